@@ -19,6 +19,7 @@ from drivers.link import TcpConnector
 from drivers.sim.operator import YardOperator
 from middleware.config.settings import IN_MEMORY, Settings
 from middleware.entangled.data.sqlite import read_records
+from middleware.frontend.client import TeamClient
 from middleware.node import SwarmNode
 from swarmnode.gateway import gateway
 from swarmnode.invitation import at_terminal, invited
@@ -85,8 +86,9 @@ def page(
 ) -> PageService:
     """The page over the data store of ``node``; ``door`` makes its port over TLS, where it is to have one."""
     operator = _operator(settings, reactor)
-    desk = TeamDesk(node, TASKS, DEMO, operator)
-    ground = Ground(settings, node, desk, reactor, seams.wall, seams.rng)
+    client = TeamClient(node)
+    desk = TeamDesk(client, TASKS, DEMO, operator)
+    ground = Ground(settings, node, client, desk, reactor, seams.wall, seams.rng)
     tls = None if door is None else door(ground, _names)
 
     def urls() -> list[str]:

@@ -19,6 +19,7 @@ from middleware.config.settings import Settings
 from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.network.network import Address
 from middleware.entangled.network.switchboard import Weather
+from middleware.frontend.client import TeamClient
 from sim.demo.trials import main as run_trials
 from sim.robots.scene import loaded
 from sim.robots.yard import Yard
@@ -80,7 +81,8 @@ class VirtualTeam(World):
             self.clock.advance(self.JOINING)
         self._operator = YardOperator(self.yard.connector(), self.clock)
         self._operator.connect()
-        self.desk = TeamDesk(self.services[self.BOOTSTRAP].assembly.node, TASKS, DEMO, self._operator)
+        self.client = TeamClient(self.services[self.BOOTSTRAP].assembly.node)
+        self.desk = TeamDesk(self.client, TASKS, DEMO, self._operator)
         self._departed = Departed()
         self.clock.advance(self.JOINING)
 

@@ -112,7 +112,18 @@ LAYERS: dict[str, Layer] = {
             *_middleware("consensus", "directory", "node", "stop", "tasks"),
         ),
     ),
-    "webnode": Layer("the page over the node's store", ("formats", "middleware")),
+    "middleware.frontend": Layer(
+        "the team as a user interface needs it: a view of its records, a client that calls and orders",
+        (*LIBRARY, *_middleware("consensus", "diagnostics", "directory", "node", "stop", "tasks")),
+    ),
+    "webnode": Layer(
+        "the page over the node's store",
+        (
+            *("formats", *LIBRARY),
+            *_middleware("admission.roles", "config", "diagnostics.survey", "directory.presence", "faults"),
+            *_middleware("frontend", "node", "stop", "tasks"),
+        ),
+    ),
     "sim.robots": Layer(
         "the simulator of robots: world, cameras, sensors, emulators, and the server that drivers connect to",
         ("formats", "drivers", "middleware.entangled.listeners", "middleware.faults.stream"),

@@ -125,6 +125,7 @@ PURE = (
     "middleware.entangled.wire.session",
     "middleware.errors",
     "middleware.faults.kinds",
+    "middleware.frontend.view",
     "middleware.faults.stream",
     "middleware.faults.takeover",
     "middleware.entangled.control.link",

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from middleware.config.settings import Settings
+from middleware.frontend.client import TeamClient
 from middleware.node import SwarmNode
 from webnode.team import TeamDesk
 
@@ -18,6 +19,7 @@ class Ground:
 
     settings: Settings
     node: SwarmNode
+    client: TeamClient
     desk: TeamDesk
     reactor: Any
     wall: Callable[[], float]

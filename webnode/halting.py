@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from twisted.internet.defer import Deferred
 
-from middleware.directory.presence import DEVICES, devices_of
-from middleware.entangled.contact import Contact
-from middleware.entangled.record import Record
-from middleware.node import SwarmNode
+from middleware.frontend.client import TeamClient
 from middleware.stop.stop_set import ID_BYTES
 from webnode.board import Halts
 from webnode.errors import Refusal
@@ -19,32 +16,28 @@ from webnode.ground import Ground
 
 def halts(ground: Ground) -> Halts | None:
     """The button of this node."""
-    return TeamHalts(ground.node, lambda: ground.desk.read(DEVICES))
+    return TeamHalts(ground.client)
 
 
 class TeamHalts:
-    """The button over ``node``; ``devices`` are the records of those that are here, which are told at once."""
+    """The button over ``client``; the devices that are present are told at once."""
 
-    def __init__(self, node: SwarmNode, devices: Callable[[], list[Record]]) -> None:
-        self._node = node
-        self._devices = devices
+    def __init__(self, client: TeamClient) -> None:
+        self._client = client
 
     def halt(self, by: str) -> Deferred[dict[str, str]]:
         """Let everything stand, and stay."""
-        return self._node.halt.stop(by, self._contacts())
+        return self._client.stop_all(by)
 
     def release(self, by: str, stops: Sequence[str] | None = None) -> Deferred[dict[str, str]]:
         """End these stops, or all that this node knows and all that a device says it obeys; raises ``Refusal``."""
         named = self._known() if stops is None else [_id(stop) for stop in stops]
-        return self._node.halt.release(named, by, self._contacts())
+        return self._client.release(named, by)
 
     def _known(self) -> list[bytes]:
-        said = [stop for device, _ in devices_of(self._devices()) for stop in device.stops]
-        return [*self._node.halt.stops, *(_id(stop) for stop in said if is_id(stop))]
-
-    def _contacts(self) -> list[Contact]:
-        records = [record for _, record in devices_of(self._devices())]
-        return [contact for record in records if (contact := self._node.contact_of(record)) is not None]
+        view = self._client.view
+        said = [stop for device in view.devices for stop in device.stops]
+        return [_id(stop) for stop in (*view.stops, *said) if is_id(stop)]
 
 
 def is_id(stop: str) -> bool:

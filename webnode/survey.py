@@ -12,12 +12,11 @@ from typing import Any
 from twisted.internet.defer import Deferred, DeferredList, maybeDeferred, succeed
 
 from middleware.diagnostics.survey import INVENTORY, LINKS, NETWORK, inventory, links, network, team
-from middleware.directory.presence import DEVICES, Device, devices_of
 from middleware.entangled.control.link import Link
 from middleware.entangled.errors import EntangledError, Refused
 from middleware.entangled.reach.passage import KINDS
-from middleware.entangled.record import Record
 from middleware.entangled.wire.rebuff import SIDES
+from middleware.frontend.client import TeamClient
 from middleware.node import SwarmNode
 from webnode.board import Survey
 from webnode.errors import Refusal
@@ -34,15 +33,15 @@ OWN: dict[str, Callable[[SwarmNode], dict[str, Any]]] = {INVENTORY: inventory, N
 
 def survey(ground: Ground) -> Survey | None:
     """The asker of this node."""
-    return TeamSurvey(ground.node, lambda: ground.desk.read(DEVICES))
+    return TeamSurvey(ground.node, ground.client)
 
 
 class TeamSurvey:
-    """Asks over ``node``; ``devices`` are the records of those that are here."""
+    """Asks the devices that ``client`` knows; the one of ``node`` answers here."""
 
-    def __init__(self, node: SwarmNode, devices: Callable[[], list[Record]]) -> None:
+    def __init__(self, node: SwarmNode, client: TeamClient) -> None:
         self._node = node
-        self._devices = devices
+        self._client = client
         self._rounds = {NETWORK: _Round(_network_view), LINKS: _Round(_links_view)}
 
     def network(self) -> Deferred[Json]:
@@ -59,11 +58,10 @@ class TeamSurvey:
 
     def inventory(self, uuid: str) -> Deferred[Json]:
         """What a device stores; fails with ``Refusal`` 409 or 504."""
-        found = next((pair for pair in devices_of(self._devices()) if pair[0].uuid == uuid), None)
-        if found is None:
+        device = self._client.view.device(uuid)
+        if device is None:
             raise Refusal("device", "it has left the network", "wait until it is back", 409)
-        device, record = found
-        return self._ask(device, record, INVENTORY).addCallbacks(_inventory_view, _refused, errbackArgs=(device.name,))
+        return self._ask(uuid, INVENTORY).addCallbacks(_inventory_view, _refused, errbackArgs=(device.name,))
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
@@ -81,14 +79,14 @@ class TeamSurvey:
         return waiter
 
     def _ask_all(self, method: str, asked: _Round) -> None:
-        pairs = devices_of(self._devices())
-        names = {device.uuid: device.name for device, _ in pairs}
-        pairs = pairs[:MAX_ASKED]
+        devices = self._client.view.devices
+        names = {device.uuid: device.name for device in devices}
+        devices = devices[:MAX_ASKED]
         asked.waiting = []
 
         def ended(outcomes: list[tuple[bool, Any]]) -> None:
             # In the order of joining, whoever was quicker.
-            told = [(device.uuid, outcome) for (device, _), (_, outcome) in zip(pairs, outcomes, strict=True)]
+            told = [(device.uuid, outcome) for device, (_, outcome) in zip(devices, outcomes, strict=True)]
             views = {uuid: asked.view(outcome, names) for uuid, outcome in told if isinstance(outcome, dict)}
             silent: list[Json] = [uuid for uuid, _ in told if uuid not in views]
             asked.told = {"here": self._node.uuid, "devices": views, "silent": silent}
@@ -97,16 +95,13 @@ class TeamSurvey:
             for waiter in waiting:
                 waiter.callback(asked.told)
 
-        answers = [maybeDeferred(self._ask, device, record, method) for device, record in pairs]
+        answers = [maybeDeferred(self._ask, device.uuid, method) for device in devices]
         DeferredList(answers, consumeErrors=True).addCallback(ended)
 
-    def _ask(self, device: Device, record: Record, method: str) -> Deferred[Any]:
-        if device.uuid == self._node.uuid:
+    def _ask(self, uuid: str, method: str) -> Deferred[Any]:
+        if uuid == self._node.uuid:
             return succeed(OWN[method](self._node))
-        contact = self._node.contact_of(record)
-        if contact is None:
-            raise Refusal("device", f"{device.name} says no address", "wait a moment, then try again", 409)
-        return self._node.entangled.endpoint.ask(contact, method, timeout=PATIENCE_S)
+        return self._client.call(uuid, method, timeout=PATIENCE_S)
 
 
 @dataclass

@@ -3,25 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Protocol
 
 from twisted.internet.defer import Deferred, DeferredList, fail
 from twisted.logger import Logger
 
-from middleware.consensus.verdict import verdicts_key
-from middleware.directory.presence import DEVICES, Device, devices_of
+from middleware.directory.presence import Device
 from middleware.entangled.errors import EntangledError, Refused
 from middleware.entangled.record import Record
-from middleware.entangled.replication.watch import Watch
-from middleware.node import CAMERA, SwarmNode
-from middleware.stop.halt import HALT
-from middleware.tasks.order import PAUSE, RESUME, Order
-from middleware.tasks.task import CANCELLED, TASKS, Result, Task, group_key, member_of, outcome_of, tasks_of
+from middleware.frontend.client import TeamClient
+from middleware.tasks.order import PAUSE, RESUME
+from middleware.tasks.task import Task
 from webnode.camera import OnFrame
 from webnode.errors import Refusal
-from webnode.ledger import refused_by
 
 PLACING = 5.0
 """Seconds between Run Demo and the target's appearance: it is placed while the robots search (thesis, section 5)."""
@@ -30,8 +26,6 @@ DIVIDED = "group_optimal"
 """The strategy of a task of a group whose catalogue entry says the nearest, which is for one task."""
 PATIENCE = 1.5
 """Seconds that a device has to answer an order: less than the page's own patience, so that its visitor is told why."""
-ASKING = 1.0
-"""Seconds that the team has to say whether a task is there already."""
 
 
 class YardHand(Protocol):
@@ -55,47 +49,36 @@ class YardHand(Protocol):
 
 
 class TeamDesk:
-    """The desk of a running team; ``predefined`` and ``demo`` come from the catalogue of tasks.
-
-    ``version`` is another number whenever what is known has changed.
-    """
+    """The desk of a running team; ``predefined`` and ``demo`` come from the catalogue of tasks."""
 
     _log = Logger()
 
     def __init__(
-        self, node: SwarmNode, predefined: Mapping[str, Task], demo: str, yard: YardHand | None = None
+        self, client: TeamClient, predefined: Mapping[str, Task], demo: str, yard: YardHand | None = None
     ) -> None:
-        self._node = node
+        self._client = client
+        self._view = client.view
         self._predefined = predefined
         self._demo = demo
         self._yard = yard
-        self._groups: dict[str, Watch] = {}
-        self._reasons: dict[str, Watch] = {}
-        self.version = 0
-        self._devices = node.watch_devices(self._count, keep=True)
-        self._tasks = node.watch_tasks(self._follow, keep=True)
-        node.halt.follow()
+
+    @property
+    def version(self) -> int:
+        """Another number whenever what is known has changed."""
+        return self._client.version
 
     # -- what is known ----------------------------------------------------------------------------------------------
 
     def read(self, key: bytes) -> list[Record]:
         """The records under ``key``, of the keys that the page shows, as they are watched now."""
-        if key == DEVICES:
-            return self._devices.records
-        if key == TASKS:
-            return self._tasks.records
-        if key == HALT:
-            return self._node.halt.records
-        watches = (*self._groups.values(), *self._reasons.values())
-        return next((watch.records for watch in watches if watch.key == key), [])
+        return self._client.read(key)
 
     def watch(self, uuid: str, on_frame: OnFrame) -> Callable[[], None]:
         """Look through the camera of the device ``uuid`` until what is returned is called."""
-        record = self._record_of(uuid)
-        contact = None if record is None else self._node.contact_of(record)
+        contact = self._client.contact(uuid)
         if contact is None:
             raise Refusal("device", "there is no such device", "choose one of /api/v1/devices", 404)
-        return self._node.streams.look(contact, CAMERA, on_frame)
+        return self._client.stream_camera(contact, on_frame)
 
     def yard(self) -> Mapping[str, Any] | None:
         """The newest view from above, or None."""
@@ -116,8 +99,9 @@ class TeamDesk:
         Returns its id; fires with it, where ``task_id`` says what it is to be, and does nothing if it is there.
         """
         if task_id:
-            return self._found(task_id).addCallback(lambda task: task_id if task else self._demonstrated(task_id))
-        return self._demonstrated(self._fresh_id())
+            found = self._client.find_task(task_id)
+            return found.addCallback(lambda task: task_id if task else self._demonstrated(task_id))
+        return self._demonstrated(self._client.new_task_id())
 
     def assign(self, name: str, tolerates: int = 1, group: str = "", task_id: str = "") -> Any:
         """Publish a predefined task; the devices that can do it take it up by themselves.
@@ -127,17 +111,16 @@ class TeamDesk:
         """
         template = replace(self._template(name, group), tolerates=tolerates)
         if task_id:
-            found = self._found(task_id)
+            found = self._client.find_task(task_id)
             return found.addCallback(lambda task: self._told(task) if task else self._published(template, task_id))
-        return self._published(template, self._fresh_id())
+        return self._published(template, self._client.new_task_id())
 
     def preview(self, name: str, group: str = "") -> dict[str, Any]:
         """Who could take a predefined task and who not, and why; nothing is asked of anybody."""
         task = self._template(name, group)
-        devices = [device for device, _ in devices_of(self._devices.records)]
-        refused = refused_by(task, devices)
-        titles = {task_id: each.title for task_id, each in tasks_of(self._tasks.records).items()}
-        able = [device for device in devices if device.name not in refused]
+        refused = self._view.unable(task)
+        titles = {each.task_id: each.title for each in self._view.tasks}
+        able = [device for device in self._view.devices if device.name not in refused]
         rows = [
             {"uuid": d.uuid, "name": d.name, "busy": titles.get(d.task, "another task" * bool(d.task))} for d in able
         ]
@@ -145,26 +128,22 @@ class TeamDesk:
         # As the agents divide them: those of one group that want the same of a device, by the same strategy.
         together = [
             {"id": other.task_id, "title": other.title}
-            for other in self._open_tasks()
+            for other in self._view.open_tasks
             if group and (other.group, other.strategy, other.requirements) == (group, task.strategy, task.requirements)
         ]
         return {"able": rows, "refused": refused, "likely": likely, "together": together}
 
     def cancel(self, task_id: str) -> None:
         """Record that the task is cancelled; whoever is at it stops."""
-        result = Result(CANCELLED, self._node.presence.device.name)
-        task = tasks_of(self._tasks.records).get(task_id)
-        if task is None:
-            return self._quietly(self._node.conclude(task_id, result))
-        self._quietly(Deferred.fromCoroutine(self._node.cancel(task, result)))
+        self._quietly(self._client.cancel(task_id))
 
     def pause(self, task_id: str) -> None:
         """Record that the task is to rest; whoever is at it stops, and is free for others."""
-        self._order(task_id, PAUSE)
+        self._quietly(self._client.order(task_id, PAUSE))
 
     def resume(self, task_id: str) -> None:
         """Record that the task is to go on."""
-        self._order(task_id, RESUME)
+        self._quietly(self._client.order(task_id, RESUME))
 
     def message(self, uuid: str, text: str) -> Deferred[dict[str, Any]]:
         """Send a text to one device, or to all; fires with who has it, and by name why others have not."""
@@ -181,9 +160,8 @@ class TeamDesk:
 
         if uuid:
             one = self.call(uuid, "device.message", text)
-            return one.addCallback(lambda _: {"delivered": [self._name_of(uuid)], "failed": failed})
-        devices = [device for device, _ in devices_of(self._devices.records)]
-        all_told = DeferredList([told(device).addErrback(untold, device.name) for device in devices])
+            return one.addCallback(lambda _: {"delivered": [self._view.name_of(uuid)], "failed": failed})
+        all_told = DeferredList([told(device).addErrback(untold, device.name) for device in self._view.devices])
         return all_told.addCallback(lambda _: {"delivered": sorted(delivered), "failed": failed})
 
     def disconnect(self, uuid: str, seconds: float) -> Deferred[Any]:
@@ -202,12 +180,11 @@ class TeamDesk:
         409: it is not here, leaves while it is asked, or says no; 504: it is here and does not answer.  ``refused``
         may know better what a no means.
         """
-        name, record = self._name_of(uuid), self._record_of(uuid)
-        contact = None if record is None else self._node.contact_of(record)
-        if contact is None:
+        name = self._view.name_of(uuid)
+        if self._client.contact(uuid) is None:
             return fail(Refusal("device", f"{name} is not here", "choose one of /api/v1/devices", 409))
-        until = self._node.clock.seconds() + PATIENCE
-        asked = self._node.entangled.endpoint.ask(contact, method, *arguments, timeout=PATIENCE, changes=True)
+        until = self._client.clock.seconds() + PATIENCE
+        asked = self._client.call(uuid, method, *arguments, timeout=PATIENCE, changes=True)
         return asked.addErrback(self._unanswered, uuid, name, until, refused)
 
     def move_target(self, x: float, y: float) -> Any:
@@ -224,30 +201,8 @@ class TeamDesk:
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
-    def _fresh_id(self) -> str:
-        return self._node.rng.randbytes(6).hex()
-
-    def _found(self, task_id: str) -> Deferred[Task | None]:
-        """The task of that id, as the team knows it; None where there is none.
-
-        The team is asked, as what another web node did in its last moment, or while this one was frozen, need not
-        have come here; what is known here counts where nobody answers in time.
-        """
-        found: Deferred[Task | None] = Deferred()
-
-        def tell(records: Iterable[Record]) -> None:
-            if not found.called:
-                found.callback(tasks_of([*self._tasks.records, *records]).get(task_id))
-
-        if task_id in tasks_of(self._tasks.records):
-            tell(())
-            return found
-        cancel = self._node.later(ASKING, tell, ())
-        self._node.entangled.get(TASKS).addErrback(_unknown).addCallback(tell).addBoth(lambda _: cancel())
-        return found
-
     def _demonstrated(self, task_id: str) -> str:
-        for task in self._open_tasks():
+        for task in self._view.open_tasks:
             self.cancel(task.task_id)
         if self._yard is not None:
             self._quietly(self._yard.clear_target())
@@ -258,14 +213,14 @@ class TeamDesk:
         return str(self._published(template, task_id)["id"])
 
     def _published(self, template: Task, task_id: str) -> dict[str, Any]:
-        task = replace(template, task_id=task_id, created=self._node.wall())
-        self._quietly(Deferred.fromCoroutine(self._node.submit(task)))
+        task, stored = self._client.submit(template, task_id)
+        self._quietly(stored)
         return self._told(task)
 
     def _told(self, task: Task) -> dict[str, Any]:
-        devices = [device for device, _ in devices_of(self._devices.records)]
-        refused = refused_by(task, devices)
-        return {"id": task.task_id, "able": [d.name for d in devices if d.name not in refused], "refused": refused}
+        refused = self._view.unable(task)
+        able = [device.name for device in self._view.devices if device.name not in refused]
+        return {"id": task.task_id, "able": able, "refused": refused}
 
     def _template(self, name: str, group: str = "") -> Task:
         template = self._predefined.get(name)
@@ -279,39 +234,13 @@ class TeamDesk:
     def _likely(self, task: Task, able: Sequence[str]) -> str | None:
         """Who of ``able`` would be the nearest by what is reported to open tasks of that kind; None: nobody knows."""
         costs: dict[str, float] = {}
-        for other in self._open_tasks():
+        for other in self._view.open_tasks:
             if (other.kind, other.parameters) == (task.kind, task.parameters):
-                for record in self.read(group_key(other.task_id)):
-                    member = member_of(record)
-                    if member is not None and member.cost is not None and member.uuid in able:
+                for member in self._view.members(other.task_id):
+                    if member.cost is not None and member.uuid in able:
                         costs[member.uuid] = min(member.cost, costs.get(member.uuid, math.inf))
         nearest = min(costs, key=lambda uuid: (costs[uuid], uuid), default=None)
-        return None if nearest is None else self._name_of(nearest)
-
-    def _follow(self, records: list[Record]) -> None:
-        self._count(records)
-        for task_id in tasks_of(records):
-            if task_id not in self._groups:
-                self._groups[task_id] = self._node.watch_group(task_id, self._count, keep=True)
-                self._reasons[task_id] = self._node.entangled.watch(verdicts_key(task_id), self._count, keep=True)
-
-    def _count(self, records: list[Record]) -> None:
-        self.version += 1
-
-    def _order(self, task_id: str, word: str) -> None:
-        order = Order(word, self._node.presence.device.name, self._node.wall())
-        self._quietly(self._node.order(task_id, order.packed()))
-
-    def _open_tasks(self) -> list[Task]:
-        tasks = tasks_of(self._tasks.records).values()
-        return [task for task in tasks if outcome_of(task, self.read(group_key(task.task_id))) is None]
-
-    def _record_of(self, uuid: str) -> Record | None:
-        return next((record for device, record in devices_of(self._devices.records) if device.uuid == uuid), None)
-
-    def _name_of(self, uuid: str) -> str:
-        devices = devices_of(self._devices.records)
-        return next((device.name for device, _ in devices if device.uuid == uuid), uuid[:8])
+        return None if nearest is None else self._view.name_of(nearest)
 
     def _unanswered(
         self, failure: Any, uuid: str, name: str, until: float, refused: Callable[[Refused], Refusal | None]
@@ -327,12 +256,12 @@ class TeamDesk:
         def judge() -> None:
             remedy = "look whether it was done all the same, then try again"
             refusal = Refusal("device", f"{name} did not answer", remedy, 504)
-            if self._record_of(uuid) is None:
+            if self._view.device(uuid) is None:
                 refusal = Refusal("device", f"{name} left while it was asked", "wait until it is back", 409)
             silent.errback(refusal)
 
         # Its presence outlives it for a moment: whether it is gone or only silent shows then.
-        self._node.later(max(0.0, until - self._node.clock.seconds()), judge)
+        self._client.clock.callLater(max(0.0, until - self._client.clock.seconds()), judge)
         return silent
 
     def _with_yard(self) -> YardHand:
@@ -346,11 +275,6 @@ class TeamDesk:
                 self._log.warn("a wish was not granted: {error}", error=failure.getErrorMessage())
 
         work.addErrback(ended)
-
-
-def _unknown(failure: Any) -> list[Record]:
-    failure.trap(EntangledError)
-    return []
 
 
 def _refused(failure: Any, what: str = "target") -> None:

@@ -34,6 +34,7 @@ LOADERS = {
     "swarmnode.sandbox",
     *("agents.behaviour", "agents.registry", "drivers.registry", "middleware.consensus.servant"),
     *("middleware.consensus.strategy", "swarmnode.driver.catalogue", "swarmnode.command", "drivers.foreign"),
+    "webnode.routes.table",
 }
 HOOKS = {("middleware.entangled.wire.message", hook) for hook in ("ext_hook", "object_hook")}
 """The first one refuses every extension, the second one counts."""

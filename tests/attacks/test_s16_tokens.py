@@ -77,7 +77,7 @@ class PageCase(SynchronousTestCase):
         service = self.team.services[name]
         node, rng = service.assembly.node, random.Random(name)
         settings = replace(service.settings, web=replace(service.settings.web, code=CODE))
-        ground = Ground(settings, node, self.team.desk, self.team.clock, self.now, rng)
+        ground = Ground(settings, node, self.team.client, self.team.desk, self.team.clock, self.now, rng)
         followed = fallbacks(ground)
         signed = sessions(ground, followed)
         assert isinstance(followed, TeamFallbacks) and isinstance(signed, SignedSessions)

@@ -7,7 +7,6 @@ from typing import Any
 from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.directory.presence import DEVICES
 from middleware.stop.halt import HALT, SLOT, UNHEARD
 from swarmnode.rehearsal import VirtualTeam
 from webnode.halting import TeamHalts
@@ -20,7 +19,7 @@ class HaltTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.team = VirtualTeam(5)
         self.addCleanup(self.team.stop)
-        self.halts = TeamHalts(self.node("vaio"), lambda: self.team.desk.read(DEVICES))
+        self.halts = TeamHalts(self.team.client)
 
     def node(self, name: str) -> Any:
         """The node of a device."""
@@ -94,7 +93,7 @@ class HaltTests(SynchronousTestCase):
         """A dog that joins a halted team, and finds a task there, does not move until the team is released."""
         team = VirtualTeam(6, dogs=("dog1", "dog2"))
         self.addCleanup(team.stop)
-        halts = TeamHalts(team.services["vaio"].assembly.node, lambda: team.desk.read(DEVICES))
+        halts = TeamHalts(team.client)
         halts.halt("ann")
         team.clock.advance(0.5)
         team.run_demo()

@@ -13,6 +13,7 @@ from twisted.internet.defer import Deferred
 
 from middleware.diagnostics.survey import inventory
 from middleware.entangled.control.place import made
+from middleware.frontend.client import TeamClient
 from swarmnode.asker import Asker
 from swarmnode.team.verb import TeamVerbs
 from tests.fleet import FleetCase, SwarmFleet
@@ -44,7 +45,7 @@ class SplitTests(FleetCase):
     def test_page(self) -> None:
         """The page of a web node shows every device of a directory that is split."""
         fleet = self.apart()
-        desk = TeamDesk(fleet.nodes[2], {}, "")
+        desk = TeamDesk(TeamClient(fleet.nodes[2]), {}, "")
         fleet.run(3.0)
         state = state_from(desk.read, Departed(), "dog2", 0.0)
         self.assertEqual([device["name"] for device in state["devices"]], [f"dog{n}" for n in range(COUNT)])

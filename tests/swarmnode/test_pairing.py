@@ -16,6 +16,7 @@ from agents.catalogue import DEMO, TASKS
 from drivers.registry import describe
 from middleware.config.settings import Settings
 from middleware.directory.presence import Device
+from middleware.frontend.client import TeamClient
 from sim.robots.emulator.aibo_dog import AiboEmulator
 from sim.robots.emulator.body import MemoryBody
 from swarmnode.service import NodeService
@@ -80,7 +81,7 @@ class PairingTests(SynchronousTestCase):
             self.addCleanup(services[name].stopService)
             world.clock.advance(1.0)
         world.clock.advance(3.0)
-        desk = TeamDesk(services["vaio"].assembly.node, TASKS, DEMO, None)
+        desk = TeamDesk(TeamClient(services["vaio"].assembly.node), TASKS, DEMO, None)
         devices = state_from(desk.read, Departed(), "vaio", world.clock.seconds())["devices"]
         told = {device["name"]: (device["name"], device["laptop"], device["agent"]) for device in devices}
         self.assertEqual(told, {"vaio": ("vaio", "vaio", ""), **{row[0]: row for row in ROWS}})

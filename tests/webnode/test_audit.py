@@ -111,7 +111,7 @@ class AuditRouteTests(SynchronousTestCase):
         nothing = cast(Any, None)
         for store, kind in ((str(folder / "a.sqlite"), FileAudit), (IN_MEMORY, MemoryAudit)):
             settings = Settings.from_mapping({"node": {"name": "a", "store": store}}, "a.toml")
-            made = audit(Ground(settings, nothing, nothing, nothing, lambda: 7.0, random.Random(1)))
+            made = audit(Ground(settings, nothing, nothing, nothing, nothing, lambda: 7.0, random.Random(1)))
             self.assertIsInstance(made, kind)
             made.note(ANN, "h", "POST /x", "", "202")
             self.assertEqual(made.newest(1)[0]["at"], 7.0)

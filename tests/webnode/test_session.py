@@ -212,7 +212,7 @@ class FactoryTests(SynchronousTestCase):
         nothing = cast(Any, None)
         identity = Identity(bytes(32))
         node = cast(Any, SimpleNamespace(entangled=SimpleNamespace(watch=lambda *what, **how: None, identity=identity)))
-        return Ground(settings, node, nothing, nothing, lambda: 0.0, random.Random(1))
+        return Ground(settings, node, nothing, nothing, nothing, lambda: 0.0, random.Random(1))
 
     def test_have_the_code_of_the_settings(self) -> None:
         """The code is that of the settings; where there is none, one is made that cannot be misread."""

@@ -9,6 +9,7 @@ from middleware.entangled.control.link import Link
 from middleware.entangled.network.switchboard import Weather
 from middleware.entangled.record import hashed_key
 from middleware.entangled.wire.door import UNPROTECTED
+from middleware.frontend.client import TeamClient
 from middleware.node import SwarmNode
 from tests.fleet import FleetCase, SwarmFleet
 from tests.webnode.guests import Guests
@@ -28,9 +29,9 @@ class SurveyTests(FleetCase):
         for node in self.team.nodes:
             answer_survey(node)
         self.dogs = [node.uuid for node in self.team.nodes]
-        watch = self.team.nodes[0].watch_devices(lambda records: None, keep=True)
+        client = TeamClient(self.team.nodes[0])
         self.team.run(1)
-        self.survey = TeamSurvey(self.team.nodes[0], lambda: watch.records)
+        self.survey = TeamSurvey(self.team.nodes[0], client)
 
     def network(self) -> Any:
         return self.done(self.team, self.survey.network(), PATIENCE_S + 1)

@@ -10,10 +10,11 @@ from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
 from agents.catalogue import DEMO, TASKS
+from middleware.frontend.client import LOOKUP_S, TeamClient
 from middleware.tasks.task import TASKS as ALL_TASKS
 from swarmnode.rehearsal import VirtualTeam
 from webnode.errors import Refusal
-from webnode.team import ASKING, PATIENCE, PLACING, TeamDesk
+from webnode.team import PATIENCE, PLACING, TeamDesk
 
 
 class TeamDeskTests(SynchronousTestCase):
@@ -146,7 +147,7 @@ class RepeatedWishTests(SynchronousTestCase):
         self.team = VirtualTeam(3, dogs=("dog1", "dog2"), others=("pi",))
         self.addCleanup(self.team.stop)
         self.desk = self.team.desk
-        self.reserve = TeamDesk(self.team.services["pi"].assembly.node, TASKS, DEMO)
+        self.reserve = TeamDesk(TeamClient(self.team.services["pi"].assembly.node), TASKS, DEMO)
         self.team.clock.advance(1.0)
 
     def test_wish_that_is_repeated_elsewhere(self) -> None:
@@ -163,7 +164,7 @@ class RepeatedWishTests(SynchronousTestCase):
             self.team.board.heal()
             self.assertNotIn(task_id, [record.name for record in self.reserve.read(ALL_TASKS)])
             again = wish(self.reserve)
-            self.team.clock.advance(ASKING)
+            self.team.clock.advance(LOOKUP_S)
             self.assertEqual((self.successResultOf(first), self.successResultOf(again)), (task_id, task_id))
             owners = [record.owner for record in self.desk.read(ALL_TASKS) if record.name == task_id]
             self.assertEqual(owners, [owner])
@@ -174,6 +175,6 @@ class RepeatedWishTests(SynchronousTestCase):
         """The node that was asked first is dead and had done nothing: the next one does it, soon enough to say so."""
         self.team.kill("vaio")
         wish = self.reserve.assign("turn-around", task_id="a1")
-        self.team.clock.advance(ASKING + 0.1)
+        self.team.clock.advance(LOOKUP_S + 0.1)
         self.assertEqual(self.successResultOf(wish)["id"], "a1")
         self.assertEqual([r.name for r in self.reserve.read(ALL_TASKS)], ["a1"])

@@ -159,7 +159,7 @@ class DoorTests(SynchronousTestCase):
         settings = Settings.from_mapping({"node": node, "web": {"tls": "auto"}}, str(self.folder / "a.toml"))
         anything: Any = None
         web_node: Any = SimpleNamespace(store=MemoryStore() if kept is None else kept)
-        ground = Ground(settings, web_node, anything, Clock(), lambda: NOW, random.Random(seed))
+        ground = Ground(settings, web_node, anything, anything, Clock(), lambda: NOW, random.Random(seed))
         return door(ground, lambda: ["192.168.0.7"])
 
     def test_have_an_authority_of_its_own(self) -> None:

@@ -1,0 +1,154 @@
+"""TeamClient: the requests of a user interface over one node (thesis, Algorithm 4.4)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from typing import Any
+
+from twisted.internet.defer import Deferred, fail
+
+from middleware.consensus.verdict import verdicts_key
+from middleware.directory.presence import DEVICES
+from middleware.entangled.contact import Contact
+from middleware.entangled.errors import EntangledError, NoAnswer
+from middleware.entangled.record import Record
+from middleware.entangled.replication.watch import Watch
+from middleware.frontend.view import TeamView
+from middleware.node import CAMERA, SwarmNode
+from middleware.stop.halt import HALT
+from middleware.tasks.order import Order
+from middleware.tasks.task import CANCELLED, TASKS, Result, Task, tasks_of
+
+LOOKUP_S = 1.0
+"""Seconds that the team has to answer whether a task exists."""
+
+
+class TeamClient:
+    """Watches the team over ``node``, calls its devices, and orders tasks.
+
+    ``view`` shows the watched records, ``version`` counts their changes, and ``clock`` is the node's.
+    """
+
+    def __init__(self, node: SwarmNode) -> None:
+        self.clock = node.clock
+        self._node = node
+        self._tasks_watched: dict[str, tuple[Watch, Watch]] = {}
+        self.version = 0
+        self.view = TeamView(self.read)
+        self._devices = node.watch_devices(self._count, keep=True)
+        self._tasks = node.watch_tasks(self._follow, keep=True)
+        node.halt.follow()
+
+    @property
+    def name(self) -> str:
+        """The name of this node's device."""
+        return self._node.presence.device.name
+
+    def read(self, key: bytes) -> list[Record]:
+        """Return the watched records under ``key``: of devices, tasks, stops, and each task's group and verdicts."""
+        if key == DEVICES:
+            return self._devices.records
+        if key == TASKS:
+            return self._tasks.records
+        if key == HALT:
+            return self._node.halt.records
+        watches = (watch for pair in self._tasks_watched.values() for watch in pair)
+        return next((watch.records for watch in watches if watch.key == key), [])
+
+    # -- devices ----------------------------------------------------------------------------------------------------
+
+    def contact(self, uuid: str) -> Contact | None:
+        """Return the contact of a device that is present, or None."""
+        record = self.view.record_of(uuid)
+        return None if record is None else self._node.contact_of(record)
+
+    def call(self, uuid: str, method: str, *arguments: object, timeout: float, changes: bool = False) -> Deferred[Any]:
+        """Call a method of a device; fails with ``EntangledError``, with ``NoAnswer`` where it is not present.
+
+        :param timeout: seconds
+        :param changes: whether the call changes something, so that it may run only once
+        """
+        contact = self.contact(uuid)
+        if contact is None:
+            return fail(NoAnswer(f"{self.view.name_of(uuid)} is not here"))
+        return self._node.entangled.endpoint.ask(contact, method, *arguments, timeout=timeout, changes=changes)
+
+    def stream_camera(self, contact: Contact, on_frame: Callable[[int, bytes, float], None]) -> Callable[[], None]:
+        """Receive the pictures of a device's camera until the returned function is called."""
+        return self._node.streams.look(contact, CAMERA, on_frame)
+
+    # -- stops ------------------------------------------------------------------------------------------------------
+
+    def stop_all(self, by: str) -> Deferred[dict[str, str]]:
+        """Stop every device; fires with the answer of each by uuid."""
+        return self._node.halt.stop(by, self._contacts())
+
+    def release(self, stops: Iterable[bytes], by: str) -> Deferred[dict[str, str]]:
+        """Release ``stops``; fires with the answer of each device by uuid."""
+        return self._node.halt.release(list(stops), by, self._contacts())
+
+    # -- tasks ------------------------------------------------------------------------------------------------------
+
+    def new_task_id(self) -> str:
+        """Return an id that no task has."""
+        return self._node.rng.randbytes(6).hex()
+
+    def find_task(self, task_id: str) -> Deferred[Task | None]:
+        """Fire with the task of that id, or None.
+
+        The team is asked, because another node's last request may not have been replicated to this one; the records
+        that are watched here count where no answer comes in ``LOOKUP_S``.
+        """
+        found: Deferred[Task | None] = Deferred()
+
+        def answer(records: Iterable[Record]) -> None:
+            if not found.called:
+                found.callback(tasks_of([*self._tasks.records, *records]).get(task_id))
+
+        if self.view.task(task_id) is not None:
+            answer(())
+            return found
+        cancel = self._node.later(LOOKUP_S, answer, ())
+        self._node.entangled.get(TASKS).addErrback(_none).addCallback(answer).addBoth(lambda _: cancel())
+        return found
+
+    def submit(self, template: Task, task_id: str) -> tuple[Task, Deferred[Any]]:
+        """Publish a task now; return it, and a Deferred that fires when it is stored."""
+        task = replace(template, task_id=task_id, created=self._node.wall())
+        return task, Deferred.fromCoroutine(self._node.submit(task))
+
+    def cancel(self, task_id: str) -> Deferred[Any]:
+        """Record that the task is cancelled; its agents stop."""
+        result = Result(CANCELLED, self.name)
+        task = self.view.task(task_id)
+        if task is None:
+            return self._node.conclude(task_id, result)
+        return Deferred.fromCoroutine(self._node.cancel(task, result))
+
+    def order(self, task_id: str, word: str) -> Deferred[Any]:
+        """Pause or resume a task (``middleware.tasks.order``)."""
+        return self._node.order(task_id, Order(word, self.name, self._node.wall()).packed())
+
+    # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _contacts(self) -> list[Contact]:
+        contacts = [self.contact(device.uuid) for device in self.view.devices]
+        return [contact for contact in contacts if contact is not None]
+
+    def _follow(self, records: list[Record]) -> None:
+        self._count(records)
+        for task_id in tasks_of(records):
+            if task_id not in self._tasks_watched:
+                self._tasks_watched[task_id] = (
+                    self._node.watch_group(task_id, self._count, keep=True),
+                    self._node.entangled.watch(verdicts_key(task_id), self._count, keep=True),
+                )
+
+    def _count(self, records: list[Record]) -> None:
+        self.version += 1
+
+
+def _none(failure: Any) -> list[Record]:
+    failure.trap(EntangledError)
+    return []

@@ -1,0 +1,1 @@
+"""Tests of the read interface of a user interface."""

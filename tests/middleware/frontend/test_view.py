@@ -1,0 +1,73 @@
+"""``TeamView`` over records that a test wrote."""
+
+from __future__ import annotations
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.directory.presence import DEVICES, Device
+from middleware.entangled.identity import Identity, node_id
+from middleware.entangled.record import Record
+from middleware.frontend.view import TeamView
+from middleware.tasks.order import PAUSE, RESUME, Order
+from middleware.tasks.task import CANCELLED, MEMBER, ORDER, RESULT, TASKS, Member, Result, Task, group_key
+
+DOG = Identity(bytes(32))
+UUID = node_id(DOG.public).hex()
+OLD = Task("old", "search", "Search", {"camera": {"width": 160}}, created=1.0)
+NEW = Task("new", "search", "Search", created=2.0)
+
+
+def record_of(key: bytes, name: str, value: bytes) -> Record:
+    """Return an unsigned record of the dog."""
+    return Record(key, name, DOG.public, 1, "team", 60.0, value, bytes(64))
+
+
+class TeamViewTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.records: dict[bytes, list[Record]] = {}
+        self.view = TeamView(lambda key: self.records.get(key, []))
+        self.write(DEVICES, "dog1", Device(UUID, "dog1", capabilities={"camera": {"width": 80}}).packed())
+        self.write(TASKS, "old", OLD.packed())
+        self.write(TASKS, "new", NEW.packed())
+
+    def write(self, key: bytes, name: str, value: bytes) -> None:
+        """Write a record under ``key`` beside those that stand there."""
+        self.records.setdefault(key, []).append(record_of(key, name, value))
+
+    def test_newest_task_first(self) -> None:
+        """Tasks stand in the order of their creation, the newest first."""
+        self.assertEqual([task.task_id for task in self.view.tasks], ["new", "old"])
+
+    def test_task_with_a_result_is_not_open(self) -> None:
+        """A result closes a task, and progress has it as the outcome."""
+        self.write(group_key("new"), RESULT, Result(CANCELLED, "vaio").packed())
+        self.assertEqual([task.task_id for task in self.view.open_tasks], ["old"])
+        outcome = self.view.progress(NEW).outcome
+        assert outcome is not None
+        self.assertEqual((outcome.outcome, outcome.by), (CANCELLED, "vaio"))
+
+    def test_progress_has_the_agents_and_the_newest_order(self) -> None:
+        """A task is paused from the order to pause it until a newer order or its result."""
+        self.write(group_key("old"), MEMBER, Member(UUID, "dog1", "searching").packed())
+        self.write(group_key("old"), ORDER, Order(PAUSE, "vaio", 1.0).packed())
+        progress = self.view.progress(OLD)
+        self.assertEqual(([member.name for member in progress.members], progress.paused_by), (["dog1"], "vaio"))
+        self.write(group_key("old"), ORDER, Order(RESUME, "vaio", 2.0).packed())
+        self.assertEqual(self.view.progress(OLD).paused_by, "")
+
+    def test_finished_task_is_not_paused(self) -> None:
+        """A result ends a pause."""
+        self.write(group_key("old"), ORDER, Order(PAUSE, "vaio", 1.0).packed())
+        self.write(group_key("old"), RESULT, Result(CANCELLED, "vaio").packed())
+        self.assertEqual(self.view.progress(OLD).paused_by, "")
+
+    def test_unable_names_devices_and_requirements(self) -> None:
+        """A device without a required property is listed with the requirement that it does not meet."""
+        self.assertEqual(list(self.view.unable(OLD)), ["dog1"])
+        self.assertEqual(self.view.unable(NEW), {})
+
+    def test_absent_device_has_the_beginning_of_its_uuid_as_name(self) -> None:
+        """A device that left has no record, and 8 characters of its uuid stand for its name."""
+        self.assertEqual(self.view.name_of(UUID), "dog1")
+        self.assertEqual(self.view.name_of("ab" * 32), "abababab")
+        self.assertIsNone(self.view.record_of("ab" * 32))
