@@ -187,7 +187,7 @@ class DemonstrationPhoneTests(BrowserCase, DemonstrationCase):
         page.locator("#phone-name").fill("anna")
         page.get_by_role("button", name="Take part", exact=True).tap()
         page.locator(".phone", has_text="Target at about 0.2").wait_for()
-        self.until(lambda: "anna" in self.devices(), 10.0, page)
+        self.until(lambda: "anna" in self.devices(), 30.0, page)
         return page
 
     def lose_web_node(self, page: Any) -> None:
