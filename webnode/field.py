@@ -18,7 +18,10 @@ def text(value: object, fallback: str = "", limit: int = MAX_TEXT) -> str:
     """``value`` where it is text, without control characters and lone surrogates, at most ``limit`` characters."""
     if not isinstance(value, str):
         return fallback
-    return "".join(c if c.isprintable() else " " for c in value[:limit]).strip() or fallback
+    shown = value[:limit]
+    if not shown.isprintable():
+        shown = "".join(c if c.isprintable() else " " for c in shown)
+    return shown.strip() or fallback
 
 
 def number(value: object, fallback: float = 0.0) -> float:

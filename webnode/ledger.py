@@ -45,10 +45,10 @@ def state_from(read: Read, departed: Departed, node: str, now: float) -> State:
     for task in view.tasks[:TASKS_SHOWN]:
         progress = view.progress(task)
         groups[task.task_id] = [
-            {**asdict(member), "name": names.get(member.uuid, member.name)} for member in progress.members
+            {**vars(member), "name": names.get(member.uuid, member.name)} for member in progress.members
         ]
         rows.append({**_task_row(task, progress, view), "why": asdict(view.explain(task.task_id))})
-    device_rows = [asdict(device) for device in devices]
+    device_rows = [dict(vars(device)) for device in devices]
     state = state_of(device_rows, rows, groups, departed=departed.of(device_rows, now), node=node)
     return {**state, **stopped_view(view.stops, state["devices"])}
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import msgpack
@@ -78,7 +78,7 @@ class Device:
         """The value of its record; where it is too large, messages give way, then description, then ``deployed``."""
         device = self
         while True:
-            content = asdict(device)
+            content = dict(vars(device))
             # Most devices have none of them, and each byte of a record is sent again and again.
             for name in ("pages", "position", "laptop", "agent", "depth", "stops", "obeys"):
                 if not content[name]:

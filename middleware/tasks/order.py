@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 
 import msgpack
 
@@ -24,7 +24,7 @@ class Order:
 
     def packed(self) -> bytes:
         """The value of the order's record."""
-        return bounded(bytes(msgpack.packb(asdict(self))))
+        return bounded(bytes(msgpack.packb(vars(self))))
 
 
 def order_of(records: list[Record]) -> Order | None:

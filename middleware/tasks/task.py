@@ -9,7 +9,7 @@ signatures of the council before it, the end of a task (``DONE``) those of the c
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import MISSING, asdict, dataclass, field, fields, replace
+from dataclasses import MISSING, dataclass, field, fields, replace
 from functools import lru_cache
 from typing import Any
 
@@ -179,7 +179,7 @@ class Result:
 
     def packed(self) -> bytes:
         """The value of the result's record."""
-        return bounded(bytes(msgpack.packb(asdict(self))))
+        return bounded(bytes(msgpack.packb(vars(self))))
 
     @property
     def rank(self) -> tuple[int, str, str]:
@@ -341,7 +341,7 @@ def result_of(record: Record, most: int = MAX_VALUE) -> Result | None:
 
 def done_packed(result: Result, proof: bytes) -> bytes:
     """The value of the record in which an agent says how the task ended that it held, with the proof that it did."""
-    return bytes(msgpack.packb({**asdict(result), "proof": proof}))
+    return bytes(msgpack.packb({**vars(result), "proof": proof}))
 
 
 def outcome_of(task: Task, records: Iterable[Record]) -> Result | None:
