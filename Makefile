@@ -74,9 +74,9 @@ demo: $(RUNTIME)
 	@exec $(PY) -m $(if $(filter-out 0,$(NAT)),sim.namespaces.demo,sim.demo) --seed $(SEED) --robot $(ROBOT) --lose $(LOSE) $(if $(filter-out 0,$(HEADLESS)),--headless) $(if $(filter-out 0,$(TLS)),--tls) \
 	    --web-host $(WEB_HOST) $(if $(WEB_PORT),--web-port $(WEB_PORT))
 
-# Tests with sockets, processes and browsers wait a third of their time, so one worker more than processors.
+# Tests with sockets, processes and browsers wait a third of their time, so two workers more than processors.
 test: $(DEV)
-	$(PY) -m twisted.trial -j$$(($(JOBS) + 1)) tests
+	$(PY) -m twisted.trial -j$$(($(JOBS) + 2)) tests
 
 trials: $(RUNTIME)
 	$(VENV)/bin/swarm trials --count $(N) --seed $(SEED) --real $(REAL)

@@ -1,4 +1,4 @@
-"""A few dozen schedules of ``tests.invariants``, and a look at whether they bite."""
+"""A few schedules of ``tests.invariants``, and the seeded bugs that they find; ``make schedules`` runs 2,000."""
 
 from __future__ import annotations
 
@@ -72,8 +72,8 @@ class InvariantTests(SynchronousTestCase):
         return schedule.run([Records(schedule)])
 
     def test_schedules(self) -> None:
-        """Two dozen random schedules of loss, cuts, kills and restarts break no invariant of the records."""
-        failed = {seed: found for seed in range(5001, 5025) if (found := self.found(seed))}
+        """Eight random schedules of loss, cuts, kills and restarts break no invariant of the records."""
+        failed = {seed: found for seed in range(5001, 5009) if (found := self.found(seed))}
         self.assertEqual(failed, {})
 
     def test_they_bite(self) -> None:
@@ -95,14 +95,14 @@ class InvariantTests(SynchronousTestCase):
         self.assertEqual(digests[0], digests[1])
 
     def test_all_workloads(self) -> None:
-        """Tuples, hostile datagrams and failing disks beside the records break no invariant either."""
-        self.assertEqual({seed: found for seed in (7, 12) if (found := run(seed, ALL).found)}, {})
+        """A schedule of all workloads breaks no invariant: records, tuples, hostile datagrams, failing disks."""
+        self.assertEqual({seed: found for seed in (7,) if (found := run(seed, ALL).found)}, {})
 
     def test_whole_agents(self) -> None:
-        """Forty schedules of agents that come, go, fail, pause and cancel break none of E4 to E7, and none repeats."""
-        outcomes = [run(seed, ("tasks",)) for seed in range(7001, 7041)]
+        """Fifteen schedules of agents that come, go, fail, pause and cancel break none of E4 to E7, and none repeats."""
+        outcomes = [run(seed, ("tasks",)) for seed in range(7001, 7016)]
         self.assertEqual({outcome.seed: outcome.found for outcome in outcomes if outcome.found}, {})
-        self.assertGreater(len({outcome.digest for outcome in outcomes}), 35)
+        self.assertGreater(len({outcome.digest for outcome in outcomes}), 13)
         self.assertEqual(outcomes[0], run(7001, ("tasks",)))
 
     def test_the_others_bite(self) -> None:
@@ -120,7 +120,7 @@ class InvariantTests(SynchronousTestCase):
 
     def test_order(self) -> None:
         """What runs before it in the same process changes nothing about a run: they may come in any order."""
-        wanted = [(seed, only) for only in (("records",), ("tasks",), ("leases",), ("groups",)) for seed in (3, 4)]
+        wanted = [(seed, only) for only in (("records",), ("tasks",), ("leases",), ("groups",)) for seed in (3,)]
         outcomes = [run(seed, only) for seed, only in wanted]
         self.assertEqual([run(seed, only) for seed, only in reversed(wanted)], outcomes[::-1])
 
