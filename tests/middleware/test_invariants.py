@@ -99,7 +99,7 @@ class InvariantTests(SynchronousTestCase):
         self.assertEqual({seed: found for seed in (7,) if (found := run(seed, ALL).found)}, {})
 
     def test_whole_agents(self) -> None:
-        """Fifteen schedules of agents that come, go, fail, pause and cancel break none of E4 to E7, and none repeats."""
+        """Fifteen schedules of agents that join, leave, fail, pause and cancel break none of E4 to E7; none repeats."""
         outcomes = [run(seed, ("tasks",)) for seed in range(7001, 7016)]
         self.assertEqual({outcome.seed: outcome.found for outcome in outcomes if outcome.found}, {})
         self.assertGreater(len({outcome.digest for outcome in outcomes}), 13)
