@@ -20,9 +20,8 @@ from twisted.protocols.basic import LineReceiver
 from middleware.config.settings import Settings
 from middleware.entangled.clock import use_monotonic_time
 from middleware.node import CAMERA
-from swarmnode.ballast import drop_tls
+from swarmnode.ballast import STARTED_S, drop_tls, warmed_up
 from swarmnode.service import NodeService
-from swarmnode.warmth import STARTED_S, warmed_up
 from swarmnode.web import web_page
 from swarmnode.world import real_seams
 

@@ -10,7 +10,7 @@ import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from twisted.application.service import Service
 from twisted.internet.defer import Deferred, DeferredList, fail, maybeDeferred, succeed
@@ -30,18 +30,16 @@ from middleware.config.settings import (
     Settings,
     WebSettings,
 )
-from middleware.directory.presence import DEVICES, DONE, EXECUTING, IDLE, Device, devices_of
+from middleware.directory.presence import DONE, EXECUTING, IDLE, Device
 from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.identity import Identity
 from middleware.entangled.token_bucket import TokenBucket
+from middleware.frontend.view import TeamView
 from middleware.node import SwarmNode
 from swarmnode.assembly import FAULTS, assembled
 from swarmnode.seams import Seams
-from webnode.board import Phones, Wanted
+from webnode.board import Wanted
 from webnode.errors import Refusal
-
-if TYPE_CHECKING:
-    from webnode.ground import Ground
 
 MOST = 8
 """Phones at one web node: each costs it the memory and the work of a node."""
@@ -277,17 +275,13 @@ def _settings_of(settings: Settings, node: SwarmNode, name: str, can: Mapping[st
     )
 
 
-def gateway(ground: Ground) -> Phones:
-    """The phones that take part through this web node."""
+def gateway(settings: Settings, node: SwarmNode, seams: Seams, reactor: Any, view: TeamView) -> Gateway:
+    """The phones that take part through the web node with these ``seams``, each at a UDP port of its own."""
     from middleware.entangled.network.udp import UdpNetwork
 
-    def seams() -> Seams:
-        settings = ground.settings.node
-        store = MemoryStore(settings.store_rows, settings.store_bytes, epoch=ground.rng.randbytes(8))
-        network = partial(UdpNetwork, ground.reactor, settings.host, 0)
-        return Seams(ground.reactor, network, store, ground.rng, ground.wall)
+    def of_phone() -> Seams:
+        store = MemoryStore(settings.node.store_rows, settings.node.store_bytes, epoch=seams.rng.randbytes(8))
+        network = partial(UdpNetwork, reactor, settings.node.host, 0)
+        return Seams(reactor, network, store, seams.rng, seams.wall)
 
-    def others() -> list[Device]:
-        return [device for device, _ in devices_of(ground.desk.read(DEVICES))]
-
-    return Gateway(ground.settings, ground.node, seams, others)
+    return Gateway(settings, node, of_phone, lambda: view.devices)

@@ -10,13 +10,13 @@ import json
 import os
 import sys
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import asdict, dataclass
 from typing import TextIO
 
 from twisted.logger import Logger
 
 from middleware.entangled.control.place import NoControl, files, made
+from webnode.keyfile import keep
 
 ENDING = ".page"
 ANY = ("0.0.0.0", "::")
@@ -65,13 +65,7 @@ def invited(
         terminal.write(f"{name}: sign in with the code {code}, or open {invitation.link}\n")
         terminal.flush()
     try:
-        path = made(name).with_suffix(ENDING)
-        fresh = path.with_suffix(f"{ENDING}.new")
-        with suppress(FileNotFoundError):
-            fresh.unlink()
-        with open(os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="utf-8") as note:
-            json.dump(asdict(invitation), note)
-        fresh.replace(path)
+        keep(made(name).with_suffix(ENDING), json.dumps(asdict(invitation)).encode())
     except (NoControl, OSError) as error:
         _log.warn("swarm web will not know of the page: {error}", error=error)
 

@@ -1,4 +1,4 @@
-"""Page: the page of a web node, made of its parts: what it reads, the board, the streams, its ports.
+"""Page: the page of a web node, made of its parts: what it reads, the board, its ports.
 
 Whoever imports this has the libraries of the extra ``web``.
 """
@@ -24,31 +24,22 @@ from middleware.node import SwarmNode
 from swarmnode.gateway import gateway
 from swarmnode.invitation import at_terminal, invited
 from swarmnode.seams import Seams
-from webnode.app import create_app
-from webnode.audit import audit
+from webnode.audit import Audit
 from webnode.board import Board, Phones
-from webnode.chronicle import chronicle
-from webnode.fallback import fallbacks
-from webnode.faults import faults
-from webnode.ground import Ground
+from webnode.fallback import TeamFallbacks
+from webnode.faults import FaultControl
 from webnode.guard import LOCAL_ENDS
-from webnode.halting import halts
+from webnode.halting import TeamHalts
 from webnode.invite import TeamInvites
 from webnode.ledger import Glance, state_from
-from webnode.limits import limits
-from webnode.live import Events, Shots
-from webnode.server import Files, WebService, caller
+from webnode.server import WebService
 from webnode.session import sessions
-from webnode.state import Departed, State
-from webnode.survey import survey
+from webnode.state import Departed
+from webnode.survey import TeamSurvey
 from webnode.team import TeamDesk
 
 if TYPE_CHECKING:
     from webnode.tls import TlsDoor
-
-Names = Callable[[], Sequence[str]]
-Read = Callable[[float], State]
-"""The team at a moment in unix seconds."""
 
 
 class PageService(MultiService):
@@ -82,91 +73,57 @@ class PageService(MultiService):
 
 
 def page(
-    settings: Settings, seams: Seams, reactor: Any, node: SwarmNode, door: Callable[[Ground, Names], TlsDoor] | None
+    settings: Settings, seams: Seams, reactor: Any, node: SwarmNode, door: Callable[..., TlsDoor] | None
 ) -> PageService:
     """The page over the data store of ``node``; ``door`` makes its port over TLS, where it is to have one."""
-    operator = _operator(settings, reactor)
+    address, wall, store = settings.web, seams.wall, settings.node.store
+    operator = None
+    if address.yard is not None:
+        operator = YardOperator(TcpConnector(), reactor, address.yard.host, address.yard.port)
     client = TeamClient(node)
     desk = TeamDesk(client, TASKS, DEMO, operator)
-    ground = Ground(settings, node, client, desk, reactor, seams.wall, seams.rng)
-    tls = None if door is None else door(ground, _names)
+    tls = None if door is None else door(settings, node.store, reactor, wall, seams.rng, _names)
+    team = TeamFallbacks(node, reactor.seconds)
+    phones = gateway(settings, node, seams, reactor, client.view)
 
     def urls() -> list[str]:
         return web.urls(_names())
 
-    hosts = hosts_of(settings, socket.gethostname())
-    board = _board(ground, phones := gateway(ground), _invites(reactor, tls, urls))
-    live = _live(ground)
-    stored = live if settings.node.store == IN_MEMORY else _on_file(ground)
-    glance = Glance(lambda: stored(seams.wall()), reactor.seconds)
-    app = create_app(glance, board, caller(reactor), hosts, seams.wall)
-    events, shots, address = _events(ground, board, live), Shots(desk, reactor), settings.web
-    doors = [] if tls is None else [tls.open]
-    parts = app, events, shots, Files(), board, seams.wall, hosts, doors
-    web = WebService(reactor, address.host, address.port, *parts)
+    authority, fingerprint = (b"", "") if tls is None else (tls.signer.pem, tls.signer.fingerprint)
+    board = Board(
+        desk,
+        sessions(settings, node, reactor, seams.rng, team),
+        Audit(None if store == IN_MEMORY else Path(f"{store}.audit"), wall),
+        fallbacks=team,
+        survey=TeamSurvey(node, client),
+        halts=TeamHalts(client),
+        faults=FaultControl(node, reactor.seconds) if settings.faults.allow else None,
+        phones=phones,
+        invites=TeamInvites(urls, authority, fingerprint, reactor, reactor.getThreadPool()),
+    )
+    live = partial(state_from, client.read, Departed(), settings.node.name)
+    # A memory of the departed of its own: the file lags what is watched by a commit, and one would doubt the other.
+    on_file = partial(state_from, partial(read_records, Path(store)), Departed(), settings.node.name)
+    stored = live if store == IN_MEMORY else on_file
+    web = WebService(
+        reactor,
+        address.host,
+        address.port,
+        Glance(lambda: stored(wall()), reactor.seconds),
+        board,
+        wall,
+        hosts_of(settings, socket.gethostname()),
+        [] if tls is None else [tls.open],
+        live=lambda: live(wall()),
+        version=lambda: (client.version, tuple(node.halt.stops)),
+    )
 
     def tell() -> None:
         where = address.host, lambda: web.port
         invited(settings.node.name, *where, board.sessions.code, web.secure_port, at_terminal())
-        board.fallbacks.serves(urls())
+        team.serves(urls())
 
     return PageService(web, operator, tell, phones)
-
-
-def _operator(settings: Settings, reactor: Any) -> YardOperator | None:
-    """The line to the yard that the page's map shows."""
-    yard = settings.web.yard
-    return None if yard is None else YardOperator(TcpConnector(), reactor, yard.host, yard.port)
-
-
-def _invites(reactor: Any, tls: TlsDoor | None, urls: Callable[[], Sequence[str]]) -> TeamInvites:
-    """Where the page is, and whom a browser has to trust there."""
-    authority, fingerprint = (b"", "") if tls is None else (tls.signer.pem, tls.signer.fingerprint)
-    return TeamInvites(urls, authority, fingerprint, reactor, reactor.getThreadPool())
-
-
-def _board(ground: Ground, phones: Phones, invites: TeamInvites) -> Board:
-    """What the page's routes act on."""
-    team = fallbacks(ground)
-    return Board(
-        ground.desk,
-        sessions(ground, team),
-        audit(ground),
-        chronicle(ground),
-        team,
-        limits(ground),
-        survey(ground),
-        halts(ground),
-        faults(ground),
-        phones,
-        invites,
-    )
-
-
-def _live(ground: Ground) -> Read:
-    """Reads what the node watches."""
-    return partial(state_from, ground.desk.read, Departed(), ground.settings.node.name)
-
-
-def _on_file(ground: Ground) -> Read:
-    """Reads the file of the node's data store."""
-    node = ground.settings.node
-    # A memory of the departed of its own: the file lags what is watched by a commit, and one would doubt the other.
-    return partial(state_from, partial(read_records, Path(node.store)), Departed(), node.name)
-
-
-def _events(ground: Ground, board: Board, live: Read) -> Events:
-    """The stream of what changes."""
-    return Events(
-        lambda: live(ground.wall()),
-        ground.reactor,
-        ground.wall,
-        ground.desk.yard,
-        board.fallbacks.here,
-        board.chronicle,
-        lambda: (ground.desk.version, tuple(ground.node.halt.stops)),
-        board.sessions,
-    )
 
 
 def hosts_of(settings: Settings, machine: str) -> frozenset[str]:

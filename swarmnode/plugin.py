@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import NoReturn
@@ -15,18 +16,18 @@ from twisted.python import usage
 from drivers.errors import DriverError
 from middleware.admission.errors import BadKeyFile
 from middleware.admission.keyfile import MAX_FILE, read_bytes
-from middleware.config.settings import COMMAND_LINE, Settings
+from middleware.config.settings import COMMAND_LINE, NodeSettings, Settings
 from middleware.entangled.clock import use_monotonic_time
 from middleware.entangled.errors import BadStore, PortInUse, TunnelPortInUse
+from middleware.entangled.network.network import Network
 from middleware.errors import BadSetting, MissingExtra, SwarmError, UnknownAgent
 from middleware.node import SwarmNode
-from swarmnode.assembly import FAULTS, checked_team
-from swarmnode.ballast import drop_tls
+from swarmnode.assembly import FAULTS, assembled, checked_team
+from swarmnode.ballast import STARTED_S, drop_tls, warmed_up
 from swarmnode.ports import given_way
 from swarmnode.service import NodeService
-from swarmnode.warmth import STARTED_S, warmed_up
 from swarmnode.web import web_page, with_code
-from swarmnode.world import control_socket, real_seams, resolved
+from swarmnode.world import control_socket, real_network, real_seams, resolved
 from webnode.errors import PortTaken
 
 use_monotonic_time()
@@ -43,8 +44,9 @@ KEYS: Sequence[tuple[type[Exception], str]] = (
 )
 """Which setting to look at for which fault."""
 
-
 KEY_FILE = "team-key-file"
+TRIES = 5
+"""Ports that are tried where programs that start at the same moment take one another's."""
 
 
 class Options(usage.Options):
@@ -129,19 +131,33 @@ def makeService(options: Options) -> IService:
             settings = with_code(settings, seams.rng)
             fronts.append(partial(web_page, settings, seams, reactor))
         reactor.callLater(STARTED_S, warmed_up)
-        return _Checked(settings, seams, fronts)
+        return CheckedService(settings, seams, fronts)
     except FAULTS as error:
         _refuse(told(error, settings.origin))
 
 
-class _Checked(NodeService):
+class CheckedService(NodeService):
     """A node service whose failure to start is one line for a person and exit code 2."""
 
     def startService(self) -> None:
+        """Start; where no port was set and another program took the usual one since it was looked up, at the next."""
         try:
-            super().startService()
+            for left in reversed(range(TRIES)):
+                try:
+                    super().startService()
+                    return
+                except PortInUse:
+                    if not left or self.settings.is_given("node", "port"):
+                        raise
+                self.vanish()
+                self.settings = given_way(self.settings)
+                self._seams = replace(self._seams, network=self._network(self.settings.node))
+                self.assembly = assembled(self.settings, self._seams)
         except FAULTS as error:
             _refuse(told(error, self.settings.origin))
+
+    def _network(self, node: NodeSettings) -> Callable[[], Network]:
+        return real_network(node, self._seams.clock, self._seams.rng)
 
 
 def told(error: Exception, origin: str) -> str:

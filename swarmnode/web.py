@@ -17,7 +17,7 @@ from swarmnode.seams import Seams
 
 def with_code(settings: Settings, rng: random.Random) -> Settings:
     """``settings`` with a code to sign in with: made once, as a node that falls off the network comes back with it."""
-    from webnode.code import draw_code
+    from webnode.password import draw_code
 
     web = settings.web
     return settings if web.code or not web.sign_in else replace(settings, web=replace(web, code=draw_code(rng)))

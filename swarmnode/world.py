@@ -15,12 +15,12 @@ from typing import Any
 from twisted.application.service import IService, Service
 from twisted.logger import Logger
 
-from middleware.config.settings import IN_MEMORY, Settings
+from middleware.config.settings import IN_MEMORY, NodeSettings, Settings
 from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.data.sqlite import SqliteStore
 from middleware.entangled.data.store import Store
 from middleware.entangled.network.interface import is_loopback
-from middleware.entangled.network.network import EVERYWHERE, Address
+from middleware.entangled.network.network import EVERYWHERE, Address, Network
 from middleware.errors import BadSetting
 from middleware.node import SwarmNode
 from swarmnode.seams import Seams
@@ -31,8 +31,6 @@ _log = Logger()
 
 def real_seams(settings: Settings, reactor: Any) -> Seams:
     """The seams of a node that runs on this machine."""
-    from middleware.entangled.network.udp import UdpNetwork
-
     membership = None
     if settings.node.membership:
         from middleware.admission.membership import MembershipFile
@@ -52,9 +50,7 @@ def real_seams(settings: Settings, reactor: Any) -> Seams:
         from middleware.entangled.network.lan import LanMulticast
 
         lan = partial(LanMulticast, reactor, settings.node.host)
-    network = with_tunnels(
-        settings.node, partial(UdpNetwork, reactor, settings.node.host, settings.node.port), reactor, rng, os.environ
-    )
+    network = real_network(settings.node, reactor, rng)
     shelf = None
     if settings.deployment.allow and path != IN_MEMORY:
         from middleware.deployment.shelf import FileShelf
@@ -66,6 +62,13 @@ def real_seams(settings: Settings, reactor: Any) -> Seams:
 
         process = OwnProcess()
     return Seams(reactor, network, store, rng, time.time, shelf=shelf, process=process, membership=membership, lan=lan)
+
+
+def real_network(node: NodeSettings, reactor: Any, rng: random.Random) -> Callable[[], Network]:
+    """What makes the node's UDP port, and its tunnels where it has any."""
+    from middleware.entangled.network.udp import UdpNetwork
+
+    return with_tunnels(node, partial(UdpNetwork, reactor, node.host, node.port), reactor, rng, os.environ)
 
 
 LookUp = Callable[..., Sequence[tuple[Any, ...]]]

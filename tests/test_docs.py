@@ -48,8 +48,8 @@ from swarmnode.driver import pilot
 from tests.layers import write_table
 from tests.role_table import write_tables
 from webnode import channel, limits, live, team
-from webnode.board import AUDITED
-from webnode.routes import orders, phones
+from webnode.audit import AUDITED
+from webnode.routes import devices, phones
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = [
@@ -189,8 +189,8 @@ FIGURES: Sequence[tuple[str, str]] = (
     ("protocol", f"at most {stop_set.MAX_NAMED} stops `[id, by]`, at most {stop_set.MAX_RELEASED} ids of stops"),
     ("protocol", f"by: at most {stop_set.MAX_BY} characters; an id has {stop_set.ID_BYTES} bytes"),
     ("protocol", f"the newest {halt.RECORDED_RELEASES} ids that it released"),
-    ("web", f"`text`, 1 to {orders.MAX_MESSAGE} characters"),
-    ("web", f"`seconds`, {orders.MIN_AWAY_S:g} to {orders.MAX_AWAY_S:g}, default {orders.AWAY_S:g}"),
+    ("web", f"`text`, 1 to {devices.MAX_MESSAGE} characters"),
+    ("web", f"`seconds`, {devices.MIN_AWAY_S:g} to {devices.MAX_AWAY_S:g}, default {devices.AWAY_S:g}"),
     ("web", f"At most {live.MAX_VIEWERS} streams"),
     ("web", f"nobody has asked for {gauge.IDLE:g} s"),
     ("web", f"those with {survey.ENDING_S / 86_400:g} days or less come first"),

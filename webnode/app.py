@@ -66,9 +66,25 @@ def create_app(
     _explain(app)
     _serve_page(app, read)
     dispatch = Dispatch()
+
+    def serve(route: Route) -> None:
+        def answer(**path: str) -> Response:
+            now = wall()
+            who = on_reactor(board.sessions.visitor, _token(), now)
+            guarded(route.role, who)
+            given = checked(route, path, request.args, {} if route.method == "GET" else _body())
+            ask = Ask(given, who, board, read(), _id(), request.remote_addr or "", now, tuple(table))
+            told = on_reactor(dispatch.carry_out, route, ask, limit_s=route.limit_s)
+            is_content = isinstance(told, Content)
+            response = app.response_class(told.body, content_type=told.kind) if is_content else jsonify(told)
+            response.status_code = route.status
+            return response
+
+        app.add_url_rule(_rule(route.path), route.name, answer, methods=[route.method])
+
     for route in table:
         if route.answer is not None:
-            _serve(app, route, tuple(table), read, board, wall, on_reactor, dispatch)
+            serve(route)
     return app
 
 
@@ -125,31 +141,6 @@ def _serve_page(app: Flask, read: Callable[[], State]) -> None:
         response.add_etag()
         response.make_conditional(request)
         return response
-
-
-def _serve(
-    app: Flask,
-    route: Route,
-    table: tuple[Route, ...],
-    read: Callable[[], State],
-    board: Board,
-    wall: Callable[[], float],
-    on_reactor: OnReactor,
-    dispatch: Dispatch,
-) -> None:
-    def answer(**path: str) -> Response:
-        now = wall()
-        who = on_reactor(board.sessions.visitor, _token(), now)
-        guarded(route.role, who)
-        given = checked(route, path, request.args, {} if route.method == "GET" else _body())
-        ask = Ask(given, who, board, read(), _id(), request.remote_addr or "", now, table)
-        told = on_reactor(dispatch.carry_out, route, ask, limit_s=route.limit_s)
-        is_content = isinstance(told, Content)
-        response = app.response_class(told.body, content_type=told.kind) if is_content else jsonify(told)
-        response.status_code = route.status
-        return response
-
-    app.add_url_rule(_rule(route.path), route.name, answer, methods=[route.method])
 
 
 def _rule(path: str) -> str:

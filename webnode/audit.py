@@ -10,12 +10,11 @@ from pathlib import Path
 
 from twisted.logger import Logger
 
-from middleware.config.settings import IN_MEMORY
-from webnode.board import AUDITED, Audit, MemoryAudit, Visitor
 from webnode.field import Json
-from webnode.ground import Ground
+from webnode.visitor import Visitor
 
-ENDING = ".audit"
+AUDITED = 200
+"""Lines of which the newest are told."""
 MOST = 1 << 20
 """Bytes of the file; then it is put aside as ``.1`` and a new one begun, so there are at most two."""
 TAIL = 1 << 16
@@ -23,25 +22,25 @@ QUIET_S, KNOWN = 60.0, 256
 """The same from the same stranger is one line in so many seconds, and of so many strangers that is known."""
 
 
-class FileAudit:
-    """Lines in a file that are kept when the node ends, the newest of them also in memory.
+class Audit:
+    """Lines in the file at ``path``, or in memory alone where that is None; ``wall`` is unix time in seconds.
 
     A file that cannot be written is told of once in the log; the page goes on.
     """
 
     _log = Logger()
 
-    def __init__(self, path: Path, wall: Callable[[], float], most: int = MOST) -> None:
+    def __init__(self, path: Path | None = None, wall: Callable[[], float] = lambda: 0.0, most: int = MOST) -> None:
         self._path = path
         self._wall = wall
         self._most = most
-        self._newest: deque[dict[str, Json]] = deque(_tail(path), maxlen=AUDITED)
+        self._newest: deque[dict[str, Json]] = deque([] if path is None else _tail(path), maxlen=AUDITED)
         self._counts: Counter[tuple[str, str]] = Counter()
         self._strangers: OrderedDict[tuple[str, str, str], list[float]] = OrderedDict()
         self._is_failing = False
 
     def note(self, who: Visitor, source: str, route: str, target: str, outcome: str) -> None:
-        """Keep one line."""
+        """Keep one line: ``route`` is method and path, ``target`` what its path named, ``outcome`` the status."""
         self._counts[who.role, outcome[:3]] += 1
         now = self._wall()
         repeated = self._repeated((source, route, outcome), now) if who.role == "anyone" else 0
@@ -52,8 +51,10 @@ class FileAudit:
         if repeated:
             line["repeated"] = repeated
         self._newest.appendleft(line)
+        if self._path is None:
+            return
         try:
-            self._write(json.dumps(line) + "\n")
+            _write(self._path, json.dumps(line) + "\n", self._most)
         except OSError as error:
             if not self._is_failing:
                 self._log.warn("the audit {path} cannot be written: {error}", path=self._path, error=error)
@@ -62,7 +63,7 @@ class FileAudit:
             self._is_failing = False
 
     def newest(self, count: int) -> list[dict[str, Json]]:
-        """The newest lines, the newest first."""
+        """The newest lines, the newest first; at most ``AUDITED``."""
         return list(self._newest)[:count]
 
     def counts(self) -> Mapping[tuple[str, str], int]:
@@ -81,15 +82,16 @@ class FileAudit:
             self._strangers.popitem(last=False)
         return 0 if known is None else int(known[1])
 
-    def _write(self, line: str) -> None:
-        descriptor = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
-        with open(descriptor, "a", encoding="utf-8") as file:
-            is_full = file.tell() + len(line) > self._most
-            if not is_full:
-                file.write(line)
-        if is_full:
-            os.replace(self._path, self._path.with_name(f"{self._path.name}.1"))
-            self._write(line[: self._most])
+
+def _write(path: Path, line: str, most: int) -> None:
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
+    with open(descriptor, "a", encoding="utf-8") as file:
+        is_full = file.tell() + len(line) > most
+        if not is_full:
+            file.write(line)
+    if is_full:
+        os.replace(path, path.with_name(f"{path.name}.1"))
+        _write(path, line[:most], most)
 
 
 def _tail(path: Path) -> list[dict[str, Json]]:
@@ -109,9 +111,3 @@ def _tail(path: Path) -> list[dict[str, Json]]:
         if isinstance(line, dict):
             found.append(line)
     return found[::-1]
-
-
-def audit(ground: Ground) -> Audit:
-    """The audit in a file, or in memory alone where the store is there, too."""
-    store = ground.settings.node.store
-    return MemoryAudit(ground.wall) if store == IN_MEMORY else FileAudit(Path(f"{store}{ENDING}"), ground.wall)

@@ -1,52 +1,23 @@
-"""Cameras: the newest picture of a device, and who waits for the next one."""
+"""Cameras: the newest picture of a device, and who waits for the next one; streams exist while somebody looks."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
 
 from twisted.internet.interfaces import IDelayedCall, IReactorTime
 from twisted.web.http import Request
 
 from formats.jpeg import size_of
 from webnode.errors import Refusal
+from webnode.resource import argument
 
 POLL_S = 5.0
 LINGER_S = 2.0
 MAX_FRAME = 1 << 20
 
 OnFrame = Callable[[int, bytes, float], None]
+"""Called with the number of a picture, the picture as a JPEG, and the seconds since it was taken."""
 Question = tuple[Request, bytes, IDelayedCall]
-
-
-class FrameSource(Protocol):
-    """Where camera pictures come from; the stream to a robot's node exists only while somebody looks."""
-
-    def watch(self, uuid: str, on_frame: OnFrame) -> Callable[[], None]:
-        """Call ``on_frame(seq, jpeg, age)`` for each new picture of a device until what is returned is called.
-
-        ``age`` is in seconds, since it was taken.
-        Raises ``Refusal`` where the device has no camera or is not there.
-        """
-
-
-class MemoryFrames:
-    """A frame source in memory: ``show`` hands over a picture; ``watched`` says whose pictures are wanted."""
-
-    def __init__(self) -> None:
-        self.watched: dict[str, OnFrame] = {}
-        self.opened = 0
-
-    def watch(self, uuid: str, on_frame: OnFrame) -> Callable[[], None]:
-        """Watch ``uuid``; every device has a camera here."""
-        self.watched[uuid] = on_frame
-        self.opened += 1
-        return lambda: self.watched.pop(uuid, None) and None
-
-    def show(self, uuid: str, seq: int, jpeg: bytes, age: float = 0.0) -> None:
-        """Hand over one picture, if somebody watches."""
-        if uuid in self.watched:
-            self.watched[uuid](seq, jpeg, age)
 
 
 class Camera:
@@ -70,13 +41,13 @@ class Camera:
 
     def wait(self, request: Request) -> None:
         """Answer ``request`` with the first picture that is news to it."""
-        viewer = _argument(request, b"viewer")
+        viewer = argument(request, b"viewer")
         for entry in [entry for entry in self.waiting if viewer and entry[1] == viewer]:
             self._release(entry)
         if self._linger is not None:
             self._linger.cancel()
             self._linger = None
-        if self._newest is not None and _argument(request, b"after") != str(self._newest[0]).encode():
+        if self._newest is not None and argument(request, b"after") != str(self._newest[0]).encode():
             self._send(request)
             self._rest()
             return
@@ -148,8 +119,3 @@ class Camera:
         self._ended = True
         self._stop_upstream()
         self._on_end()
-
-
-def _argument(request: Request, name: bytes) -> bytes:
-    values: list[bytes] = (request.args or {}).get(name, [b""])
-    return values[0][:40]

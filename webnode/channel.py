@@ -15,9 +15,10 @@ from twisted.web.http import HTTPChannel
 from twisted.web.server import Request as SiteRequest
 from twisted.web.server import Site
 
-from webnode.board import Kept, Limits, Visitor
 from webnode.errors import Refusal
 from webnode.guard import HEADERS, MAX_BODY
+from webnode.limits import AddressLimits, Kept
+from webnode.visitor import Visitor
 
 HEAD_S = 10.0
 """A request's lines are complete so long after its first byte, or after the connection was made."""
@@ -94,7 +95,7 @@ class Channel(HTTPChannel):
 
     factory: Any
     transport: Any
-    limits: Limits
+    limits: AddressLimits
     _phase = "idle"
     _due: IDelayedCall | None = None
     _stalled: IDelayedCall | None = None
@@ -249,7 +250,7 @@ class Channel(HTTPChannel):
         self.transport.abortConnection()
 
 
-def limited(site: Site, limits: Limits) -> None:
+def limited(site: Site, limits: AddressLimits) -> None:
     """Have the connections of ``site`` keep to ``limits`` and to the deadlines above."""
     held: Any = site
     held.protocol = Channel

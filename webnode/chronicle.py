@@ -11,8 +11,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from webnode.board import Chronicle, Entry
-from webnode.ground import Ground
 from webnode.state import GONE, State
 
 KEPT = 2000
@@ -23,9 +21,17 @@ EXECUTING = "EXECUTING"
 DECIDED = ("COMPLETED", "FAILED", "CANCELLED")
 
 
-def chronicle(ground: Ground) -> Chronicle:
-    """What this node sees from now on."""
-    return TeamChronicle()
+@dataclass(frozen=True)
+class Entry:
+    """Something that happened: ``n`` counts them, ``at`` is unix seconds, ``seconds`` how long it took (or None)."""
+
+    n: int
+    at: float
+    kind: str
+    uuid: str
+    task: str
+    text: str
+    seconds: float | None = None
 
 
 @dataclass

@@ -17,8 +17,6 @@ from middleware.admission.roles import GATEWAY
 from middleware.directory.presence import Device, devices_of
 from middleware.entangled.record import Record
 from middleware.node import SwarmNode
-from webnode.board import Page
-from webnode.ground import Ground
 from webnode.guard import is_local_name
 
 REMEMBERED_S = 3600.0
@@ -29,6 +27,35 @@ MAX_GONE = 256
 """Pages that are gone and remembered, the newest."""
 PORTS = {"http": 80, "https": 443}
 ANY = ("0.0.0.0", "::", "")
+
+
+@dataclass(frozen=True)
+class Page:
+    """A URL at which a node of the team serves the page; ``node`` is the node's uuid."""
+
+    node: str
+    url: str
+    is_secure: bool = False
+    is_self: bool = False
+
+
+class Fallbacks:
+    """The web nodes of the team; this one knows those that it was made with, and hears of no others."""
+
+    def __init__(self, *pages: Page) -> None:
+        self.pages = list(pages)
+
+    def here(self) -> list[Page]:
+        """Where the page is served now."""
+        return self.pages
+
+    def serves(self, urls: Iterable[str]) -> None:
+        """Tell the team that this node serves the page at ``urls``, too; call it when the port is open."""
+        self.pages += [Page("here", url, url.startswith("https:"), True) for url in urls]
+
+    def lets_in(self, origin: str) -> bool:
+        """Whether a page that came from ``origin`` may ask here: it is, or was a short while ago, one of the team's."""
+        return origin in [page.url for page in self.pages]
 
 
 def origin_of(url: str) -> str:
@@ -86,7 +113,7 @@ class _Served:
     end: float = inf
 
 
-class TeamFallbacks:
+class TeamFallbacks(Fallbacks):
     """The web nodes of a running team; ``clock`` counts seconds.
 
     Those that count are gateways: in a closed team whoever has that role now, in an open one, where everybody may do
@@ -101,7 +128,7 @@ class TeamFallbacks:
         self._watch = node.watch_devices(self._follow, keep=True)
 
     def serves(self, urls: Iterable[str]) -> None:
-        """Tell the team that this node serves the page there too; call it when the port is open."""
+        """Tell the team that this node serves the page at ``urls``, too; call it when the port is open."""
         pages = [*self._node.presence.device.pages, *urls]
         self._node.presence.change(pages=tuple(dict.fromkeys(pages))[:MAX_URLS])
         self._follow(self._watch.records)
@@ -152,8 +179,3 @@ class TeamFallbacks:
             if each.end > now and (each.public, each.page.url) not in known
         ]
         self._served = here + sorted(gone, key=lambda each: -each.end)[:MAX_GONE]
-
-
-def fallbacks(ground: Ground) -> TeamFallbacks:
-    """The web nodes of the team."""
-    return TeamFallbacks(ground.node, ground.reactor.seconds)

@@ -16,10 +16,8 @@ from middleware.errors import BadFault
 from middleware.faults.kinds import ASKED, CAUSE, KINDS, Fault, begins_in, parse_fault
 from middleware.faults.takeover import Takeover, acting
 from middleware.node import SwarmNode
-from webnode.board import Faults
 from webnode.errors import Refusal
 from webnode.field import Json, text
-from webnode.ground import Ground
 
 PATIENCE_S = 1.5
 """Seconds for which a device may think about an order; whoever gave it waits for two."""
@@ -58,7 +56,11 @@ class FaultControl:
         return self._kinds.get(uuid, ())
 
     def cause(self, uuid: str, kind: str, seconds: float, amount: float | None) -> Deferred[None]:
-        """Ask the device; the clock runs from when it said in its answer that it would begin."""
+        """Cause one, without an ``amount`` as much as is usual; fires when the device has said that it will.
+
+        Fails with ``Refusal``: 400 names the field, 409 and 504 the device.  The clock runs from when the device said
+        that it would begin.
+        """
         try:
             fault = parse_fault(kind, seconds, amount)
         except BadFault as error:
@@ -93,7 +95,12 @@ class FaultControl:
         return asked.addCallbacks(taken, refused)
 
     def active(self) -> list[dict[str, Json]]:
-        """Those that go on or ended a short while ago."""
+        """Those that go on or ended a short while ago, the newest first, and what came of each.
+
+        ``n`` counts them; ``left_s`` and ``since_s`` are its seconds to come and gone; ``task`` is what the device was
+        at; ``takeover_s`` and ``to`` are the seconds until another (by name) acted on that task, None and empty until
+        then; ``watched`` says whether the clock runs.
+        """
         now = self._clock()
         self._caused = [each for each in self._caused if now < each.clock.until + TOLD_S]
         return [self._row(each, now) for each in self._caused]
@@ -151,10 +158,3 @@ class FaultControl:
 
         asked = self._node.entangled.call(contact, ASKED).addCallbacks(told, untold)
         asked.addErrback(lambda failure: self._log.failure("while asking for faults", failure))
-
-
-def faults(ground: Ground) -> Faults | None:
-    """The faults that this node can cause; None where its own settings do not allow them."""
-    if not ground.settings.faults.allow:
-        return None
-    return FaultControl(ground.node, ground.reactor.seconds)

@@ -9,18 +9,11 @@ from twisted.internet.defer import Deferred
 
 from middleware.frontend.client import TeamClient
 from middleware.stop.stop_set import ID_BYTES
-from webnode.board import Halts
 from webnode.errors import Refusal
-from webnode.ground import Ground
-
-
-def halts(ground: Ground) -> Halts | None:
-    """The button of this node."""
-    return TeamHalts(ground.client)
 
 
 class TeamHalts:
-    """The button over ``client``; the devices that are present are told at once."""
+    """Stops the whole team through ``client``; answers map each uuid to ``stands``, or to why it does not."""
 
     def __init__(self, client: TeamClient) -> None:
         self._client = client

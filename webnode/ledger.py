@@ -5,16 +5,19 @@ Flask's threads read the SQLite file, the live stream reads what the node watche
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict
 from typing import Any
 
+from middleware.directory.presence import STOPS_SHOWN
 from middleware.frontend.view import Progress, Read, TeamView
+from middleware.stop.halt import STANDS
 from middleware.tasks.task import Task
-from webnode.state import Departed, State, state_of
-from webnode.stopped import stopped_view
+from webnode.state import GONE, Departed, State, state_of
 
 TASKS_SHOWN = 20
+STOPS_NAMED = 64
+"""Stops that the page names; when these are released it names the next ones."""
 FRESH_S = 0.1
 """A state as old as this will do: nobody can tell, and a hundred who ask at once are answered by ten."""
 
@@ -50,7 +53,7 @@ def state_from(read: Read, departed: Departed, node: str, now: float) -> State:
         rows.append({**_task_row(task, progress, view), "why": asdict(view.explain(task.task_id))})
     device_rows = [dict(vars(device)) for device in devices]
     state = state_of(device_rows, rows, groups, departed=departed.of(device_rows, now), node=node)
-    return {**state, **stopped_view(view.stops, state["devices"])}
+    return {**state, **_stopped_view(view.stops, state["devices"])}
 
 
 def _task_row(task: Task, progress: Progress, view: TeamView) -> dict[str, Any]:
@@ -90,3 +93,38 @@ def _task_row(task: Task, progress: Progress, view: TeamView) -> dict[str, Any]:
         "deadline": task.deadline,
         "result": None if outcome is None else {"by": outcome.by, "took": outcome.took},
     }
+
+
+def _stopped_view(stops: Mapping[str, str], devices: Iterable[State]) -> State:
+    """``halted``, and in ``halt`` the stops, how many robots stand, and what the others say.
+
+    ``halted`` is true only where every robot says that it stands for every stop in force: a stop that was ordered and
+    not confirmed is shown as such, and so is a robot that has not heard a release.
+    ``stops`` (id to operator) are those that the team knows; ``devices`` are the rows of the page.  What a robot said
+    before it left counts, as it stands until it hears a release.
+    """
+    robots = [row for row in devices if row["capabilities"]]
+    standing = [row for row in robots if _stands(row, stops)]
+    # A robot may obey a stop whose records are gone: the page has to name it, or no operator could release it.
+    known = {**dict.fromkeys((stop for row in robots for stop in row["stops"]), ""), **stops}
+    others = [{"name": row["name"], "says": _says(row)} for row in robots if row not in standing]
+    return {
+        "halted": bool(known) and not others,
+        "halt": {
+            "ordered": bool(stops),
+            "stops": [{"id": stop, "by": known[stop]} for stop in sorted(known)[:STOPS_NAMED]],
+            "standing": [row["name"] for row in standing],
+            "others": others if known else [],
+        },
+    }
+
+
+def _stands(row: Mapping[str, Any], stops: Mapping[str, str]) -> bool:
+    obeyed = set(row["stops"])
+    return bool(row["obeys"] == STANDS and obeyed and (obeyed >= set(stops) or len(obeyed) == STOPS_SHOWN))
+
+
+def _says(row: Mapping[str, Any]) -> str:
+    if row["status"] == GONE:
+        return "is gone and has not confirmed"
+    return "has not confirmed" if row["obeys"] in ("", STANDS) else str(row["obeys"])

@@ -1,17 +1,14 @@
-"""Limits: how much one address may have open at once."""
+"""Limits: how much one address may have open at once; whoever opens something counts it, and again when it ends."""
 
 from __future__ import annotations
 
 from collections import Counter
+from typing import Literal
 
-from webnode.board import Kept, Limits
-from webnode.ground import Ground
-
+Kept = Literal["unfinished", "stream", "open"]
+"""Requests that are not complete, answers that are under way (streams and long polls among them), connections."""
 MOST: dict[Kept, int] = {"unfinished": 16, "stream": 128, "open": 256}
-"""Requests that are not complete, answers that are under way (streams and long polls among them), connections.
-
-A browser sends its requests whole; so 16 that are not are many, even of a classroom that comes by one address.
-"""
+"""A browser sends its requests whole; so 16 that are not are many, even of a classroom that comes by one address."""
 
 
 class AddressLimits:
@@ -26,7 +23,7 @@ class AddressLimits:
         return self._counts[kind, address] < self._most[kind]
 
     def count(self, kind: Kept, address: str, by: int) -> None:
-        """Count one more, or one less; nothing is kept of an address that has none."""
+        """Count one more (1), or one less (-1); nothing is kept of an address that has none."""
         self._counts[kind, address] += by
         if not self._counts[kind, address]:
             del self._counts[kind, address]
@@ -34,8 +31,3 @@ class AddressLimits:
     def total(self, kind: Kept) -> int:
         """How many there are of all addresses."""
         return sum(count for (each, _), count in self._counts.items() if each == kind)
-
-
-def limits(ground: Ground) -> Limits:
-    """What the connections of the page keep to."""
-    return AddressLimits()

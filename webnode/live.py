@@ -7,7 +7,7 @@ counted, never queued for: what it gets next is what it missed, or the newest wh
 from __future__ import annotations
 
 import socket
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from functools import partial
 from typing import Any
@@ -20,12 +20,12 @@ from twisted.web.resource import Resource
 from twisted.web.server import NOT_DONE_YET
 from zope.interface import implementer
 
-from webnode.board import Chronicle, MemoryChronicle, OpenSessions, Page, Sessions
-from webnode.camera import Camera, FrameSource
+from webnode.board import Board
+from webnode.camera import Camera, OnFrame
 from webnode.errors import Refusal
 from webnode.guard import token_of
 from webnode.journal import Journal, dumped
-from webnode.resource import JsonResource, answer
+from webnode.resource import JsonResource, answer, argument
 from webnode.state import State
 
 BEAT_S = 0.2
@@ -44,6 +44,9 @@ ENTRIES = 100
 """Of the chronicle, for a page that is opened."""
 SENT_AHEAD, SYSTEM_AHEAD = 4096, 16384
 """Bytes that may wait for a slow client here, and in the system: seconds of a slow line would be the past."""
+
+Watch = Callable[[str, OnFrame], Callable[[], None]]
+"""Looks through the camera of a device until what is returned is called; raises ``Refusal`` where it has none."""
 
 
 @implementer(IPushProducer)
@@ -109,20 +112,19 @@ class Events(JsonResource):
         read: Callable[[], State],
         clock: IReactorTime,
         wall: Callable[[], float],
-        yard: Callable[[], Mapping[str, Any] | None] = lambda: None,
-        pages: Callable[[], Iterable[Page]] = lambda: (),
-        chronicle: Chronicle | None = None,
+        board: Board,
         version: Callable[[], object] | None = None,
-        sessions: Sessions | None = None,
     ) -> None:
         super().__init__()
         self._read = read
         self._clock = clock
         self._wall = wall
-        self._newest: dict[str, Callable[[], Any]] = {"yard": yard, "pages": lambda: [asdict(page) for page in pages()]}
-        self._chronicle = MemoryChronicle() if chronicle is None else chronicle
+        self._board = board
+        self._newest: dict[str, Callable[[], Any]] = {
+            "yard": lambda: board.desk.yard(),
+            "pages": lambda: [asdict(page) for page in board.fallbacks.here()],
+        }
         self._version = version
-        self._sessions = OpenSessions() if sessions is None else sessions
         self._checked_at = 0.0
         self._known: object = None
         self._read_at = -IDLE_S
@@ -152,8 +154,8 @@ class Events(JsonResource):
         request.setHeader("Content-Type", "text/event-stream; charset=utf-8")
         request.setHeader("Cache-Control", "no-store")
         request.setHeader("X-Accel-Buffering", "no")
-        since = request.getHeader("last-event-id") or _argument(request, b"since")
-        is_whole = _argument(request, b"whole") in ("1", "true")
+        since = request.getHeader("last-event-id") or argument(request, b"since").decode("ascii", "replace")
+        is_whole = argument(request, b"whole") in (b"1", b"true")
         viewer = Viewer(request, is_whole, self._journal.number(since), shown(request))
         self._viewers.append(viewer)
         request.notifyFinish().addBoth(lambda _: self._close(viewer))
@@ -203,7 +205,7 @@ class Events(JsonResource):
     def _may_stay(self, viewer: Viewer) -> bool:
         """End the stream of who is signed in no more; tell who will be so soon, and may have it put off."""
         now = self._wall()
-        who = self._sessions.visitor(viewer.ticket, now)
+        who = self._board.sessions.visitor(viewer.ticket, now)
         if who.role == "anyone":
             self._end(viewer)
             return False
@@ -227,7 +229,7 @@ class Events(JsonResource):
         self._known, self._read_at = version, now
         with_state = self._sound("state", lambda: self._journal.take(self._read()))
         if with_state:
-            self._chronicle.saw(self._journal.state, self._wall())
+            self._board.chronicle.saw(self._journal.state, self._wall())
         self._took = self._clock.seconds() - now
 
     def _missed(self, viewer: Viewer, is_again: bool) -> str:
@@ -242,7 +244,7 @@ class Events(JsonResource):
             start = "true," if is_again and not viewer.is_whole else "false,"
             words = [f'id: {journal.id(journal.n)}\nevent: state\ndata: {{"resync":{start}{self._written()}\n\n']
         viewer.heard = journal.n
-        entries = self._chronicle.since(viewer.entry)[-ENTRIES:]
+        entries = self._board.chronicle.since(viewer.entry)[-ENTRIES:]
         if entries:
             viewer.entry = entries[-1].n
             words.append(_event("event", dumped([asdict(entry) for entry in entries])))
@@ -300,11 +302,6 @@ def shown(request: Request) -> str:
     return token_of(request.getHeader("authorization") or "", tickets[0].decode("ascii", "replace"))
 
 
-def _argument(request: Request, name: bytes) -> str:
-    values: list[bytes] = (request.args or {}).get(name, [b""])
-    return values[0][:40].decode("ascii", "replace")
-
-
 class Shots(JsonResource):
     """``/shot/<device>?after=N&viewer=V``: the newest picture whose number is not N, as soon as there is one.
 
@@ -313,9 +310,9 @@ class Shots(JsonResource):
     picture in flight, never a queue.
     """
 
-    def __init__(self, frames: FrameSource, clock: IReactorTime) -> None:
+    def __init__(self, watch: Watch, clock: IReactorTime) -> None:
         super().__init__()
-        self._frames = frames
+        self._watch = watch
         self._clock = clock
         self._cameras: dict[str, Camera] = {}
 
@@ -333,7 +330,7 @@ class Shots(JsonResource):
         camera = self._cameras.get(uuid)
         if camera is None:
             try:
-                camera = Camera(self._clock, lambda seen: self._frames.watch(uuid, seen), lambda: self._end(uuid))
+                camera = Camera(self._clock, lambda seen: self._watch(uuid, seen), lambda: self._end(uuid))
             except Refusal as refusal:
                 return answer(request, refusal)
             self._cameras[uuid] = camera

@@ -1,4 +1,4 @@
-"""Password: the hash of one, made and checked.
+"""Password: the hash of one, made and checked; and the code to sign in with where the settings name none.
 
 scrypt with N = 2^14, r = 8, p = 5 takes 16 MiB, which a small device has, and is one of the choices of the OWASP
 Password Storage Cheat Sheet, beside N = 2^17, p = 1 with 128 MiB.  It takes some tenths of a second, so it never runs
@@ -10,12 +10,21 @@ from __future__ import annotations
 import base64
 import hashlib
 import hmac
+import random
 
 LOG_N, R, P = 14, 8, 5
 MEMORY = 64 * 1024 * 1024
 SALT, SIZE = 16, 32
 LEAST, MOST = 8, 200
 """Characters of a password."""
+LETTERS = "abcdefghjkmnpqrstuvwxyz"
+"""Of a code: none looks like another, or like a digit."""
+
+
+def draw_code(rng: random.Random) -> str:
+    """A code to sign in with."""
+    letters = "".join(rng.choice(LETTERS) for _ in range(8))
+    return f"{letters[:4]}-{letters[4:]}"
 
 
 def hashed(password: str, salt: bytes, log_n: int = LOG_N) -> str:

@@ -56,6 +56,12 @@ def answer(request: Request, refusal: Refusal) -> bytes:
     return json.dumps(refusal.fields).encode()
 
 
+def argument(request: Request, name: bytes) -> bytes:
+    """The first value of that name in the query, at most 40 bytes of it; empty where there is none."""
+    values: list[bytes] = (request.args or {}).get(name, [b""])
+    return values[0][:40]
+
+
 def path_of(request: Request) -> str:
     """The path that was asked for, for people: without its query, which may hold a ticket, and not too long."""
     path: bytes = request.path or b""

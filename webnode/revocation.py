@@ -7,7 +7,7 @@ that starts later reads them.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any
 
 import msgpack
 
@@ -24,43 +24,29 @@ REMEMBERED = 4096
 ID_BYTES = 8
 
 
-class Revocations(Protocol):
-    """Which sessions are over; ``has`` may be asked on any thread."""
-
-    def has(self, token_id: str) -> bool:
-        """Whether that one is."""
-
-    def add(self, token_id: str, until: float) -> None:
-        """End it; whatever was made of it runs out ``until`` then, in unix seconds."""
-
-
-class MemoryRevocations:
-    """Those that were ended here, known to nobody else."""
+class Revocations:
+    """Sessions that were ended here, known to no other node; ``has`` may be asked on any thread."""
 
     def __init__(self) -> None:
-        self._ends: dict[str, float] = {}
+        self._known: dict[str, float] = {}
 
     def has(self, token_id: str) -> bool:
         """Whether it was ended."""
-        return token_id in self._ends
+        return token_id in self._known
 
     def add(self, token_id: str, until: float) -> None:
-        """End it."""
-        self._ends = _newest({**self._ends, token_id: until}, REMEMBERED)
+        """End it; whatever was made of it runs out ``until`` then, in unix seconds."""
+        self._known = _newest({**self._known, token_id: until}, REMEMBERED)
 
 
-class TeamRevocations:
+class TeamRevocations(Revocations):
     """Those that were ended at any web node of the team of ``node``."""
 
     def __init__(self, node: SwarmNode) -> None:
+        super().__init__()
         self._node = node
         self._own: dict[str, float] = {}
-        self._known: dict[str, float] = {}
         self._watch = node.entangled.watch(REVOKED, self._heard, keep=True)
-
-    def has(self, token_id: str) -> bool:
-        """Whether it was ended anywhere."""
-        return token_id in self._known
 
     def add(self, token_id: str, until: float) -> None:
         """End it here at once, and tell the others."""

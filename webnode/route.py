@@ -13,15 +13,16 @@ from typing import Annotated, Any, Literal
 from msgspec import Meta
 
 from formats.convert import Invalid, Secret, Unit, convert_value, nearest_of
-from webnode.board import Board, Role, Visitor
+from webnode.board import Board
 from webnode.errors import Refusal
-from webnode.field import Json, text
+from webnode.field import MAX_ENTRIES, MAX_TEXT, text
 from webnode.state import GONE, State
+from webnode.visitor import Role, Visitor
 
 API = "/api/v1"
 MAX_NUMBER = 1e9
-MAX_ENTRIES = 64
-MAX_TEXT = 300
+REQUIRED: Any = object()
+"""Stands for the default of a field that has none."""
 ALLOWED: Mapping[Role, tuple[Role, ...]] = {
     "anyone": ("anyone", "viewer", "operator", "phone"),
     "viewer": ("viewer", "operator", "phone"),
@@ -42,7 +43,7 @@ class Field:
     """One value that a route takes.
 
     ``least`` and ``most`` bound a number, the characters of a text (1 to 300 where they are not given) or the entries
-    of a list.  ``default`` holds where a field that is not required is missing.
+    of a list.  ``default`` holds where the field is missing; without one it has to be given.
     """
 
     name: str
@@ -52,9 +53,11 @@ class Field:
     least: float | None = None
     most: float | None = None
     choices: tuple[str, ...] = ()
-    default: Json = None
-    is_required: bool = True
+    default: Any = REQUIRED
     unit: str = ""
+
+
+DEVICE = Field("uuid", "text", "the device", "path", most=64)
 
 
 @dataclass(frozen=True)
@@ -134,7 +137,7 @@ def checked(route: Route, path: Mapping[str, str], query: Mapping[str, str], bod
         if field.name in place:
             value = place[field.name]
             given[field.name] = _value(field, value if field.where == "body" else _read(field, value))
-        elif field.is_required:
+        elif field.default is REQUIRED:
             raise Refusal(field.name, "it is missing", f"give {field.about}")
         else:
             given[field.name] = field.default

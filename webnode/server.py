@@ -16,7 +16,6 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any
 
-from flask import Flask
 from twisted.application.service import Service
 from twisted.internet.defer import Deferred, gatherResults, maybeDeferred
 from twisted.internet.error import CannotListenError
@@ -31,8 +30,7 @@ from twisted.web.server import Site
 from twisted.web.wsgi import WSGIResource
 
 from webnode.app import OnReactor, create_app
-from webnode.board import Board, Role
-from webnode.camera import FrameSource
+from webnode.board import Board
 from webnode.channel import CappedRequest, limited
 from webnode.errors import PortTaken, Refusal
 from webnode.fallback import urls_at
@@ -42,6 +40,7 @@ from webnode.resource import JsonResource, Refused
 from webnode.route import Route, guarded
 from webnode.routes.table import TABLE
 from webnode.state import State
+from webnode.visitor import Role
 
 WORKERS = 4
 LIMIT_S = 2.0
@@ -240,7 +239,9 @@ class WebService(Service):
     """The page as a service of the node's process.
 
     ``startService`` raises ``PortTaken`` (one line for a person) where the port cannot be had; ``port`` 0 takes
-    any, see ``port``.  ``doors`` open further ports for the same page.
+    any, see ``port``.  ``read`` returns the newest state on any thread, ``live`` on the reactor's (as ``read`` where it
+    is None), where ``version`` may spare reading it again (see ``Events``); ``wall`` is the unix time in seconds.
+    ``doors`` open further ports for the same page.
     """
 
     name = "web"
@@ -250,26 +251,25 @@ class WebService(Service):
         reactor: Any,
         host: str,
         port: int,
-        app: Flask,
-        events: Events,
-        shots: Shots,
-        static: Resource,
+        read: Callable[[], State],
         board: Board,
         wall: Callable[[], float],
         hosts: Collection[str] = (),
         doors: Sequence[Door] = (),
         table: Sequence[Route] = TABLE,
+        live: Callable[[], State] | None = None,
+        version: Callable[[], object] | None = None,
     ) -> None:
         self._reactor = reactor
         self._host = host
         self._wanted = port
         self._doors = doors
         self._pool = ThreadPool(1, WORKERS, "web")
-        flask = WSGIResource(reactor, self._pool, app)
-        native: dict[str, Resource] = {"/events": events, "/shot": shots, "/static": static}
+        flask = WSGIResource(reactor, self._pool, create_app(read, board, caller(reactor), hosts, wall, table))
+        self._events = Events(live or read, reactor, wall, board, version)
+        self._shots = Shots(board.desk.watch, reactor)
+        native: dict[str, Resource] = {"/events": self._events, "/shot": self._shots, "/static": Files()}
         native.update({route.path: route.native(board, reactor) for route in table if route.native is not None})
-        self._events = events
-        self._shots = shots
         root = Root(flask, native, board, wall, hosts, table)
         self.site = QuietSite(root, requestFactory=CappedRequest, timeout=30)
         self.site.displayTracebacks = False
@@ -321,23 +321,3 @@ class WebService(Service):
         # Waits for the workers, which at that moment may wait for the reactor to take their answer: not on its thread.
         closed.append(deferToThreadPool(self._reactor, self._reactor.getThreadPool(), self._pool.stop))
         return gatherResults(closed).addCallback(lambda _: None)
-
-
-def web_service(
-    reactor: Any,
-    host: str,
-    port: int,
-    read: Callable[[], State],
-    board: Board,
-    frames: FrameSource,
-    wall: Callable[[], float],
-    hosts: Collection[str] = (),
-    doors: Sequence[Door] = (),
-    table: Sequence[Route] = TABLE,
-) -> WebService:
-    """The whole web node from what the front door has; ``wall`` is the unix time in seconds."""
-    app = create_app(read, board, caller(reactor), hosts, wall, table)
-    desk, here = board.desk, board.fallbacks.here
-    events = Events(read, reactor, wall, desk.yard, here, board.chronicle, sessions=board.sessions)
-    shots = Shots(frames, reactor)
-    return WebService(reactor, host, port, app, events, shots, Files(), board, wall, hosts, doors, table)

@@ -13,16 +13,16 @@ from typing import Any
 from twisted.internet.defer import Deferred, DeferredSemaphore, fail, succeed
 from twisted.internet.threads import deferToThreadPool
 
+from middleware.config.settings import Settings
 from middleware.errors import BadSetting
-from webnode.board import OpenSessions, Role, Sessions, Token, Visitor
-from webnode.code import draw_code
+from middleware.node import SwarmNode
 from webnode.delay import SOURCES, Delays, network_of
 from webnode.errors import Refusal
 from webnode.fallback import TeamFallbacks, is_loopback
-from webnode.ground import Ground
-from webnode.password import is_password, read
-from webnode.revocation import MemoryRevocations, Revocations, TeamRevocations
+from webnode.password import draw_code, is_password, read
+from webnode.revocation import Revocations, TeamRevocations
 from webnode.token import MAX_PARENTS, MAX_VOUCHERS, SESSION_BYTES, Claim, TokenKey
+from webnode.visitor import OpenSessions, Role, Sessions, Token, Visitor
 
 SIGNED_S = 12 * 3600.0
 """How long one is signed in, unless the page has it renewed."""
@@ -77,7 +77,7 @@ class SignedSessions:
         self._rng = rng
         self._check = check
         self._attempts = Attempts()
-        self._revoked = MemoryRevocations() if revoked is None else revoked
+        self._revoked = Revocations() if revoked is None else revoked
         self.signed_s = signed_s
         self._gate = DeferredSemaphore(AT_ONCE)
 
@@ -208,10 +208,10 @@ class Attempts:
         return network_of(source) in self._known or is_loopback(source)
 
 
-def sessions(ground: Ground, team: TeamFallbacks) -> Sessions:
+def sessions(settings: Settings, node: SwarmNode, reactor: Any, rng: random.Random, team: TeamFallbacks) -> Sessions:
     """Who may come in; raises ``BadSetting`` where the settings would let in everybody of the network."""
-    web, origin = ground.settings.web, ground.settings.origin
-    key = TokenKey(ground.node.entangled.identity)
+    web, origin = settings.web, settings.origin
+    key = TokenKey(node.entangled.identity)
     if not web.sign_in:
         if not is_loopback(web.host):
             problem = f"is false, and {web.host} serves more than this machine"
@@ -226,11 +226,10 @@ def sessions(ground: Ground, team: TeamFallbacks) -> Sessions:
             ) from error
 
     def check(text: str, password: str) -> Deferred[Any]:
-        return deferToThreadPool(ground.reactor, ground.reactor.getThreadPool(), is_password, text, password)
+        return deferToThreadPool(reactor, reactor.getThreadPool(), is_password, text, password)
 
-    revoked = TeamRevocations(ground.node)
-    code = web.code or draw_code(ground.rng)
-    return SignedSessions(key, team.may_vouch, code, web.password, ground.rng, check, revoked)
+    code = web.code or draw_code(rng)
+    return SignedSessions(key, team.may_vouch, code, web.password, rng, check, TeamRevocations(node))
 
 
 def _wrong() -> Refusal:

@@ -18,10 +18,8 @@ from middleware.entangled.reach.passage import KINDS
 from middleware.entangled.wire.rebuff import SIDES
 from middleware.frontend.client import TeamClient
 from middleware.node import SwarmNode
-from webnode.board import Survey
 from webnode.errors import Refusal
 from webnode.field import MAX_ENTRIES, Json, count, distance, number, text
-from webnode.ground import Ground
 
 PATIENCE_S = 1.2
 """How long a device has to answer; below what the caller of a route waits."""
@@ -29,11 +27,6 @@ FRESH_S = 1.0
 MAX_ASKED = 64
 """Devices that are asked for the view of the network, in the order of joining."""
 OWN: dict[str, Callable[[SwarmNode], dict[str, Any]]] = {INVENTORY: inventory, NETWORK: network, LINKS: links}
-
-
-def survey(ground: Ground) -> Survey | None:
-    """The asker of this node."""
-    return TeamSurvey(ground.node, ground.client)
 
 
 class TeamSurvey:

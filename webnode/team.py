@@ -49,7 +49,11 @@ class YardHand(Protocol):
 
 
 class TeamDesk:
-    """The desk of a running team; ``predefined`` and ``demo`` come from the catalogue of tasks."""
+    """The desk of a running team; ``predefined`` and ``demo`` come from the catalogue of tasks.
+
+    Every method is called on the reactor's thread and returns at once, or returns a Deferred that fires soon.  A wish
+    that cannot be granted raises ``Refusal``; its outcome is seen in the state, not in the answer.
+    """
 
     _log = Logger()
 
@@ -61,11 +65,6 @@ class TeamDesk:
         self._predefined = predefined
         self._demo = demo
         self._yard = yard
-
-    @property
-    def version(self) -> int:
-        """Another number whenever what is known has changed."""
-        return self._client.version
 
     # -- what is known ----------------------------------------------------------------------------------------------
 
@@ -81,11 +80,15 @@ class TeamDesk:
         return self._client.stream_camera(contact, on_frame)
 
     def yard(self) -> Mapping[str, Any] | None:
-        """The newest view from above, or None."""
+        """The newest view from above, or None where there is no yard.
+
+        ``{"walls": [w, h], "dogs": [{"name", "x", "y", "heading", "stripes"}], "target": {"x", "y", "radius"} |
+        None}``; metres and radians, origin in the lower left corner.
+        """
         return None if self._yard is None else self._yard.snapshot
 
     def catalogue(self) -> Sequence[Mapping[str, Any]]:
-        """The predefined tasks."""
+        """The predefined tasks: ``{"name", "title", "requirements"}`` each."""
         return [
             {"name": name, "title": task.title, "requirements": task.requirements}
             for name, task in self._predefined.items()
@@ -104,10 +107,11 @@ class TeamDesk:
         return self._demonstrated(self._client.new_task_id())
 
     def assign(self, name: str, tolerates: int = 1, group: str = "", task_id: str = "") -> Any:
-        """Publish a predefined task; the devices that can do it take it up by themselves.
+        """Publish a predefined task; ``tolerates`` members of its council may be lost at once.
 
-        Those of one ``group`` are divided together.  Where ``task_id`` says what its id is to be, the answer is a
-        Deferred, and a task that is there already, made by another web node for the same wish, is not made again.
+        Those of one ``group`` are divided together.  Returns ``{"id", "able": [names], "refused": {name: [reasons]}}``.
+        Where ``task_id`` says what its id is to be, the answer is a Deferred, and a task that is there already, made by
+        another web node for the same wish, is not made again.
         """
         template = replace(self._template(name, group), tolerates=tolerates)
         if task_id:
@@ -116,7 +120,12 @@ class TeamDesk:
         return self._published(template, self._client.new_task_id())
 
     def preview(self, name: str, group: str = "") -> dict[str, Any]:
-        """Who could take a predefined task and who not, and why; nothing is asked of anybody."""
+        """Who could take a predefined task and who not, and why; nothing is asked of anybody.
+
+        ``{"able": [{"uuid", "name", "busy"}], "refused": {name: [reasons]}, "likely": name | None, "together": [{"id",
+        "title"}]}``; ``busy`` is the task that a device has now, ``likely`` who would take it by what is known already,
+        ``together`` the open tasks that it would be divided together with, as one of ``group``.
+        """
         task = self._template(name, group)
         refused = self._view.unable(task)
         titles = {each.task_id: each.title for each in self._view.tasks}
@@ -146,7 +155,10 @@ class TeamDesk:
         self._quietly(self._client.order(task_id, RESUME))
 
     def message(self, uuid: str, text: str) -> Deferred[dict[str, Any]]:
-        """Send a text to one device, or to all; fires with who has it, and by name why others have not."""
+        """Send a text to one device, or to all where ``uuid`` is empty.
+
+        Fires with ``{"delivered": [names], "failed": {name: why}}``; for one device a failure is a ``Refusal``.
+        """
         delivered: list[str] = []
         failed: dict[str, str] = {}
 
@@ -187,16 +199,16 @@ class TeamDesk:
         asked = self._client.call(uuid, method, *arguments, timeout=PATIENCE, changes=True)
         return asked.addErrback(self._unanswered, uuid, name, until, refused)
 
-    def move_target(self, x: float, y: float) -> Any:
-        """Put the target at (x, y)."""
+    def move_target(self, x: float, y: float) -> Deferred[Any]:
+        """Put the target at (x, y), metres in the yard's frame."""
         return self._with_yard().place_target(x, y).addErrback(_refused)
 
-    def clear_target(self) -> Any:
+    def clear_target(self) -> Deferred[Any]:
         """Take the target away."""
         return self._with_yard().clear_target().addErrback(_refused)
 
-    def move_robot(self, name: str, x: float, y: float, heading: float) -> Any:
-        """Lift a robot of the yard and set it down at (x, y)."""
+    def move_robot(self, name: str, x: float, y: float, heading: float) -> Deferred[Any]:
+        """Lift a robot of the yard and set it down at (x, y), looking along ``heading`` (radians)."""
         return self._with_yard().move_dog(name, x, y, heading).addErrback(_refused, name)
 
     # -- inside -----------------------------------------------------------------------------------------------------

@@ -20,10 +20,9 @@ from twisted.protocols.tls import BufferingTLSTransport, TLSMemoryBIOFactory
 from twisted.web.server import Site
 from zope.interface import implementer
 
-from middleware.config.settings import IN_MEMORY
+from middleware.config.settings import IN_MEMORY, Settings
 from middleware.entangled.data.store import Store
 from webnode.certificate import Authority, Leaf, authority, leaf, nameable, plain, read
-from webnode.ground import Ground
 from webnode.keyfile import Unsafe, keep, kept
 from webnode.server import listening
 
@@ -172,15 +171,16 @@ class TlsDoor:
         return listening(self._reactor, self._host, self._port, connections, "tls_port")
 
 
-def door(ground: Ground, names: Names) -> TlsDoor:
-    """The page's port over TLS."""
-    web, node = ground.settings.web, ground.settings.node
-    store = None if node.store == IN_MEMORY else node.store
-    signer = authority(_seed(ground.node.store, ground.rng), node.name)
-    path = None if store is None else Path(f"{store}{LEAF}")
-    certified = Certified(signer, node.name, path, names, ground.wall, ground.rng)
+def door(
+    settings: Settings, store: Store, reactor: Any, wall: Callable[[], float], rng: random.Random, names: Names
+) -> TlsDoor:
+    """The page's port over TLS, for the node with this ``store``."""
+    web, node = settings.web, settings.node
+    signer = authority(_seed(store, rng), node.name)
+    path = None if node.store == IN_MEMORY else Path(f"{node.store}{LEAF}")
+    certified = Certified(signer, node.name, path, names, wall, rng)
     _log.info("phones that trust the authority {fingerprint} trust this node's page", fingerprint=signer.fingerprint)
-    return TlsDoor(ground.reactor, web.host, web.tls_port, signer, certified)
+    return TlsDoor(reactor, web.host, web.tls_port, signer, certified)
 
 
 def _seed(store: Store, rng: random.Random) -> bytes:

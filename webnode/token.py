@@ -16,7 +16,7 @@ from itsdangerous.encoding import base64_decode, base64_encode
 from itsdangerous.signer import SigningAlgorithm
 
 from middleware.entangled.identity import Identity, verified
-from webnode.board import Role
+from webnode.visitor import Role
 
 ROLES: tuple[Role, ...] = ("viewer", "operator", "phone")
 VERSION = 3

@@ -18,17 +18,18 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.admission.membership import MemoryMembership
 from middleware.admission.operator import FIRST
+from middleware.config.settings import Settings
 from swarmnode import invitation
 from swarmnode.rehearsal import VirtualTeam
 from tests.webnode.memory import MemoryDesk
 from webnode.app import create_app
-from webnode.board import Board, OpenSessions, Token, Visitor
+from webnode.board import Board
 from webnode.errors import Refusal
-from webnode.fallback import TeamFallbacks, fallbacks
-from webnode.ground import Ground
+from webnode.fallback import TeamFallbacks
 from webnode.session import SignedSessions, sessions
 from webnode.state import state_of
 from webnode.token import Claim, TokenKey, packed
+from webnode.visitor import OpenSessions, Token, Visitor
 
 CODE = "quiet-otter"
 HOME = "10.0.0.9"
@@ -57,7 +58,7 @@ class Web:
     sessions: SignedSessions
     fallbacks: TeamFallbacks
     node: Any
-    ground: Ground
+    settings: Settings
 
 
 class PageCase(SynchronousTestCase):
@@ -77,12 +78,11 @@ class PageCase(SynchronousTestCase):
         service = self.team.services[name]
         node, rng = service.assembly.node, random.Random(name)
         settings = replace(service.settings, web=replace(service.settings.web, code=CODE))
-        ground = Ground(settings, node, self.team.client, self.team.desk, self.team.clock, self.now, rng)
-        followed = fallbacks(ground)
-        signed = sessions(ground, followed)
-        assert isinstance(followed, TeamFallbacks) and isinstance(signed, SignedSessions)
+        followed = TeamFallbacks(node, self.team.clock.seconds)
+        signed = sessions(settings, node, self.team.clock, rng, followed)
+        assert isinstance(signed, SignedSessions)
         followed.serves([f"http://127.0.0.1:{port}"])
-        return Web(signed, followed, node, ground)
+        return Web(signed, followed, node, settings)
 
     def now(self) -> float:
         """The wall clock of all."""
@@ -354,9 +354,13 @@ class TlsTests(PageCase):
         from webnode.certificate import authority
         from webnode.tls import door
 
-        signers = [door(web.ground, lambda: []).signer for web in (self.vaio, self.pi)]
+        def signer(web: Web) -> Any:
+            rng = random.Random(web.settings.node.name)
+            return door(web.settings, web.node.store, self.team.clock, self.now, rng, list).signer
+
+        signers = [signer(web) for web in (self.vaio, self.pi)]
         self.assertNotEqual(signers[0].pem, signers[1].pem)
-        self.assertEqual(door(self.vaio.ground, lambda: []).signer.pem, signers[0].pem)
+        self.assertEqual(signer(self.vaio).pem, signers[0].pem)
         for secret in [*self.secrets(), hashlib.blake2s(b"").digest()]:
             page = hashlib.blake2s(secret, person=b"page").hexdigest()
             for known in (secret, hashlib.blake2s(page.encode()).digest()):

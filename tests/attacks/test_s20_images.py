@@ -37,8 +37,8 @@ from middleware.tasks.task import Task
 from sim.robots.emulator.body import MemoryBody
 from sim.robots.emulator.camera import MjpegCamera
 from swarmnode.gateway import sides
+from tests.webnode.memory import MemoryFrames
 from webnode.camera import Camera as WebCamera
-from webnode.camera import MemoryFrames
 from webnode.errors import Refusal
 
 SIZE = Size(0.05, 0.2)

@@ -33,15 +33,18 @@ from middleware.faults.kinds import KINDS
 from swarmnode.gateway import sides
 from tests.live.keys import GATEWAYS, key_of
 from tests.webnode.memory import MemoryDesk, MemoryFaults, MemoryHalts, MemoryPhones, MemorySurvey
-from webnode.board import Board, MemoryAudit, MemoryFallbacks, Page, Token, Visitor
+from webnode.audit import Audit
+from webnode.board import Board
 from webnode.camera import OnFrame
 from webnode.chronicle import TeamChronicle
+from webnode.fallback import Fallbacks, Page
 from webnode.invite import TeamInvites
 from webnode.limits import AddressLimits
 from webnode.password import hashed, is_password
-from webnode.server import WebService, web_service
+from webnode.server import WebService
 from webnode.session import NOBODY, SignedSessions
 from webnode.state import Departed, State, state_of
+from webnode.visitor import Token, Visitor
 
 reactor: Any = _reactor
 PASSWORD = hashed("correct horse", bytes(16), 4)
@@ -283,12 +286,12 @@ class Orders(LineReceiver):
     def _begin(self, port: int) -> None:
         """Serve a new team, and say where it is and how to come in."""
         self._team = team = Team()
-        pages = MemoryFallbacks()
+        pages = Fallbacks()
         self._pages = pages.pages
         served = replace(board(team), fallbacks=pages)
         assert isinstance(served.sessions, SignedSessions) and isinstance(served.desk, MemoryDesk)
         self._sessions, self._desk = served.sessions, served.desk
-        self._web = web_service(reactor, "127.0.0.1", port, team.read, served, team, time.time, ("vaio.local",))
+        self._web = WebService(reactor, "127.0.0.1", port, team.read, served, time.time, ("vaio.local",))
         pages_here = ["http://192.168.0.7:8080", "https://192.168.0.7:8443", f"http://127.0.0.1:{port}"]
         served.invites = TeamInvites(lambda: pages_here, b"PEM", "AB:CD:" * 10, reactor, reactor.getThreadPool())
         self._web.startService()
@@ -331,6 +334,7 @@ def board(team: Team) -> Board:
     """What the page can ask for: twins in memory, so that every order is taken and none does harm."""
     desk = MemoryDesk(CATALOGUE, team.yard)
     able = [{"uuid": f"{n:02x}" * 16, "name": f"dog{n}", "busy": "Patrol the yard" * (n == 2)} for n in (1, 2)]
+    desk.frames = team
     desk.previews["search"] = {"able": able, "refused": {"dog3": ["no gripper", "no lift"]}, "likely": None}
     desk.together["yard"] = [{"id": "t1", "title": "Find and touch the red target"}]
     gateways = {key_of(name).public for name in GATEWAYS}
@@ -339,7 +343,7 @@ def board(team: Team) -> Board:
     survey = MemorySurvey(network(), {f"0{n}" * 16: inventory() for n in (1, 2)}, links(), membership())
     parts: dict[str, Any] = {"halts": team.halts, "survey": survey, "chronicle": TeamChronicle()}
     parts["faults"], parts["phones"] = MemoryFaults(*KINDS), MemoryPhones(check=sides)
-    return Board(desk, sessions, MemoryAudit(time.time), limits=AddressLimits(), **parts)
+    return Board(desk, sessions, Audit(wall=time.time), limits=AddressLimits(), **parts)
 
 
 class TeamSessions(SignedSessions):

@@ -19,13 +19,13 @@ from twisted.web.static import Data
 
 from tests.webnode.memory import MemoryDesk
 from tests.webnode.picture import jpeg
-from webnode.board import Board, OpenSessions
-from webnode.camera import MemoryFrames
+from webnode.board import Board
 from webnode.errors import PortTaken
 from webnode.route import Route
 from webnode.routes.table import TABLE
-from webnode.server import WORKERS, WebService, web_service
+from webnode.server import WORKERS, WebService
 from webnode.state import State, state_of
+from webnode.visitor import OpenSessions
 
 reactor: Any = _reactor
 
@@ -68,7 +68,7 @@ class WebServiceTests(TestCase):
         self.gate.set()
         self.held = threading.Event()
         self.desk = MemoryDesk()
-        self.frames = MemoryFrames()
+        self.frames = self.desk.frames
         self.web = self.service(0)
         self.web.startService()
         self.pool = HTTPConnectionPool(reactor, persistent=False)
@@ -83,7 +83,7 @@ class WebServiceTests(TestCase):
 
     def service(self, port: int) -> WebService:
         board = Board(self.desk, OpenSessions())
-        return web_service(reactor, "127.0.0.1", port, self.read, board, self.frames, lambda: 1e9)
+        return WebService(reactor, "127.0.0.1", port, self.read, board, lambda: 1e9)
 
     def read(self) -> State:
         if threading.current_thread() is not threading.main_thread():
@@ -116,13 +116,6 @@ class WebServiceTests(TestCase):
         self.frames.show("01", 1, jpeg())
         self.assertEqual(await readBody(await asked), jpeg())
         self.assertEqual(json.loads(await self.body("/api/v1/demo", b"POST")), {"id": "demo-1"})
-
-    async def test_push_changes(self) -> None:
-        """A device that joins is on the open page by itself."""
-        stream = await self.opened("/events")
-        await stream.said(b"dog1")
-        self.devices.append({"uuid": "02", "name": "dog2", "joined": 2})
-        await stream.said(b"dog2")
 
     async def test_stream_while_workers_are_stuck(self) -> None:
         """With every worker held, states, files and pictures still go out; afterwards the held answers come too."""
@@ -185,9 +178,7 @@ class WebServiceTests(TestCase):
             "GET", "/api/v1/note", "A note", "anyone", None, native=lambda board, clock: Data(b"hi", "text/plain")
         )
         board = Board(self.desk, OpenSessions())
-        web = web_service(
-            reactor, "127.0.0.1", 0, self.read, board, self.frames, lambda: 1e9, doors=[door], table=[*TABLE, native]
-        )
+        web = WebService(reactor, "127.0.0.1", 0, self.read, board, lambda: 1e9, doors=[door], table=[*TABLE, native])
         web.startService()
         url = f"http://127.0.0.1:{opened[0].getHost().port}".encode()
         for path, words in ((b"/", b"vaio"), (b"/api/v1/note", b"hi"), (b"/api/v1/state", b"dog1")):

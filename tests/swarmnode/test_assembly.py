@@ -5,9 +5,8 @@ from __future__ import annotations
 import random
 from typing import Any
 
-from twisted.logger import ILogObserver, LogEvent, formatEvent, globalLogPublisher
+from twisted.logger import capturedLogs, formatEvent
 from twisted.trial.unittest import SynchronousTestCase
-from zope.interface import implementer
 
 from drivers.driver import Filming
 from middleware.config.settings import Settings
@@ -72,18 +71,9 @@ class AssemblyTests(SynchronousTestCase):
 
     def test_lost_identity_is_said(self) -> None:
         """A node whose store was there before and has no identity any more says that it is a new one."""
-        lines: list[str] = []
-
-        @implementer(ILogObserver)
-        def seen(event: LogEvent) -> None:
-            lines.append(formatEvent(event))
-
-        globalLogPublisher.addObserver(seen)
-        self.addCleanup(globalLogPublisher.removeObserver, seen)
-        store = MemoryStore()
-        identity_in(store, random.Random(1))
-        self.assertEqual(lines, [])
         lost = MemoryStore()
         lost.origin = "replaced"
-        identity_in(lost, random.Random(1))
-        self.assertIn("this node is a new one now", "".join(lines))
+        for store, words in ((MemoryStore(), []), (lost, ["the data store has lost the node's identity"])):
+            with capturedLogs() as said:
+                identity_in(store, random.Random(1))
+            self.assertEqual([formatEvent(each).partition(":")[0] for each in said], words)

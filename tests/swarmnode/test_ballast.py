@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import subprocess
 import sys
 from pathlib import Path
 
 from twisted.trial.unittest import SynchronousTestCase
+
+from swarmnode.ballast import warmed_up
 
 ROOT = Path(__file__).resolve().parents[2]
 LOADED = "pyOpenSSL is loaded"
@@ -60,3 +63,13 @@ class BallastTests(SynchronousTestCase):
             told = self.said("-c", f"from swarmnode.command import main; main({list(verb)!r})")
             self.assertNotIn(LOADED, told)
             self.assertNotIn("Traceback", told)
+
+    def test_look_at_what_is_new_only(self) -> None:
+        """What was there before is looked through no more for garbage; what came after is."""
+        self.addCleanup(gc.unfreeze)
+        before: list[object] = [[]]
+        warmed_up()
+        after: list[object] = [[]]
+        looked_at = {id(each) for each in gc.get_objects()}
+        self.assertNotIn(id(before), looked_at)
+        self.assertIn(id(after), looked_at)

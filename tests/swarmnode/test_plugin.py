@@ -12,12 +12,15 @@ from typing import Any
 from twisted.trial.unittest import SynchronousTestCase
 
 from drivers.registry import kinds
-from middleware.config.settings import Settings
+from middleware.config.settings import NODE_PORT, Settings
 from middleware.entangled.errors import BadStore, PortInUse, TunnelPortInUse
 from middleware.entangled.network.network import Address
 from middleware.errors import BadSetting, UnknownAgent
-from swarmnode.plugin import Options, makeService, told
+from swarmnode import plugin
+from swarmnode.plugin import CheckedService, Options, makeService, told
+from swarmnode.ports import given_way
 from swarmnode.world import resolved
+from tests.swarmnode.team import KEY, World
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -52,59 +55,43 @@ class RefusalTests(SynchronousTestCase):
         for part in ("swarm-node: ", *parts):
             self.assertIn(part, line)
 
-    def test_refuse_unknown_key(self) -> None:
-        """An unknown key is refused with file, key and the nearest lawful one."""
-        path = self.file('[node]\nname = "a"\nteam_key = "t"\nprot = 7\n')
-        self.assert_says(self.refusal("--config", path), path, "[node] prot", "the nearest is port")
-
-    def test_refuse_wrong_type(self) -> None:
-        """A value of the wrong type is refused with file, key and what to write."""
-        path = self.file('[node]\nname = "a"\nteam_key = "t"\nport = "high"\n')
-        self.assert_says(self.refusal("--config", path), path, "[node] port", "such as 8484")
-
-    def test_refuse_missing_file(self) -> None:
-        """A settings file that is not there is named."""
-        path = str(self.folder / "nowhere.toml")
-        self.assert_says(self.refusal("--config", path), path, "cannot be read", "name a settings file")
-
-    def test_refuse_missing_name(self) -> None:
-        """Without a file the name has to be said, and the line says how."""
-        self.assert_says(self.refusal("--port", "0"), "--name", "is missing")
-
-    def test_refuse_wrong_flags(self) -> None:
-        """A flag with a wrong value is refused under its own name."""
-        self.assert_says(self.refusal("--name", "a b"), "command line: --name")
-        self.assert_says(self.refusal("--name", "a", "--port", "70000"), "command line: --port", "65535")
-        self.assert_says(self.refusal("--name", "a", "--known-nodes", "here"), "--known-nodes", "host:port")
-
-    def test_refuse_unknown_agent(self) -> None:
-        """An agent that does not exist is refused with those that do."""
-        path = self.file('[node]\nname = "a"\nteam_key = "t"\n[driver]\nkind = "sim"\n[agent]\nmodule = "serch"\n')
-        self.assert_says(self.refusal("--config", path, is_made=True), path, "[agent] module", "'serch'", "search")
-
-    def test_refuse_agent_without_robot(self) -> None:
-        """An agent that has no robot to act with is refused, and not left out in silence."""
-        path = self.file('[node]\nname = "a"\nteam_key = "t"\n[agent]\nmodule = "search"\n')
-        self.assert_says(self.refusal("--config", path, is_made=True), path, "[agent] module", "name its [driver] kind")
-
-    def test_refuse_agent_that_cannot_be_imported(self) -> None:
-        """An agent of one's own that cannot be loaded says why."""
-        path = self.file(
-            '[node]\nname = "a"\nteam_key = "t"\n[driver]\nkind = "sim"\n[agent]\nmodule = "no_such_module:Mind"\n'
+    def test_refuse_before_the_start(self) -> None:
+        """What is wrong in file or flags is refused with its place, what is wrong, and what to write instead."""
+        node = '[node]\nname = "a"\nteam_key = "t"\n'
+        texts: tuple[tuple[str, tuple[str, ...]], ...] = (
+            (f"{node}prot = 7\n", ("[node] prot", "the nearest is port")),
+            (f'{node}port = "high"\n', ("[node] port", "such as 8484")),
         )
-        line = self.refusal("--config", path, is_made=True)
-        self.assert_says(line, "[agent] module", "no_such_module")
+        for text, parts in texts:
+            path = self.file(text)
+            self.assert_says(self.refusal("--config", path), path, *parts)
+        missing = str(self.folder / "nowhere.toml")
+        flags: tuple[tuple[tuple[str, ...], tuple[str, ...]], ...] = (
+            (("--config", missing), (missing, "cannot be read", "name a settings file")),
+            (("--port", "0"), ("--name", "is missing")),
+            (("--name", "a b"), ("command line: --name",)),
+            (("--name", "a", "--port", "70000"), ("command line: --port", "65535")),
+            (("--name", "a", "--known-nodes", "here"), ("--known-nodes", "host:port")),
+        )
+        for words, parts in flags:
+            self.assert_says(self.refusal(*words), *parts)
 
-    def test_refuse_unknown_driver(self) -> None:
-        """A kind of robot that there is no driver for is refused with those that there are."""
-        path = self.file('[node]\nname = "a"\nteam_key = "t"\n[driver]\nkind = "simm"\n')
+    def test_refuse_what_cannot_be_made(self) -> None:
+        """Agents, drivers and stores that are not there, or do not go together, are refused with those that are."""
         known = "known are " + ", ".join(kinds())
-        self.assert_says(self.refusal("--config", path, is_made=True), path, "[driver]", "'simm'", known)
-
-    def test_refuse_wrong_driver_option(self) -> None:
-        """A driver's option with a wrong value is refused with the option and what to write."""
-        path = self.file('[node]\nname = "a"\nteam_key = "t"\n[driver]\nkind = "sim"\noptions = { port = "x" }\n')
-        self.assert_says(self.refusal("--config", path, is_made=True), path, "[driver]", "port", "7400")
+        (self.folder / "text.sqlite").write_text("this is a letter " * 99, encoding="utf-8")
+        driver = '[driver]\nkind = "sim"\n'
+        for text, parts in (
+            (f'{driver}[agent]\nmodule = "serch"\n', ("[agent] module", "'serch'", "search")),
+            ('[agent]\nmodule = "search"\n', ("[agent] module", "name its [driver] kind")),
+            (f'{driver}[agent]\nmodule = "no_such_module:Mind"\n', ("[agent] module", "no_such_module")),
+            ('[driver]\nkind = "simm"\n', ("[driver]", "'simm'", known)),
+            (f'{driver}options = {{ port = "x" }}\n', ("[driver]", "port", "7400")),
+            ('store = "text.sqlite"\n', ("[node] store", "text.sqlite")),
+            ('store = "no/such/folder.sqlite"\n', ("[node] store", "no/such/folder.sqlite")),
+        ):
+            path = self.file(f'[node]\nname = "a"\nteam_key = "t"\n{text}')
+            self.assert_says(self.refusal("--config", path, is_made=True), path, *parts)
 
     def test_refuse_foreign_store(self) -> None:
         """A SQLite file of another program is refused, named, and left as it was."""
@@ -115,13 +102,6 @@ class RefusalTests(SynchronousTestCase):
         path = self.file('[node]\nname = "a"\nteam_key = "t"\nstore = "foreign.sqlite"\n')
         self.assert_says(self.refusal("--config", path, is_made=True), path, "[node] store", "foreign.sqlite")
         self.assertEqual(foreign.read_bytes(), before)
-
-    def test_refuse_unreadable_store(self) -> None:
-        """A store that is no SQLite file, or lies in no folder, is refused and named."""
-        (self.folder / "text.sqlite").write_text("this is a letter " * 99, encoding="utf-8")
-        for name in ("text.sqlite", "no/such/folder.sqlite"):
-            path = self.file(f'[node]\nname = "a"\nteam_key = "t"\nstore = "{name}"\n')
-            self.assert_says(self.refusal("--config", path, is_made=True), path, "[node] store", name)
 
     def test_refuse_name_without_address(self) -> None:
         """A known node whose name has no address is refused with the key and the name."""
@@ -146,6 +126,31 @@ class RefusalTests(SynchronousTestCase):
         )
         self.assertEqual(told(BadStore("two\nlines"), "a.toml"), "a.toml: [node] store: two lines")
         self.assertEqual(told(UnknownAgent("x"), ""), "[agent] module: x")
+
+
+class CheckedServiceTests(SynchronousTestCase):
+    def test_take_the_next_port(self) -> None:
+        """A node whose usual port was taken since it was looked up starts at the next; one that was set is refused."""
+        world = World()
+        world.board.network("127.0.0.1", NODE_PORT).listen(lambda datagram, source: None)
+
+        def service(**more: Any) -> CheckedService:
+            made = CheckedService(
+                Settings.from_mapping({"node": {"name": "a", "team_key": KEY, **more}}, "test"),
+                world.seams("a", NODE_PORT),
+            )
+            self.patch(plugin, "real_network", lambda node, *_: lambda: world.board.network(node.host, node.port))
+            return made
+
+        self.patch(plugin, "given_way", lambda settings: given_way(settings, lambda _, host, port: port != NODE_PORT))
+        moved = service()
+        moved.startService()
+        self.addCleanup(moved.stopService)
+        self.assertEqual(moved.assembly.node.entangled.contact.address.port, NODE_PORT + 1)
+        errors = io.StringIO()
+        with contextlib.redirect_stderr(errors):
+            self.assertRaises(SystemExit, service(port=NODE_PORT).startService)
+        self.assertIn("test: [node] port: ", errors.getvalue())
 
 
 class OptionsTests(SynchronousTestCase):

@@ -12,8 +12,8 @@ from twisted.python.failure import Failure
 from twisted.web.resource import IResource
 from twisted.web.server import Site
 
-from webnode.board import Limits
 from webnode.channel import CappedRequest, limited
+from webnode.limits import AddressLimits
 from webnode.server import QuietSite
 
 
@@ -58,7 +58,7 @@ class Connection:
         self.protocol.connectionLost(Failure(ConnectionDone()))
 
 
-def site_of(root: IResource, clock: Clock, limits: Limits | None = None) -> Site:
+def site_of(root: IResource, clock: Clock, limits: AddressLimits | None = None) -> Site:
     """A site on ``clock`` with the web node's own kind of requests, and of connections where there are ``limits``."""
     site = QuietSite(root, requestFactory=CappedRequest, reactor=clock, timeout=None)
     if limits is not None:

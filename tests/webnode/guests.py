@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import get_args
 
-from webnode.board import OpenSessions, Role, Visitor
+from webnode.visitor import OpenSessions, Role, Visitor
 
 
 class Guests(OpenSessions):

@@ -10,30 +10,36 @@ from twisted.internet.defer import Deferred, fail, succeed
 from middleware.config.tuning import WRONG
 from middleware.entangled.errors import Refused
 from webnode.board import Wanted
+from webnode.camera import OnFrame
 from webnode.errors import Refusal
+from webnode.faults import FaultControl
 from webnode.field import Json
+from webnode.halting import TeamHalts
+from webnode.invite import TeamInvites
+from webnode.survey import TeamSurvey
+from webnode.team import TeamDesk
 
 
-class MemorySurvey:
+class MemorySurvey(TeamSurvey):
     """Answers that it was made with: of the network, of each device by uuid, of the links and of the team."""
 
     def __init__(self, network: Json, inventories: Mapping[str, Json], links: Json = None, team: Json = None) -> None:
-        self._network = network
+        self._told_network = network
         self._inventories = inventories
-        self._links = links
-        self._team = team
+        self._told_links = links
+        self._told_team = team
 
     def network(self) -> Deferred[Json]:
         """Return it."""
-        return succeed(self._network)
+        return succeed(self._told_network)
 
     def links(self) -> Deferred[Json]:
         """Return them."""
-        return succeed(self._links)
+        return succeed(self._told_links)
 
     def team(self) -> Json:
         """Return it."""
-        return self._team
+        return self._told_team
 
     def inventory(self, uuid: str) -> Deferred[Json]:
         """Return it, or fail with 504: the device did not answer."""
@@ -42,7 +48,7 @@ class MemorySurvey:
         return succeed(self._inventories[uuid])
 
 
-class MemoryHalts:
+class MemoryHalts(TeamHalts):
     """The button of a team that obeys; ``devices`` are the uuids of those that say so, ``said`` who pressed what."""
 
     def __init__(self, *devices: str) -> None:
@@ -64,17 +70,17 @@ class MemoryHalts:
         return bool(self.said) and self.said[-1][0] == "halt"
 
 
-class MemoryFaults:
+class MemoryFaults(FaultControl):
     """Faults that are only written down, in ``caused`` as (uuid, kind, seconds, amount); ``rows`` are those told of."""
 
     def __init__(self, *kinds: str) -> None:
         self.caused: list[tuple[str, str, float, float | None]] = []
         self.rows: list[dict[str, Json]] = []
-        self._kinds = kinds
+        self._can = kinds
 
     def kinds(self, uuid: str) -> Sequence[str]:
         """Return what it was made with."""
-        return self._kinds
+        return self._can
 
     def cause(self, uuid: str, kind: str, seconds: float, amount: float | None) -> Deferred[None]:
         """Write it down; nothing comes of it."""
@@ -134,7 +140,7 @@ class MemoryPhones:
         return succeed(None)
 
 
-class MemoryInvites:
+class MemoryInvites(TeamInvites):
     """Pages that it was made with, and drawings that only say of what they are."""
 
     def __init__(self, *urls: str, authority: bytes = b"", fingerprint: str = "") -> None:
@@ -154,7 +160,26 @@ class MemoryInvites:
         return succeed(f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 9 9"><title>{title}</title></svg>')
 
 
-class MemoryDesk:
+class MemoryFrames:
+    """A frame source in memory: ``show`` hands over a picture; ``watched`` says whose pictures are wanted."""
+
+    def __init__(self) -> None:
+        self.watched: dict[str, OnFrame] = {}
+        self.opened = 0
+
+    def watch(self, uuid: str, on_frame: OnFrame) -> Callable[[], None]:
+        """Watch ``uuid``; every device has a camera here."""
+        self.watched[uuid] = on_frame
+        self.opened += 1
+        return lambda: self.watched.pop(uuid, None) and None
+
+    def show(self, uuid: str, seq: int, jpeg: bytes, age: float = 0.0) -> None:
+        """Hand over one picture, if somebody watches."""
+        if uuid in self.watched:
+            self.watched[uuid](seq, jpeg, age)
+
+
+class MemoryDesk(TeamDesk):
     """A desk that writes down what it is asked, in ``asked``, and keeps the target of its own small yard."""
 
     def __init__(self, catalogue: Sequence[Mapping[str, Any]] = (), yard: Mapping[str, Any] | None = None) -> None:
@@ -164,6 +189,12 @@ class MemoryDesk:
         self.together: dict[str, list[dict[str, Any]]] = {}
         self.ground: dict[str, Any] | None = dict(yard) if yard is not None else None
         self.settings: dict[str, list[list[Any]]] = {}
+        self.frames: Any = MemoryFrames()
+
+    def watch(self, uuid: str, on_frame: OnFrame) -> Callable[[], None]:
+        """Watch ``frames``."""
+        stop: Callable[[], None] = self.frames.watch(uuid, on_frame)
+        return stop
 
     def call(
         self,
@@ -218,34 +249,35 @@ class MemoryDesk:
         """Write it down."""
         self._noted("resume", task_id)
 
-    def message(self, uuid: str, text: str) -> dict[str, Any]:
+    def message(self, uuid: str, text: str) -> Deferred[dict[str, Any]]:
         """Write it down; nobody is here to have it."""
         self._noted("message", uuid, text)
-        return {"delivered": [], "failed": {}}
+        return succeed({"delivered": [], "failed": {}})
 
-    def disconnect(self, uuid: str, seconds: float) -> None:
+    def disconnect(self, uuid: str, seconds: float) -> Deferred[Any]:
         """Write it down."""
-        self._noted("disconnect", uuid, seconds)
+        return succeed(self._noted("disconnect", uuid, seconds))
 
-    def move_target(self, x: float, y: float) -> None:
+    def move_target(self, x: float, y: float) -> Deferred[bool]:
         """Move it."""
-        self._noted("target", x, y)
-        if self.ground is not None:
-            self.ground = {**self.ground, "target": {"x": x, "y": y, "radius": 0.08}}
+        self._change(target={"x": x, "y": y, "radius": 0.08})
+        return succeed(bool(self._noted("target", x, y)))
 
-    def clear_target(self) -> None:
+    def clear_target(self) -> Deferred[bool]:
         """Take it away."""
-        self._noted("clear")
-        if self.ground is not None:
-            self.ground = {**self.ground, "target": None}
+        self._change(target=None)
+        return succeed(bool(self._noted("clear")))
 
-    def move_robot(self, name: str, x: float, y: float, heading: float) -> None:
+    def move_robot(self, name: str, x: float, y: float, heading: float) -> Deferred[bool]:
         """Move it."""
-        self._noted("robot", name, x, y, heading)
+        place = {"x": x, "y": y, "heading": heading}
         if self.ground is not None:
-            place = {"x": x, "y": y, "heading": heading}
-            dogs = [{**dog, **place} if dog["name"] == name else dog for dog in self.ground["dogs"]]
-            self.ground = {**self.ground, "dogs": dogs}
+            self._change(dogs=[{**dog, **place} if dog["name"] == name else dog for dog in self.ground["dogs"]])
+        return succeed(bool(self._noted("robot", name, x, y, heading)))
+
+    def _change(self, **changes: Any) -> None:
+        if self.ground is not None:
+            self.ground = {**self.ground, **changes}
 
     def yard(self) -> dict[str, Any] | None:
         """Return the ground."""

@@ -12,7 +12,8 @@ from twisted.trial.unittest import SynchronousTestCase
 from tests.webnode.guests import Guests
 from tests.webnode.memory import MemoryDesk, MemoryHalts
 from webnode.app import create_app
-from webnode.board import Board, MemoryChronicle
+from webnode.board import Board
+from webnode.chronicle import TeamChronicle
 from webnode.errors import Refusal
 from webnode.state import state_of
 
@@ -24,7 +25,7 @@ class ActionTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.desk = MemoryDesk([{"name": "search"}], {"walls": [3.0, 2.4], "dogs": [DOG], "target": None})
         self.halts = MemoryHalts("01", "02")
-        self.chronicle = MemoryChronicle()
+        self.chronicle = TeamChronicle()
         self.desk.settings["01"] = [["description", "a dog", "A line", "", None, 200.0]]
         self.board = Board(self.desk, Guests(), chronicle=self.chronicle, halts=self.halts)
         state = state_of([{"uuid": "01", "name": "dog1", "joined": 1}], [], {}, node="vaio")
@@ -123,9 +124,10 @@ class ActionTests(SynchronousTestCase):
         desk.message = desk.disconnect = lost
         for path, body in (("message", {"text": "sit"}), ("disconnect", {})):
             self.assertEqual(self.ask("POST", f"devices/01/{path}", body), (409, left.fields))
-        self.assertEqual(self.chronicle.faults, [])
+        self.assertEqual(self.chronicle.since(0), [])
 
     def test_disconnecting_is_a_fault_on_purpose(self) -> None:
         """A device that was told to leave is in the chronicle as such, so that the takeover is timed from there."""
         self.ask("POST", "devices/01/disconnect", {"seconds": 5})
-        self.assertEqual(self.chronicle.faults, [("01", "disconnect", 1e9)])
+        (entry,) = self.chronicle.since(0)
+        self.assertEqual((entry.kind, entry.uuid, entry.at), ("fault", "01", 1e9))

@@ -11,15 +11,15 @@ from typing import Any
 from flask.testing import FlaskClient
 from twisted.trial.unittest import SynchronousTestCase
 
-from tests.webnode.guests import Guests
 from tests.webnode.memory import MemoryDesk
 from webnode.app import create_app
-from webnode.board import Board, MemoryFallbacks, OpenSessions, Page, Sessions
-from webnode.guard import HEADERS, MAX_BODY
-from webnode.route import Content, Route
+from webnode.board import Board
+from webnode.fallback import Fallbacks, Page
+from webnode.guard import HEADERS
 from webnode.routes.table import TABLE
 from webnode.server import sent
 from webnode.state import Departed, State, state_of
+from webnode.visitor import OpenSessions, Sessions
 
 YARD: dict[str, Any] = {"walls": [3.0, 2.4], "dogs": [], "target": None}
 
@@ -35,7 +35,7 @@ class AppTests(SynchronousTestCase):
         self.client = self.client_of(lambda: self.state)
 
     def client_of(self, read: Any, sessions: Sessions | None = None, table: Any = TABLE) -> FlaskClient:
-        fallbacks = MemoryFallbacks(Page("02", "http://other:8080"))
+        fallbacks = Fallbacks(Page("02", "http://other:8080"))
         self.board = Board(self.desk, sessions or OpenSessions(), fallbacks=fallbacks)
         app = create_app(read, self.board, wall=lambda: 1e9, table=table)
         app.logger.setLevel(logging.CRITICAL + 1)
@@ -164,36 +164,6 @@ class AppTests(SynchronousTestCase):
             answer = self.client.post("/api/v1/target", data=body, headers=headers)
             self.assertEqual(answer.status_code, 400, body[:20])
 
-    def test_cap_body(self) -> None:
-        """A body of more than 64 KiB is refused."""
-        answer = self.client.post("/api/v1/message", json={"text": "x" * MAX_BODY})
-        self.assertEqual((answer.status_code, answer.get_json()["error"]["remedy"]), (413, "send less"))
-
-    def test_refuse_foreign_sites(self) -> None:
-        """A foreign form, a foreign origin and a foreign name for this node change nothing and read nothing."""
-        form = self.client.post("/api/v1/demo", data={"a": "b"})
-        origin = self.client.post("/api/v1/demo", json={}, headers={"Origin": "http://evil.example"})
-        name = self.client.get("/api/v1/state", headers={"Host": "evil.example"})
-        self.assertEqual([answer.status_code for answer in (form, origin, name)], [403, 403, 403])
-        self.assertEqual(self.desk.asked, [])
-
-    def test_ask_for_the_role(self) -> None:
-        """Each route wants its role: nobody and a viewer give no orders, and a viewer may look, by ticket or header."""
-        client = self.client_of(lambda: self.state, Guests())
-        for route in TABLE:
-            if route.answer is None or route.role == "anyone":
-                continue
-            path = route.path.format(uuid="01", task_id="t1", name="dog1")
-            answer = client.open(path, method=route.method, json={} if route.method != "GET" else None)
-            self.assertEqual((answer.status_code, answer.get_json()["error"]["field"]), (401, "Authorization"), path)
-            bearer = {"Authorization": "Bearer viewer", "X-Swarm": "1"}
-            answer = client.open(path, method=route.method, headers=bearer)
-            self.assertEqual(answer.status_code == 403, route.role not in ("viewer",), path)
-        self.assertEqual(client.get("/api/v1/state?ticket=viewer").status_code, 200)
-        self.assertEqual(self.desk.asked, [])
-        bearer = {"Authorization": "Bearer operator"}
-        self.assertEqual(client.post("/api/v1/demo", json={}, headers=bearer).status_code, 202)
-
     def test_do_once_what_is_asked_twice(self) -> None:
         """An order that is repeated with its id is given once; an id that is no name is refused."""
         answers = [self.client.post("/api/v1/demo", json={}, headers={"Idempotency-Key": "a1"}) for _ in range(2)]
@@ -202,13 +172,6 @@ class AppTests(SynchronousTestCase):
         self.assertEqual(self.desk.asked, [("demo",)])
         bad = self.client.post("/api/v1/demo", json={}, headers={"Idempotency-Key": "x" * 65})
         self.assertEqual((bad.status_code, bad.get_json()["error"]["field"]), (400, "Idempotency-Key"))
-
-    def test_note_orders(self) -> None:
-        """An order stands in the audit with its visitor, its address and what came of it."""
-        self.client.post("/api/v1/devices/03/message", json={"text": "sit"})
-        line = self.board.audit.newest(1)[0]
-        self.assertEqual((line["who"], line["from"], line["target"]), ("visitor", "127.0.0.1", "03"))
-        self.assertIn("409", str(line["outcome"]))
 
     def test_share_with_the_team(self) -> None:
         """A page of another web node of the team may look and order here; the browser is told so beforehand."""
@@ -219,18 +182,6 @@ class AppTests(SynchronousTestCase):
         self.assertEqual(self.client.options("/api/v1/demo", headers=other).status_code, 204)
         self.assertEqual(self.client.options("/api/v1/demo", headers=evil).status_code, 403)
         self.assertEqual(self.client.post("/api/v1/demo", json={}, headers=other).status_code, 202)
-
-    def test_answer_what_is_no_json(self) -> None:
-        """A route may answer text or a picture, with its own type and the strict headers."""
-        route = Route("GET", "/metrics", "Figures", "viewer", lambda ask: Content(b"up 1\n", "text/plain"))
-        answer = self.client_of(lambda: self.state, table=(route,)).get("/metrics")
-        self.assertEqual((answer.data, answer.content_type), (b"up 1\n", "text/plain"))
-        self.assertEqual(answer.headers["X-Content-Type-Options"], "nosniff")
-
-    def test_refuse_without_yard(self) -> None:
-        """Without a yard a target is refused in words."""
-        self.desk.ground = None
-        self.assertEqual(self.client.post("/api/v1/target", json={"x": 1, "y": 1}).status_code, 409)
 
     def test_hide_failures(self) -> None:
         """A failure inside is answered with 500 and no trace; an unknown path and method with theirs, all as JSON."""

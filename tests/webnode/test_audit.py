@@ -3,33 +3,30 @@
 from __future__ import annotations
 
 import json
-import random
 import stat
 from pathlib import Path
-from typing import Any, cast
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.config.settings import IN_MEMORY, Settings
 from tests.webnode.guests import Guests
 from tests.webnode.memory import MemoryDesk
 from webnode.app import create_app
-from webnode.audit import QUIET_S, FileAudit, audit
-from webnode.board import AUDITED, Board, MemoryAudit, Visitor
-from webnode.ground import Ground
+from webnode.audit import AUDITED, QUIET_S, Audit
+from webnode.board import Board
 from webnode.state import state_of
+from webnode.visitor import Visitor
 
 ANN = Visitor("ann", "operator", "ab12")
 NOBODY = Visitor()
 
 
-class FileAuditTests(SynchronousTestCase):
+class AuditTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.now = 1000.0
         self.path = Path(self.mktemp())
 
-    def audit(self, most: int = 1 << 20) -> FileAudit:
-        return FileAudit(self.path, lambda: self.now, most)
+    def audit(self, most: int = 1 << 20) -> Audit:
+        return Audit(self.path, lambda: self.now, most)
 
     def test_keep_each_line(self) -> None:
         """Each change is one line of JSON with time, who, from where, what and how it ended, for the owner alone."""
@@ -79,12 +76,15 @@ class FileAuditTests(SynchronousTestCase):
         self.assertEqual(audit.counts()["anyone", "429"], 1002)
 
     def test_go_on_without_a_file(self) -> None:
-        """Where the file cannot be written the page goes on, and the newest lines are still told."""
+        """Where the file cannot be written, or there is to be none, the newest lines are still told."""
         self.path = Path(self.mktemp()) / "missing" / "audit"
         audit = self.audit()
         for number in range(2):
             audit.note(ANN, "h", "POST /x", str(number), "202")
         self.assertEqual(len(audit.newest(9)), 2)
+        in_memory = Audit()
+        in_memory.note(ANN, "h", "POST /x", "", "202")
+        self.assertEqual(len(in_memory.newest(9)), 1)
 
 
 class AuditRouteTests(SynchronousTestCase):
@@ -103,16 +103,3 @@ class AuditRouteTests(SynchronousTestCase):
         self.assertEqual(client.get("/api/v1/audit", headers={"Authorization": "Bearer viewer"}).status_code, 403)
         for count in ("0", "x", "1e9", "1.5"):
             self.assertEqual(client.get(f"/api/v1/audit?count={count}", headers=bearer).status_code, 400)
-
-    def test_lie_beside_the_store(self) -> None:
-        """The file lies beside the node's store; a node that stores nothing keeps the audit in memory, too."""
-        folder = Path(self.mktemp())
-        folder.mkdir()
-        nothing = cast(Any, None)
-        for store, kind in ((str(folder / "a.sqlite"), FileAudit), (IN_MEMORY, MemoryAudit)):
-            settings = Settings.from_mapping({"node": {"name": "a", "store": store}}, "a.toml")
-            made = audit(Ground(settings, nothing, nothing, nothing, nothing, lambda: 7.0, random.Random(1)))
-            self.assertIsInstance(made, kind)
-            made.note(ANN, "h", "POST /x", "", "202")
-            self.assertEqual(made.newest(1)[0]["at"], 7.0)
-        self.assertEqual([path.name for path in folder.iterdir()], ["a.sqlite.audit"])

@@ -8,10 +8,11 @@ from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
 from tests.webnode.memory import MemoryDesk
-from webnode.board import Board, OpenSessions, Role, Visitor
+from webnode.board import Board
 from webnode.dispatch import REMEMBERED, Dispatch
 from webnode.errors import Refusal
 from webnode.route import Ask, Route
+from webnode.visitor import OpenSessions, Role, Visitor
 
 
 class DispatchTests(SynchronousTestCase):

@@ -6,8 +6,7 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.directory.presence import Device
 from tests.fleet import FleetCase, SwarmFleet
-from webnode.board import Page
-from webnode.fallback import REMEMBERED_S, TeamFallbacks, origin_of, pages_of, urls_at
+from webnode.fallback import REMEMBERED_S, Page, TeamFallbacks, origin_of, pages_of, urls_at
 
 
 class UrlTests(SynchronousTestCase):

@@ -11,10 +11,12 @@ from middleware.faults.kinds import KINDS
 from swarmnode.rehearsal import VirtualTeam
 from tests.webnode.memory import MemoryDesk, MemoryFaults
 from webnode.app import create_app
-from webnode.board import Board, MemoryChronicle, OpenSessions
+from webnode.board import Board
+from webnode.chronicle import TeamChronicle
 from webnode.errors import Refusal
-from webnode.faults import TOLD_S, FaultControl, faults
+from webnode.faults import TOLD_S, FaultControl
 from webnode.state import state_of
+from webnode.visitor import OpenSessions
 
 
 class FaultControlTests(SynchronousTestCase):
@@ -100,16 +102,9 @@ class FaultControlTests(SynchronousTestCase):
         self.assertEqual(self.control.active(), [])
 
     def test_only_where_allowed(self) -> None:
-        """A web node whose own settings do not allow faults offers none; devices that do not allow them say so."""
-
-        class Bare:
-            settings = self.team.services["vaio"].settings
-
-        self.assertTrue(Bare.settings.faults.allow)
+        """Devices that do not allow faults say so."""
         plain = VirtualTeam(4, dogs=("dog1",))
         self.addCleanup(plain.stop)
-        Bare.settings = plain.services["vaio"].settings
-        self.assertIsNone(faults(Bare()))  # type: ignore[arg-type]
         control = FaultControl(plain.services["vaio"].assembly.node, plain.clock.seconds)
         plain.clock.advance(2.0)
         dog = plain.services["dog1"].assembly.node.uuid
@@ -121,7 +116,7 @@ class FaultControlTests(SynchronousTestCase):
 class RouteTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.faults: MemoryFaults | None = MemoryFaults("kill", "loss")
-        self.chronicle = MemoryChronicle()
+        self.chronicle = TeamChronicle()
         self.open(self.faults)
 
     def open(self, faults: MemoryFaults | None) -> None:
@@ -138,7 +133,7 @@ class RouteTests(SynchronousTestCase):
         self.assertEqual((answer.status_code, answer.get_json()), (202, {"id": "01", "kind": "loss", "seconds": 15.0}))
         assert self.faults is not None
         self.assertEqual(self.faults.caused, [("01", "loss", 15.0, 0.3)])
-        self.assertEqual(self.chronicle.faults, [("01", "loss", 1e9)])
+        self.assertEqual([(each.uuid, each.at) for each in self.chronicle.since(0)], [("01", 1e9)])
         told = self.client.get("/api/v1/faults").get_json()
         self.assertEqual(told["can"], {"01": ["kill", "loss"]})
         self.assertEqual([kind["kind"] for kind in told["kinds"]], list(KINDS))

@@ -1,4 +1,4 @@
-"""Tests of ``webnode.openapi``: the document says what the table says."""
+"""Tests of ``webnode.routes.openapi``: the document says what the table says."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from tests.webnode.guests import Guests
 from tests.webnode.memory import MemoryDesk
 from webnode.app import create_app
 from webnode.board import Board
-from webnode.openapi import document
 from webnode.route import Field, Route
+from webnode.routes.openapi import document
 from webnode.routes.table import TABLE
 from webnode.state import state_of
 
 FIELDS = (
     Field("uuid", "text", "which", "path", most=64),
-    Field("after", "whole", "a number", "query", least=0, most=9, default=0, is_required=False),
+    Field("after", "whole", "a number", "query", least=0, most=9, default=0),
     Field("x", "number", "where", unit="m"),
-    Field("kind", "choice", "what", choices=("a", "b"), default="a", is_required=False),
-    Field("name", "text", "who", default="", is_required=False),
+    Field("kind", "choice", "what", choices=("a", "b"), default="a"),
+    Field("name", "text", "who", default=""),
 )
 
 

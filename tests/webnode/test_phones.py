@@ -18,7 +18,9 @@ from tests.webnode.browser import Connection, site_of
 from tests.webnode.memory import MemoryDesk, MemoryPhones
 from tests.webnode.picture import jpeg
 from webnode.app import create_app
-from webnode.board import Board, MemoryAudit, MemoryFallbacks, OpenSessions, Page
+from webnode.audit import Audit
+from webnode.board import Board
+from webnode.fallback import Fallbacks, Page
 from webnode.guard import MAX_BODY
 from webnode.limits import AddressLimits
 from webnode.routes.phones import MEASURES, ROUTES
@@ -26,6 +28,7 @@ from webnode.server import Root
 from webnode.session import NOBODY, SignedSessions
 from webnode.state import state_of
 from webnode.token import TokenKey
+from webnode.visitor import OpenSessions
 
 SECRET = "0f" * 32
 JOIN: dict[str, Any] = {"secret": SECRET, "name": "anna", "width": 208, "height": 156}
@@ -37,7 +40,7 @@ class PhoneRouteTests(SynchronousTestCase):
             TokenKey(Identity(bytes(32))), lambda _: True, "quiet-otter", "", random.Random(1), lambda *_: succeed(0)
         )
         self.phones = MemoryPhones(most=2, check=sides)
-        self.board = Board(MemoryDesk(), self.sessions, MemoryAudit(), phones=self.phones)
+        self.board = Board(MemoryDesk(), self.sessions, Audit(), phones=self.phones)
         state = state_of([], [], {}, node="vaio")
         self.client = create_app(lambda: state, self.board, wall=lambda: 1000.0).test_client()
         native: dict[str, Resource] = {
@@ -164,7 +167,7 @@ class PhoneRouteTests(SynchronousTestCase):
 
     def test_share_with_the_team(self) -> None:
         """A page that came from another web node goes on looking here; a foreign site cannot, whatever it knows."""
-        self.board.fallbacks = MemoryFallbacks(Page("02", "http://other:8080"))
+        self.board.fallbacks = Fallbacks(Page("02", "http://other:8080"))
         phone = self.joined()
         path = f"phones/{phone['uuid']}/look?ticket={phone['ticket']}"
         self.assertEqual(self.send(path, jpeg(), Origin="http://other:8080")[0], 200)

@@ -13,10 +13,10 @@ from twisted.trial.unittest import SynchronousTestCase
 from middleware.entangled.identity import Identity
 from middleware.entangled.record import Record
 from swarmnode.rehearsal import VirtualTeam
-from webnode.board import Visitor
-from webnode.revocation import MOST, REMEMBERED, REVOKED, SLOT, MemoryRevocations, TeamRevocations, revoked_in
+from webnode.revocation import MOST, REMEMBERED, REVOKED, SLOT, Revocations, TeamRevocations, revoked_in
 from webnode.session import SignedSessions
 from webnode.token import TokenKey
+from webnode.visitor import Visitor
 
 
 class TeamRevocationsTests(SynchronousTestCase):
@@ -80,7 +80,7 @@ class TeamRevocationsTests(SynchronousTestCase):
 
     def test_remember_so_many(self) -> None:
         """The twin in memory forgets the oldest, too."""
-        twin = MemoryRevocations()
+        twin = Revocations()
         for number in range(REMEMBERED + 1):
             twin.add(str(number), 1.0)
         self.assertEqual([twin.has(each) for each in ("0", "1", str(REMEMBERED), "x")], [False, True, True, False])

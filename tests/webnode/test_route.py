@@ -8,11 +8,12 @@ from typing import Any
 from twisted.trial.unittest import SynchronousTestCase
 
 from tests.webnode.memory import MemoryDesk
-from webnode.board import Board, OpenSessions, Visitor
+from webnode.board import Board
 from webnode.errors import Refusal
 from webnode.route import ALLOWED, Ask, Field, Route, checked, device, guarded
 from webnode.routes.table import TABLE
 from webnode.state import Departed, state_of
+from webnode.visitor import OpenSessions, Visitor
 
 
 def route(*fields: Field) -> Route:
@@ -69,7 +70,7 @@ class CheckedTests(SynchronousTestCase):
 
     def test_ask_for_what_is_missing(self) -> None:
         """A field that is missing is asked for, or has its default where it is not required."""
-        name, seconds = Field("name", "text", ""), Field("s", "number", "", default=15.0, is_required=False)
+        name, seconds = Field("name", "text", ""), Field("s", "number", "", default=15.0)
         self.assertEqual(self.assertRaises(Refusal, checked, route(name), {}, {}, {}).field, "name")
         self.assertEqual(checked(route(seconds), {}, {}, {}), {"s": 15.0})
 

@@ -17,11 +17,13 @@ from twisted.web.static import Data
 from tests.webnode.browser import Connection, site_of
 from tests.webnode.guests import Guests
 from tests.webnode.memory import MemoryDesk
-from webnode.board import Board, MemoryFallbacks, OpenSessions, Page
+from webnode.board import Board
 from webnode.errors import Refusal
+from webnode.fallback import Fallbacks, Page
 from webnode.guard import MAX_BODY
 from webnode.resource import JsonResource
 from webnode.server import Files, Root, caller, sent
+from webnode.visitor import OpenSessions
 
 
 class PathResource(Resource):
@@ -121,7 +123,7 @@ class RootTests(SynchronousTestCase):
 
     def test_share_with_the_team(self) -> None:
         """A page of another web node of the team may ask, also for what it needs a preflight; any other may not."""
-        self.board.fallbacks = MemoryFallbacks(Page("02", "http://other:8080"))
+        self.board.fallbacks = Fallbacks(Page("02", "http://other:8080"))
         for method in ("GET", "OPTIONS"):
             data = self.asked("/events", method, Origin="http://other:8080")
             self.assertIn(b"Access-Control-Allow-Origin: http://other:8080", data)
@@ -138,13 +140,6 @@ class RootTests(SynchronousTestCase):
         self.assertEqual(len(tags), 2)
         for refused in ("gzip;q=0", "br", "gzip;q=0.000"):
             self.assertNotIn(b"Content-Encoding", self.asked("/static/page.js", Accept_Encoding=refused))
-
-    def test_be_strict(self) -> None:
-        """Native answers carry the strict headers too, and are for this node's own names only."""
-        data = self.asked("/events")
-        self.assertIn(b"default-src 'self'", data)
-        self.assertIn(b"nosniff", data)
-        self.assertIn(b" 403 ", self.asked("/events", Host="evil.example"))
 
     def test_serve_files(self) -> None:
         """A file is revalidated at each visit and not sent twice; what is not there is not found."""

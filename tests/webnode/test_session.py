@@ -12,13 +12,11 @@ from twisted.trial.unittest import SynchronousTestCase
 from middleware.config.settings import Settings
 from middleware.entangled.identity import Identity
 from middleware.errors import BadSetting
-from webnode.board import OpenSessions, Token, Visitor
-from webnode.code import draw_code
 from webnode.errors import Refusal
-from webnode.ground import Ground
-from webnode.password import hashed, is_password
+from webnode.password import draw_code, hashed, is_password
 from webnode.session import AT_ONCE, MAX_SIGNED_S, PASS_S, SIGNED_S, WAITING, SignedSessions, sessions
 from webnode.token import TokenKey
+from webnode.visitor import OpenSessions, Token, Visitor
 
 HASH = hashed("correct horse", bytes(16), 4)
 HOME = "10.0.0.9"
@@ -165,14 +163,6 @@ class SignedSessionsTests(SynchronousTestCase):
         long = self.sessions.token(OPERATOR, "guest", "viewer", 0.0, 10 * SIGNED_S)
         self.assertEqual(self.signed(long.text, 1.0).until, SIGNED_S + 1.0)
 
-    def test_sign_out(self) -> None:
-        """A token that is given back lets in nobody, nor does its ticket; others stay."""
-        token, other = self.signed(), self.signed()
-        self.sessions.revoke(self.sessions.visitor(token.text, 1.0).token_id)
-        for text in (token.text, token.ticket):
-            self.assertEqual(self.sessions.visitor(text, 1.0), Visitor())
-        self.assertEqual(self.sessions.visitor(other.text, 1.0).role, "operator")
-
     def test_renew(self) -> None:
         """A token can be had anew while it is good, up to thirty days after signing in, and is the same session."""
         token, now = self.signed(), 0.0
@@ -201,35 +191,30 @@ class SignedSessionsTests(SynchronousTestCase):
 OPERATOR = Visitor("operator", "operator")
 
 
-def made_of(ground: Ground) -> Any:
-    """The sessions of a web node that is a gateway."""
-    return sessions(ground, cast(Any, SimpleNamespace(may_vouch=lambda public: True)))
-
-
 class FactoryTests(SynchronousTestCase):
-    def ground(self, **web: object) -> Ground:
+    def made(self, **web: object) -> Any:
+        """The sessions of a web node that is a gateway, with these settings."""
         settings = Settings.from_mapping({"node": {"name": "vaio", "team_key": "x" * 20}, "web": web}, "vaio.toml")
-        nothing = cast(Any, None)
-        identity = Identity(bytes(32))
-        node = cast(Any, SimpleNamespace(entangled=SimpleNamespace(watch=lambda *what, **how: None, identity=identity)))
-        return Ground(settings, node, nothing, nothing, nothing, lambda: 0.0, random.Random(1))
+        entangled = SimpleNamespace(watch=lambda *what, **how: None, identity=Identity(bytes(32)))
+        node, team = SimpleNamespace(entangled=entangled), SimpleNamespace(may_vouch=lambda public: True)
+        return sessions(settings, cast(Any, node), None, random.Random(1), cast(Any, team))
 
     def test_have_the_code_of_the_settings(self) -> None:
         """The code is that of the settings; where there is none, one is made that cannot be misread."""
-        self.assertEqual(made_of(self.ground(code="quiet-otter")).code, "quiet-otter")
-        self.assertRegex(made_of(self.ground()).code, r"^[a-hj-km-np-z]{4}-[a-hj-km-np-z]{4}$")
+        self.assertEqual(self.made(code="quiet-otter").code, "quiet-otter")
+        self.assertRegex(self.made().code, r"^[a-hj-km-np-z]{4}-[a-hj-km-np-z]{4}$")
         self.assertNotEqual(draw_code(random.Random(1)), draw_code(random.Random(2)))
 
     def test_do_without_on_this_machine_alone(self) -> None:
         """Without signing in a page is served to this machine alone; open to a network it is refused in one line."""
-        self.assertIsInstance(made_of(self.ground(sign_in=False)), OpenSessions)
-        self.assertIsInstance(made_of(self.ground(sign_in=False, host="::1")), OpenSessions)
+        self.assertIsInstance(self.made(sign_in=False), OpenSessions)
+        self.assertIsInstance(self.made(sign_in=False, host="::1"), OpenSessions)
         for host in ("0.0.0.0", "192.168.0.2", "::"):
-            error = self.assertRaises(BadSetting, made_of, self.ground(sign_in=False, host=host))
+            error = self.assertRaises(BadSetting, self.made, sign_in=False, host=host)
             self.assertIn("vaio.toml: [web] sign_in", str(error))
 
     def test_refuse_a_password_that_is_no_hash(self) -> None:
         """A password that stands there as it is typed is refused, and not shown."""
-        error = self.assertRaises(BadSetting, made_of, self.ground(password="correct horse"))
+        error = self.assertRaises(BadSetting, self.made, password="correct horse")
         self.assertIn("swarm password", str(error))
         self.assertNotIn("horse", str(error))

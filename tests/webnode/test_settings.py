@@ -26,13 +26,13 @@ class TunerTests(SynchronousTestCase):
         """The settings of a device, as it tells."""
         asked = read_settings(self.team.desk, self.team.services[name].assembly.node.uuid)
         self.team.clock.advance(0.1)
-        return {knob.key: knob.value for knob in self.successResultOf(asked)}
+        return {row["key"]: row["value"] for row in self.successResultOf(asked)}
 
     def change(self, **changes: Any) -> dict[str, Any]:
         """Change settings of dog1; what it tells then."""
         asked = change_settings(self.team.desk, self.node.uuid, changes)
         self.team.clock.advance(0.1)
-        return {knob.key: knob.value for knob in self.successResultOf(asked)}
+        return {row["key"]: row["value"] for row in self.successResultOf(asked)}
 
     def refusal(self, **changes: Any) -> Refusal:
         """Why dog1 does not change them."""
@@ -53,7 +53,7 @@ class TunerTests(SynchronousTestCase):
         asked = read_settings(self.team.desk, self.node.uuid)
         self.team.clock.advance(0.1)
         lease = self.successResultOf(asked)[1]
-        self.assertEqual((lease.value, lease.unit, lease.least, lease.most), (1.0, "s", 0.1, 60.0))
+        self.assertEqual([lease[key] for key in ("value", "unit", "least", "most")], [1.0, "s", 0.1, 60.0])
 
     def test_change_what_others_see(self) -> None:
         """A description and a capability that are changed are what the whole team sees of the device."""

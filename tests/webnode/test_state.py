@@ -134,11 +134,6 @@ class WhyTests(SynchronousTestCase):
         json.dumps(view, allow_nan=False)
         self.assertEqual(state_of([], [{"id": "t", "why": 7}], {})["tasks"][0]["why"], [])
 
-    def test_deployed(self) -> None:
-        """A device tells what was deployed on it."""
-        (view,) = state_of([device(1, deployed={"best": "1 ab"})], [], {})["devices"]
-        self.assertEqual(view["deployed"], {"best": "1 ab"})
-
 
 class DepartedTests(SynchronousTestCase):
     def test_remember_for_a_minute(self) -> None:
@@ -158,10 +153,3 @@ class DepartedTests(SynchronousTestCase):
         self.assertEqual(len(departed.of([], 2.0)), 1)
         self.assertEqual(departed.of([device(1)], 3.0), [])
         self.assertEqual([v["gone"] for v in departed.of([], 4.0)], [4.0])
-
-    def test_show_present_only_once(self) -> None:
-        """A device among both the present and the departed is shown as present."""
-        departed = Departed()
-        departed.of([device(1)], 1.0)
-        gone = departed.of([], 2.0)
-        self.assertEqual([v["status"] for v in state_of([device(1)], [], {}, departed=gone)["devices"]], ["IDLE"])

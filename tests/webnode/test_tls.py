@@ -32,7 +32,6 @@ MISSING = [name for name in ("OpenSSL", "cryptography") if find_spec(name) is No
 if not MISSING:
     from middleware.config.settings import Settings
     from webnode.certificate import authority, leaf, read
-    from webnode.ground import Ground
     from webnode.keyfile import keep
     from webnode.tls import Certified, TlsDoor, door
 
@@ -157,10 +156,14 @@ class DoorTests(SynchronousTestCase):
     def door(self, store: str = "a.sqlite", kept: MemoryStore | None = None, seed: int = 1) -> TlsDoor:
         node = {"name": "a", "roles": ["web"], "store": store, "team_key": "of a test"}
         settings = Settings.from_mapping({"node": node, "web": {"tls": "auto"}}, str(self.folder / "a.toml"))
-        anything: Any = None
-        web_node: Any = SimpleNamespace(store=MemoryStore() if kept is None else kept)
-        ground = Ground(settings, web_node, anything, anything, Clock(), lambda: NOW, random.Random(seed))
-        return door(ground, lambda: ["192.168.0.7"])
+        return door(
+            settings,
+            MemoryStore() if kept is None else kept,
+            Clock(),
+            lambda: NOW,
+            random.Random(seed),
+            lambda: ["192.168.0.7"],
+        )
 
     def test_have_an_authority_of_its_own(self) -> None:
         """Each node has its own authority, also in one team, and the same one after each start."""

@@ -7,7 +7,7 @@ from typing import Any
 from middleware.faults.kinds import KINDS, MAX_S, MIN_S, USUAL_S
 from webnode.errors import Refusal
 from webnode.field import Json
-from webnode.route import API, Ask, Field, Route, device
+from webnode.route import API, DEVICE, Ask, Field, Route, device
 
 
 def faults(ask: Ask) -> Json:
@@ -66,7 +66,7 @@ ROUTES = (
         "operator",
         cause,
         (
-            Field("uuid", "text", "the device", "path", most=64),
+            DEVICE,
             Field("kind", "choice", "what it suffers", choices=tuple(KINDS)),
             Field(
                 "seconds",
@@ -75,10 +75,9 @@ ROUTES = (
                 least=MIN_S,
                 most=MAX_S,
                 default=USUAL_S,
-                is_required=False,
                 unit="s",
             ),
-            Field("amount", "number", f"how much, where it has an amount (usual {_USUAL})", is_required=False),
+            Field("amount", "number", f"how much, where it has an amount (usual {_USUAL})", default=None),
         ),
         gives="id, kind, seconds",
         status=202,

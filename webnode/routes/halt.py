@@ -6,9 +6,9 @@ from typing import Any
 
 from middleware.stop.halt import NO_ROBOT, STANDS
 from middleware.stop.stop_set import MAX_RELEASED
-from webnode.board import Halts
 from webnode.errors import Refusal
 from webnode.field import Json
+from webnode.halting import TeamHalts
 from webnode.route import API, Ask, Field, Route
 
 
@@ -38,7 +38,7 @@ def _name(ask: Ask) -> str:
     return ask.who.name or ask.who.role
 
 
-def _halts(ask: Ask) -> Halts:
+def _halts(ask: Ask) -> TeamHalts:
     if ask.board.halts is None:
         raise Refusal("halt", "this node cannot stop the team", "ask another web node of the team", 409)
     return ask.board.halts
@@ -51,7 +51,6 @@ STOPS = Field(
     "The ids of the stops to end, as in `halt` of the state; all that are known where it is left out",
     most=MAX_RELEASED,
     default=None,
-    is_required=False,
 )
 ROUTES = (
     Route(

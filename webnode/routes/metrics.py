@@ -1,10 +1,91 @@
-"""Routes of the metrics, for programs that watch."""
+"""Routes of the metrics: what a node's page knows, in the text format of Prometheus, by its own client library.
+
+Everything is read at the moment of asking; the library is loaded at the first one, and its global registry, which would
+add figures of this process and keep them for good, is not used.
+"""
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from typing import Any, get_args
+
+from webnode.board import Board
 from webnode.errors import Refusal
-from webnode.metrics import TEXT, metrics
+from webnode.limits import Kept
 from webnode.route import Ask, Content, Route
+from webnode.state import State
+
+TEXT = "text/plain; version=0.0.4; charset=utf-8"
+"""The format that every version of Prometheus reads."""
+FLOWS = ("sent", "received", "dropped")
+
+
+def metrics(state: State, board: Board, now: float) -> bytes:
+    """The whole text; ``now`` is unix seconds.  Raises ``ModuleNotFoundError`` where the library is missing."""
+    from prometheus_client import CollectorRegistry
+    from prometheus_client.exposition import generate_latest
+
+    registry = CollectorRegistry(auto_describe=False)
+    registry.register(_Collector(list(_families(state, board, now))))
+    text: bytes = generate_latest(registry)
+    return text
+
+
+class _Collector:
+    def __init__(self, families: list[Any]) -> None:
+        self._families = families
+
+    def collect(self) -> Iterable[Any]:
+        return self._families
+
+    def describe(self) -> Iterable[Any]:
+        return ()
+
+
+def _families(state: State, board: Board, now: float) -> Iterator[Any]:
+    from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
+
+    def by_status(name: str, about: str, rows: Any) -> Any:
+        family = GaugeMetricFamily(name, about, labels=("status",))
+        for status, count in sorted(Counter(row["status"] for row in rows).items()):
+            family.add_metric([status], count)
+        return family
+
+    devices = list(state["devices"])
+    yield by_status("swarm_devices", "Devices, those that left a moment ago as GONE.", devices)
+    yield by_status("swarm_tasks", "Tasks.", state["tasks"])
+    contacts = GaugeMetricFamily("swarm_device_contacts", "Nodes that a device knows.", labels=("uuid", "device"))
+    since = GaugeMetricFamily("swarm_device_joined_seconds", "Unix time of joining.", labels=("uuid", "device"))
+    flow = CounterMetricFamily("swarm_device_datagrams", "Datagrams of a device.", labels=("uuid", "device", "flow"))
+    for device in devices:
+        whose, network = [device["uuid"], device["name"]], device["network"]
+        since.add_metric(whose, device["since"])
+        if "contacts" in network:
+            contacts.add_metric(whose, network["contacts"])
+        for name in FLOWS:
+            if name in network:
+                flow.add_metric([*whose, name], network[name])
+    yield from (contacts, since, flow)
+    agree = GaugeMetricFamily("swarm_group_agreeing", "Members of a group that name the same device.", labels=("task",))
+    members = GaugeMetricFamily("swarm_group_members", "Members of a group.", labels=("task",))
+    for group in state["groups"]:
+        agree.add_metric([group["task"]], group["agree"])
+        members.add_metric([group["task"]], group["of"])
+    yield from (agree, members)
+    kept = GaugeMetricFamily(
+        "swarm_page_connections",
+        "To this node's page: open, with an unfinished request, with an answer under way.",
+        labels=("kind",),
+    )
+    for kind in get_args(Kept):
+        kept.add_metric([kind], board.limits.total(kind))
+    yield kept
+    orders = CounterMetricFamily("swarm_page_orders", "Orders given through this node.", labels=("role", "status"))
+    for (role, status), count in sorted(board.audit.counts().items()):
+        orders.add_metric([role, status], count)
+    yield orders
+    yield GaugeMetricFamily("swarm_page_time_seconds", "Unix time at this node.", value=now)
 
 
 def read(ask: Ask) -> Content:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from webnode.board import Survey
 from webnode.errors import Refusal
-from webnode.route import API, Ask, Field, Route, device
+from webnode.route import API, DEVICE, Ask, Route, device
+from webnode.survey import TeamSurvey
 
 
 def network(ask: Ask) -> Any:
@@ -29,7 +29,7 @@ def inventory(ask: Ask) -> Any:
     return _survey(ask).inventory(device(ask)["uuid"])
 
 
-def _survey(ask: Ask) -> Survey:
+def _survey(ask: Ask) -> TeamSurvey:
     if ask.board.survey is None:
         raise Refusal("node", "it cannot ask devices", "ask another web node of the team", 409)
     return ask.board.survey
@@ -66,7 +66,7 @@ ROUTES = (
         "What a device stores; the device is asked",
         "viewer",
         inventory,
-        (Field("uuid", "text", "the device", "path", most=64),),
+        (DEVICE,),
         gives="records, deleted, bytes, most_bytes, kinds, newest (kind, name, bytes, lifetime)",
     ),
 )

@@ -6,9 +6,9 @@ from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
 
-from webnode.board import Page
+from webnode.fallback import Page
 from webnode.field import Json
-from webnode.route import API, Ask, Content, Field, Route
+from webnode.route import API, DEVICE, Ask, Content, Field, Route
 
 VERSION = 1
 """Of the API; a page of another one does not go on here."""
@@ -44,7 +44,6 @@ def state(ask: Ask) -> Json:
     return ask.state
 
 
-UUID = Field("uuid", "text", "the device", "path", most=64)
 ROUTES = (
     Route(
         "GET",
@@ -72,8 +71,8 @@ ROUTES = (
         "viewer",
         None,
         (
-            Field("since", "text", "the last id heard", "query", least=0, most=40, is_required=False, default=""),
-            Field("whole", "flag", "whole states, never changes", "query", is_required=False, default=False),
+            Field("since", "text", "the last id heard", "query", least=0, most=40, default=""),
+            Field("whole", "flag", "whole states, never changes", "query", default=False),
         ),
         gives="text/event-stream",
     ),
@@ -84,11 +83,9 @@ ROUTES = (
         "viewer",
         None,
         (
-            UUID,
-            Field(
-                "after", "text", "number of the last picture (X-Seq)", "query", least=0, is_required=False, default=""
-            ),
-            Field("viewer", "text", "name of who looks", "query", least=0, most=40, is_required=False, default=""),
+            DEVICE,
+            Field("after", "text", "number of the last picture (X-Seq)", "query", least=0, default=""),
+            Field("viewer", "text", "name of who looks", "query", least=0, most=40, default=""),
         ),
         gives="image/jpeg",
     ),

@@ -8,17 +8,18 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from twisted.internet.defer import Deferred
 from twisted.web.http import Request
 
-from webnode.board import Board, Visitor
+from webnode.board import Board, Phones
 from webnode.errors import Refusal
 from webnode.field import Json
 from webnode.resource import JsonResource, answer
 from webnode.route import API, Ask, Field, Route
+from webnode.visitor import Visitor
 
 SECRET = 32
 """Bytes of a phone's own secret, in twice as many hexadecimal digits."""
@@ -97,59 +98,53 @@ def values_of(text: str) -> dict[str, float]:
     return {name: float(value) for name, value in found.items()}
 
 
-class _OfPhone(JsonResource):
+class OfPhone(JsonResource):
     """What a phone sends of itself, by its own ticket, or an operator in its name."""
 
     isLeaf = True
     methods = (b"POST",)
 
-    def __init__(self, board: Board) -> None:
+    def __init__(self, board: Board, take: Callable[[Board, Phones, str, Request], Json]) -> None:
         super().__init__()
         self._board = board
+        self._take = take
 
     def render_POST(self, request: Request) -> bytes:
+        """Take what the phone sends, or say why not."""
         uuid = request.prepath[-2].decode("ascii", "replace")  # type: ignore[attr-defined]
-        who: Visitor = getattr(request, "who", Visitor())
+        who = who_asks(request)
         try:
             if self._board.phones is None:
                 raise Refusal("phone", "this node takes no phones", "look at another web node", 409)
             if who.role == "phone" and who.name != f"{BOUND}{uuid}":
                 raise Refusal("ticket", "it is another phone's", f"join by POST {API}/phones", 403)
-            told = self.taken(uuid, who, request)
+            told = self._take(self._board, self._board.phones, uuid, request)
         except Refusal as refusal:
             return answer(request, refusal)
         request.setHeader("Content-Type", "application/json")
         request.setHeader("Cache-Control", "no-store")
         return json.dumps(told).encode()
 
-    def taken(self, uuid: str, who: Visitor, request: Request) -> Json:
-        """Do it; returns what is answered."""
-        raise NotImplementedError
+
+def who_asks(request: Request) -> Visitor:
+    """Who asks a native resource."""
+    return getattr(request, "who", Visitor())
 
 
-class Look(_OfPhone):
-    """``POST phones/<uuid>/look?values=``: one picture, and what was measured with it."""
-
-    def taken(self, uuid: str, who: Visitor, request: Request) -> Json:
-        """Hand it on."""
-        assert self._board.phones is not None
-        given: bytes = (request.args or {}).get(b"values", [b""])[0]
-        values = values_of(given.decode("utf-8", "replace"))
-        body = request.content.read() if request.content is not None else b""
-        wanted = self._board.phones.look(uuid, body, values)
-        return {"fps": wanted.fps, "say": wanted.say}
+def look(board: Board, phones: Phones, uuid: str, request: Request) -> Json:
+    """Hand on one picture, and what was measured with it."""
+    given: bytes = (request.args or {}).get(b"values", [b""])[0]
+    values = values_of(given.decode("utf-8", "replace"))
+    wanted = phones.look(uuid, request.content.read() if request.content is not None else b"", values)
+    return {"fps": wanted.fps, "say": wanted.say}
 
 
-class Leave(_OfPhone):
-    """``POST phones/<uuid>/leave``: the last word of a page that is closed or hidden."""
-
-    def taken(self, uuid: str, who: Visitor, request: Request) -> Json:
-        """Let it go."""
-        assert self._board.phones is not None
-        self._board.phones.leave(uuid)
-        source = str(getattr(request.getClientAddress(), "host", ""))
-        self._board.audit.note(who, source, f"POST {API}/phones/{{uuid}}/leave", uuid[:64], "200")
-        return {}
+def leave(board: Board, phones: Phones, uuid: str, request: Request) -> Json:
+    """Let the phone go: the last word of a page that is closed or hidden."""
+    phones.leave(uuid)
+    source = str(getattr(request.getClientAddress(), "host", ""))
+    board.audit.note(who_asks(request), source, f"POST {API}/phones/{{uuid}}/leave", uuid[:64], "200")
+    return {}
 
 
 UUID = Field("uuid", "text", "the phone", "path", most=64)
@@ -165,8 +160,8 @@ ROUTES = (
             Field("name", "text", "what people call it: letters, digits, _ or -", most=40),
             Field("width", "whole", "of its pictures", least=16, most=MOST_SIDE, unit="pixels"),
             Field("height", "whole", "of its pictures", least=16, most=MOST_SIDE, unit="pixels"),
-            Field("orientation", "flag", "whether it tells how it is held", default=False, is_required=False),
-            Field("position", "flag", "whether it tells where it is", default=False, is_required=False),
+            Field("orientation", "flag", "whether it tells how it is held", default=False),
+            Field("position", "flag", "whether it tells where it is", default=False),
         ),
         gives="uuid, ticket (for its looks and no others, in the query), until (unix seconds), fps",
         limit_s=4.5,
@@ -187,12 +182,11 @@ ROUTES = (
                 "query",
                 least=0,
                 most=MAX_VALUES,
-                is_required=False,
                 default="",
             ),
         ),
         gives="fps (so many a second are wanted), say (words for who holds it)",
-        native=lambda board, reactor: Look(board),
+        native=lambda board, reactor: OfPhone(board, look),
         takes="image/jpeg",
     ),
     Route(
@@ -202,6 +196,6 @@ ROUTES = (
         "phone",
         None,
         (UUID,),
-        native=lambda board, reactor: Leave(board),
+        native=lambda board, reactor: OfPhone(board, leave),
     ),
 )

@@ -8,13 +8,14 @@ from urllib.parse import urlsplit
 
 from twisted.internet.defer import Deferred, gatherResults
 
-from webnode.board import Invites, Token
 from webnode.errors import Refusal
 from webnode.fallback import is_loopback
 from webnode.field import Json
+from webnode.invite import TeamInvites
 from webnode.route import API, Ask, Content, Field, Route
 from webnode.session import MAX_SIGNED_S, SIGNED_S
 from webnode.token import MAX_TEXT
+from webnode.visitor import Token
 
 INVITED_S = 86400.0
 MAX_INVITED_S = MAX_SIGNED_S
@@ -91,7 +92,7 @@ def _reach(url: str) -> dict[str, Json]:
     return {"is_secure": url.startswith("https:"), "reaches": "machine" if is_here else "network"}
 
 
-def _authority(invites: Invites, urls: list[str]) -> dict[str, Json]:
+def _authority(invites: TeamInvites, urls: list[str]) -> dict[str, Json]:
     """Where the authority is to be had: without TLS, as who lacks it is warned of the other way."""
     if not invites.authority:
         return {"certificate": "", "fingerprint": ""}
@@ -111,8 +112,8 @@ ROUTES = (
         "anyone",
         sign_in,
         (
-            Field("code", "text", "the code, or an invitation's token", most=MAX_TEXT, is_required=False, default=""),
-            Field("password", "text", "the password", is_required=False, default=""),
+            Field("code", "text", "the code, or an invitation's token", most=MAX_TEXT, default=""),
+            Field("password", "text", "the password", default=""),
         ),
         gives="token, ticket, role, until (unix seconds)",
         # A password takes a small device a while.
@@ -145,7 +146,7 @@ ROUTES = (
         invite,
         (
             Field("role", "choice", "what it lets do", choices=("viewer", "phone", "operator")),
-            Field("name", "text", "who it is for", most=40, is_required=False, default="guest"),
+            Field("name", "text", "who it is for", most=40, default="guest"),
             Field(
                 "seconds",
                 "number",
@@ -153,11 +154,10 @@ ROUTES = (
                 least=1,
                 most=MAX_INVITED_S,
                 default=INVITED_S,
-                is_required=False,
                 unit="s",
             ),
-            Field("page", "text", "at which of this node's pages", least=0, is_required=False, default=""),
-            Field("draw", "flag", "as QR codes, too", is_required=False, default=False),
+            Field("page", "text", "at which of this node's pages", least=0, default=""),
+            Field("draw", "flag", "as QR codes, too", default=False),
         ),
         gives="token, ticket, role, until (unix seconds), link, reaches (network, or this machine), is_secure, pages, "
         "certificate (URL), fingerprint, code (SVG), certificate_code",

@@ -74,7 +74,7 @@ def _order(word: str, about: str, wish: Callable[[Ask], Callable[[str], Any]]) -
 
 
 NAME = Field("name", "text", "its name in the catalogue", most=64)
-GROUP = Field("group", "text", "tasks of one group are divided together", most=64, default="", is_required=False)
+GROUP = Field("group", "text", "tasks of one group are divided together", most=64, default="")
 ROUTES = (
     Route("GET", f"{API}/tasks", "The tasks, the newest first", "viewer", tasks, gives="a list of tasks"),
     Route(
@@ -109,7 +109,6 @@ ROUTES = (
                 least=1,
                 most=3,
                 default=1,
-                is_required=False,
             ),
             GROUP,
         ),

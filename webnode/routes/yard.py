@@ -16,7 +16,7 @@ def move_target(ask: Ask) -> Any:
     """Put it at a place in the yard."""
     x, y = ask.given["x"], ask.given["y"]
     _inside(_yard(ask, "target"), "target", x, y)
-    return _then(ask.board.desk.move_target(x, y), {"x": x, "y": y})
+    return ask.board.desk.move_target(x, y).addCallback(lambda _: {"x": x, "y": y})
 
 
 def move_robot(ask: Ask) -> Any:
@@ -28,12 +28,13 @@ def move_robot(ask: Ask) -> Any:
         raise Refusal("name", "no robot of the yard is called so", f"choose one of {here}", 404)
     _inside(yard, "robot", x, y)
     heading = found["heading"] if ask.given["heading"] is None else ask.given["heading"]
-    return _then(ask.board.desk.move_robot(name, x, y, heading), {"name": name, "x": x, "y": y, "heading": heading})
+    moved = {"name": name, "x": x, "y": y, "heading": heading}
+    return ask.board.desk.move_robot(name, x, y, heading).addCallback(lambda _: moved)
 
 
 def clear_target(ask: Ask) -> Any:
     """Take it away."""
-    return _then(ask.board.desk.clear_target(), {})
+    return ask.board.desk.clear_target().addCallback(lambda _: {})
 
 
 def _yard(ask: Ask, what: str) -> Mapping[str, Any]:
@@ -47,11 +48,6 @@ def _inside(yard: Mapping[str, Any], what: str, x: float, y: float) -> None:
     width, height = yard["walls"]
     if not (0.0 <= x <= width and 0.0 <= y <= height):
         raise Refusal(what, f"({x:g}, {y:g}) is outside the yard", f"give x in 0..{width:g} and y in 0..{height:g}")
-
-
-def _then(done: Any, answer: dict[str, Any]) -> Any:
-    """``answer``, once the yard has done what was asked, where that takes a while."""
-    return answer if done is None else done.addCallback(lambda _: answer)
 
 
 X = Field("x", "number", "from the yard's lower left corner", unit="m")
@@ -84,7 +80,7 @@ ROUTES = (
                 "where it looks, counter-clockwise from the right; as before where it is left out",
                 least=-TURN,
                 most=TURN,
-                is_required=False,
+                default=None,
                 unit="rad",
             ),
         ),
