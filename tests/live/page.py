@@ -18,6 +18,7 @@ import ssl
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -226,6 +227,11 @@ class BrowserCase(SynchronousTestCase):
         """Look at a view, as a link to it does."""
         page.evaluate(f"location.hash = {name!r}")
         page.locator(f"body[data-view={name}]").wait_for()
+
+    def floor(self, page: Any) -> Callable[[float, float], tuple[float, float]]:
+        """Where on the screen a place of the yard is, from its metres."""
+        box = page.locator(".floor").bounding_box()
+        return lambda x, y: (box["x"] + box["width"] * x / 3.0, box["y"] + box["height"] * (1 - y / 2.4))
 
     def pass_by(self, page: Any, seconds: float) -> None:
         """Turn the page's clock on; what it asks for thereupon has been asked for."""

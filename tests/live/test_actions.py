@@ -85,11 +85,7 @@ class ActionPageTests(PageCase):
     def test_lift_a_robot(self) -> None:
         """A robot is dragged elsewhere, moved by the arrow keys and turned by a click or Enter; the target stays."""
         page = self.opened(DESK)
-        box = page.locator(".floor").bounding_box()
-
-        def at(x: float, y: float) -> tuple[float, float]:
-            return box["x"] + box["width"] * x / 3.0, box["y"] + box["height"] * (1 - y / 2.4)
-
+        at = self.floor(page)
         page.locator(".dog .grip").nth(2).wait_for(state="attached")
         target = page.locator("#place").inner_text()
         page.mouse.move(*at(0.6, 0.6))
@@ -122,14 +118,11 @@ class ActionPageTests(PageCase):
         page.locator(".dog .grip").nth(2).wait_for(state="attached")
         self.view(page, "map")
         page.locator("#map").scroll_into_view_if_needed()
-        box = page.locator(".floor").bounding_box()
+        at = self.floor(page)
         touch = page.context.new_cdp_session(page)
 
         def finger(kind: str, *places: tuple[float, float]) -> None:
-            points = [
-                {"x": box["x"] + box["width"] * x / 3.0, "y": box["y"] + box["height"] * (1 - y / 2.4)}
-                for x, y in places
-            ]
+            points = [dict(zip("xy", at(*place), strict=True)) for place in places]
             touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
 
         before = page.evaluate("scrollY")

@@ -6,7 +6,6 @@ import json
 import select
 import socket
 import ssl
-import subprocess
 import time
 import urllib.error
 import urllib.request
@@ -15,7 +14,7 @@ from itertools import chain, repeat
 from typing import Any
 
 from sim.demo import port
-from tests.live.test_bad_input import LiveTests
+from tests.live.node import NodeCase
 from tests.live.until import takes, until
 
 MISSING = [name for name in ("flask", "OpenSSL", "cryptography") if find_spec(name) is None]
@@ -27,22 +26,19 @@ CODE = "quiet-otter"
 class SecureNode:
     """A web node in a process of its own, with the page at ``plain`` and at ``secure``."""
 
-    def __init__(self, test: LiveTests, name: str, known: str = "", key: str = "of these tests") -> None:
+    def __init__(self, test: NodeCase, name: str, known: str = "") -> None:
         http, https = port.free("tcp", "127.0.0.1", 2)
         (udp,) = port.free("udp", "127.0.0.1", 1)
-        path = test.folder / f"{name}.toml"
-        path.write_text(
-            f'[node]\nname = "{name}"\nport = {udp}\nroles = ["web"]\nstore = "{name}.sqlite"\nteam_key = "{key}"\n'
+        path = test.file(
+            f'[node]\nname = "{name}"\nport = {udp}\nroles = ["web"]\nstore = "{name}.sqlite"\nteam_key = "t"\n'
             f"known_nodes = {json.dumps([known] if known else [])}\n"
             f'[web]\nport = {http}\ntls = "auto"\ntls_port = {https}\ncode = "{CODE}"\n',
-            encoding="utf-8",
+            name,
         )
         self.address = f"127.0.0.1:{udp}"
         self.plain, self.secure = f"http://127.0.0.1:{http}", f"https://127.0.0.1:{https}"
         self.port = https
-        self.process: subprocess.Popen[str] = test.start("--config", str(path))
-        test.addCleanup(self.process.communicate)
-        test.addCleanup(self.process.kill)
+        self.process = test.node("--config", path).process
         until(lambda: takes(http))
         self.authority = asked(f"{self.plain}/api/v1/ca.crt").decode()
 
@@ -56,7 +52,7 @@ def asked(url: str, trust: ssl.SSLContext | None = None, body: object = None, to
     return content
 
 
-class HttpsTests(LiveTests):
+class HttpsTests(NodeCase):
     if MISSING:
         skip = f"THE PAGE OVER TLS IS NOT TESTED: missing {', '.join(MISSING)} (pip install 'swarm-node[tls]')"
 
@@ -67,9 +63,15 @@ class HttpsTests(LiveTests):
             setattr(trust, name, version)
         return trust
 
-    def test_serve_all_of_the_page(self) -> None:
-        """Page, scripts, API and stream come over TLS 1.2 or newer to who trusts the team, and to nobody else."""
+    def test_serve_the_page_to_who_trusts_it(self) -> None:
+        """One node serves all of the page over TLS, guards it as the plain port, and lets slow handshakes go."""
         node = SecureNode(self, "vaio")
+        self.serve_all_of_the_page(node)
+        self.keep_the_guard(node)
+        self.let_go_who_dribbles_a_handshake(node)
+
+    def serve_all_of_the_page(self, node: SecureNode) -> None:
+        """Page, scripts, API and stream come over TLS 1.2 or newer to who trusts the team, and to nobody else."""
         trust = self.trusting(node)
         self.assertIn(b"<title>Swarm</title>", asked(node.secure, trust))
         self.assertIn(b"import", asked(f"{node.secure}/static/page.js", trust))
@@ -96,9 +98,8 @@ class HttpsTests(LiveTests):
         self.assertRaises(urllib.error.URLError, asked, node.secure, old)
         self.assertIn(b"vaio", asked(node.secure, self.trusting(node, maximum_version=ssl.TLSVersion.TLSv1_2)))
 
-    def test_keep_the_guard(self) -> None:
+    def keep_the_guard(self, node: SecureNode) -> None:
         """What is refused at the plain port is refused at the other: a foreign host or site, no session, too much."""
-        node = SecureNode(self, "vaio")
         trust = self.trusting(node)
         for path, headers, body, status in (
             ("/api/v1/state", {}, None, 401),
@@ -121,13 +122,12 @@ class HttpsTests(LiveTests):
         self.assertRaises(urllib.error.URLError, asked, second.secure, self.trusting(first))
         before = ssl.get_server_certificate(("127.0.0.1", first.port))
         first.process.terminate()
-        first.process.communicate()
+        first.process.wait()
         again = SecureNode(self, "vaio")
         self.assertEqual(ssl.get_server_certificate(("127.0.0.1", again.port)), before)
 
-    def test_let_go_who_dribbles_a_handshake(self) -> None:
+    def let_go_who_dribbles_a_handshake(self, node: SecureNode) -> None:
         """Forty that dribble a handshake, say nothing or speak no TLS are closed in time; others are served."""
-        node = SecureNode(self, "vaio")
         began = time.monotonic()
         slow = [socket.create_connection(("127.0.0.1", node.port), 5.0) for _ in range(40)]
         for client in slow:

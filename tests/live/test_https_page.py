@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import json
 import signal
-import ssl
 from importlib.util import find_spec
 
-from tests.live.page import DESK, PHONE, BrowserCase, pin
+from tests.live.node import NodeCase
+from tests.live.page import DESK, BrowserCase, pin
 from tests.live.page import MISSING as NO_BROWSER
-from tests.live.test_bad_input import LiveTests
 from tests.live.test_https import CODE, SecureNode, asked
 
 MISSING = [*NO_BROWSER, *(name for name in ("OpenSSL", "cryptography") if find_spec(name) is None)]
@@ -17,25 +16,9 @@ MOVED_S = 15.0
 """Within 2 s where the machine has nothing else to do."""
 
 
-class HttpsPageTests(BrowserCase, LiveTests):
+class HttpsPageTests(BrowserCase, NodeCase):
     if MISSING:
         skip = f"THE PAGE OVER TLS IS NOT TESTED IN A BROWSER: missing {'; '.join(MISSING)}"
-
-    def test_take_part_by_an_invitation(self) -> None:
-        """A phone that scanned an invitation gives its camera over TLS by one tap, and is a device of the team."""
-        node = SecureNode(self, "vaio")
-        trust = ssl.create_default_context(cadata=node.authority)
-        session = json.loads(asked(f"{node.secure}/api/v1/session", trust, {"code": CODE}))["token"]
-        invited = json.loads(asked(f"{node.secure}/api/v1/invitations", trust, {"role": "phone"}, session))
-        self.assertTrue(invited["link"].startswith(f"{node.secure}/#code="), invited["link"])
-        self.browser = self.launched(f"--ignore-certificate-errors-spki-list={pin(node.port)}")
-        page = self.tab(PHONE, permissions=["camera"])
-        page.goto(invited["link"])
-        page.get_by_role("button", name="Take part", exact=True).tap()
-        page.get_by_role("button", name="Stop taking part").wait_for()
-        page.locator(".device").nth(1).wait_for(state="attached")
-        state = json.loads(asked(f"{node.secure}/api/v1/state", trust, token=session))
-        self.assertEqual(["camera" in device["capabilities"] for device in state["devices"]], [False, True])
 
     def test_stay_secure_when_the_node_is_lost(self) -> None:
         """The page has camera and service worker within reach, and goes on at another node's https, never at http."""

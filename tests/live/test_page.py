@@ -77,11 +77,6 @@ class PageTests(PageCase):
         self.assertEqual(page.evaluate(shown), ["place-cameras"])
         self.assertEqual(self.faults, [])
 
-    def test_keep_twins_apart(self) -> None:
-        """Two rows that are alike, as two equal messages of one moment, stay two, and go when they are no more."""
-        page = self.opened(PHONE)
-        self.assertEqual(page.evaluate(TWINS), [["abab", 4], ["aba", 0], ["baa", 0]])
-
     def test_choose_colours(self) -> None:
         """The page follows the system's colours; light and dark can be chosen against them, and stay chosen."""
         page = self.opened(DESK, "light")
@@ -187,7 +182,7 @@ class PageTests(PageCase):
         page.locator(".device[data-state=WAITING]", has_text="dog1").wait_for()
 
     def test_open_a_device(self) -> None:
-        """A double click, a tap and Enter open a device; a single click does not; Escape closes."""
+        """A double click, Enter and its address open a device; a click does not; Escape, Close and back leave it."""
         page = self.opened(DESK)
         dialog = page.locator("dialog[open]")
         page.locator(".device").nth(1).click()
@@ -195,28 +190,24 @@ class PageTests(PageCase):
         self.assertEqual(dialog.count(), 0)
         page.locator(".device").nth(1).dblclick()
         dialog.wait_for()
+        self.assertIn("#device/0202", page.url)
         for words in ("dog2", "base2d", "192.168.0.12:7000", "red target seen at 0.62 m"):
             self.assertIn(words, dialog.inner_text())
-        page.keyboard.press("Escape")
+        page.go_back()
         dialog.wait_for(state="hidden")
         page.locator(".device").nth(2).focus()
         page.keyboard.press("Enter")
         dialog.wait_for()
-        phone = self.opened(PHONE)
-        phone.locator(".device").first.tap()
-        phone.locator("dialog[open]").wait_for()
-
-    def test_go_back_from_a_device(self) -> None:
-        """A device has an address: the back button leaves it, a link leads to it, an unknown place leads nowhere."""
-        page = self.opened(DESK)
-        dialog = page.locator("dialog[open]")
-        page.locator(".device").nth(1).dblclick()
-        dialog.wait_for()
-        self.assertIn("#device/0202", page.url)
-        page.go_back()
+        page.keyboard.press("Escape")
         dialog.wait_for(state="hidden")
         page.evaluate("location.hash = 'device/' + '01'.repeat(16)")
         page.locator("#d-name", has_text="dog1").wait_for()
+        page.locator("#d-text").fill("sit")
+        page.keyboard.press("Enter")
+        page.locator("#d-answer", has_text="Message sent").wait_for()
+        self.assertEqual(page.locator("#d-text").input_value(), "")
+        page.get_by_role("button", name="Disconnect").click()
+        page.locator("#d-answer", has_text="15 s").wait_for()
         page.locator("#d-close").click()
         dialog.wait_for(state="hidden")
         self.assertNotIn("#device", page.url)
@@ -225,9 +216,10 @@ class PageTests(PageCase):
         dialog.wait_for()
         self.assertEqual(self.faults, [])
 
-    def test_give_panels_their_place(self) -> None:
-        """A panel stands where it belongs, in order, for whom and where it is meant, is told what comes, and ends."""
+    def test_run_the_parts_of_the_page(self) -> None:
+        """A panel stands where it belongs, for whom it is meant, is told what comes, and ends; equal rows stay two."""
         page = self.informed(self.opened(DESK))
+        self.assertEqual(page.evaluate(TWINS), [["abab", 4], ["aba", 0], ["baa", 0]])
         page.evaluate(PANELS)
         self.assertEqual(page.locator("#place-groups > [data-order]").all_inner_texts(), [])
         page.evaluate("seen.model.has = [...seen.model.has, 'wings']")
@@ -265,32 +257,8 @@ class PageTests(PageCase):
         self.assertFalse([words for words in page.locator("#d-events").all_inner_texts() if "dog3" in words])
         self.assertEqual(self.faults, [])
 
-    def test_read_what_happened_on_a_phone(self) -> None:
-        """On a phone, where the events have the screen to themselves, the page is scrolled and not a list within it."""
-        page = self.opened(PHONE)
-        self.view(page, "events")
-        page.locator("#events li", has_text="begins to look").wait_for()
-        inside = """events => {
-          for (let n = 0; n < 100; n += 1) events.append(events.firstElementChild.cloneNode(true));
-          return events.scrollHeight - events.clientHeight;
-        }"""
-        self.assertEqual(page.locator("#events").evaluate(inside), 0)
-        page.evaluate("scrollTo(0, document.body.scrollHeight)")
-        self.assertLessEqual(page.locator("#events").bounding_box()["y"], 0)
-
-    def test_speak_to_a_device(self) -> None:
-        """From the dialog a message is sent and a device told to leave; the answer stands there in words."""
-        page = self.opened(DESK)
-        page.locator(".device").first.dblclick()
-        page.locator("#d-text").fill("sit")
-        page.keyboard.press("Enter")
-        page.locator("#d-answer", has_text="Message sent").wait_for()
-        self.assertEqual(page.locator("#d-text").input_value(), "")
-        page.get_by_role("button", name="Disconnect").click()
-        page.locator("#d-answer", has_text="15 s").wait_for()
-
     def test_give_tasks(self) -> None:
-        """Run Demo, assigning a chosen task and cancelling one are each a button and an answer in words."""
+        """On a phone a task is assigned and cancelled by a button, and the group shows its bids and whom it names."""
         page = self.opened(PHONE)
         page.get_by_role("button", name="Run Demo").tap()
         self.told(page, "The demo runs")
@@ -301,10 +269,6 @@ class PageTests(PageCase):
         page.get_by_role("button", name="Cancel").first.tap()
         self.told(page, "sent")
         self.assertIn("dog1: no gripper", page.locator("#tasks").inner_text())
-
-    def test_show_consensus(self) -> None:
-        """The group's consensus point and every bid stand there; a status is a word and a shape."""
-        page = self.opened(PHONE)
         self.view(page, "groups")
         self.assertEqual(page.locator(".point").inner_text(), "dog2 – 3 of 3 agree")
         self.assertEqual(page.locator(".cost").all_inner_texts(), ["1.04 m", "0.62 m", "1.37 m"])
@@ -314,15 +278,21 @@ class PageTests(PageCase):
         self.assertEqual(len(set(shapes)), 3)
         self.team.order("status dog3 DONE")
         page.locator(".device[data-state=DONE]", has_text="done").wait_for()
+        # Where the events have the screen to themselves the page is scrolled, and not a list within it.
+        self.view(page, "events")
+        page.locator("#events li", has_text="begins to look").wait_for()
+        inside = """events => {
+          for (let n = 0; n < 100; n += 1) events.append(events.firstElementChild.cloneNode(true));
+          return events.scrollHeight - events.clientHeight;
+        }"""
+        self.assertEqual(page.locator("#events").evaluate(inside), 0)
+        page.evaluate("scrollTo(0, document.body.scrollHeight)")
+        self.assertLessEqual(page.locator("#events").bounding_box()["y"], 0)
 
     def test_move_the_target(self) -> None:
         """A click, a drag and the arrow keys move the target; a button takes it away."""
         page = self.opened(DESK)
-        box = page.locator(".floor").bounding_box()
-
-        def at(x: float, y: float) -> tuple[float, float]:
-            return box["x"] + box["width"] * x / 3.0, box["y"] + box["height"] * (1 - y / 2.4)
-
+        at = self.floor(page)
         page.mouse.click(*at(2.03, 2.0))
         page.locator("#place", has_text="Target at 2.0").wait_for()
         ball = page.locator(".target .ball").bounding_box()

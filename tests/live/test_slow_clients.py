@@ -101,15 +101,3 @@ class SlowClientTests(TeamCase):
         self.assertLess(time.monotonic() - began, CLOSED_S)
         self.assertLess(slowest, ANSWER_S)
         self.assertEqual({data[:12] for data in self.crowd.heard}, {b"HTTP/1.1 408"})
-
-    def test_bear_one_address(self) -> None:
-        """Of a hundred dribblers of one address 16 are borne, the others told at once; a whole request gets through."""
-        self.crowd.join(100, BEGUN, first=7)
-        self.crowd.live(1.5)
-        self.assertEqual(len(self.crowd.open), 16)
-        self.assertEqual(sum(data.startswith(b"HTTP/1.1 503") for data in self.crowd.heard), 84)
-        whole = Crowd(self.team.port)
-        self.addCleanup(whole.leave)
-        whole.join(1, b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n", first=7)
-        whole.live(1.0)
-        self.assertTrue(whole.heard[0].startswith(b"HTTP/1.1 200"))

@@ -24,7 +24,7 @@ from middleware.entangled.network.tunnel import MAX_BEGUN, MAX_OF_HOST, TunnelNe
 from middleware.entangled.network.url import Url
 from middleware.entangled.wire.endpoint import Endpoint
 from sim.demo import port
-from tests.live.test_bad_input import PATIENCE_S, LiveTests
+from tests.live.node import PATIENCE_S, NodeCase
 from tests.live.until import takes, until
 
 REACTOR: Any = reactor
@@ -308,12 +308,11 @@ class TunnelTests(TestCase):
         self.assertNotIn("\n", str(error))
 
 
-class NodeTests(LiveTests):
-    def node(self, name: str, text: str) -> Any:
+class NodeTests(NodeCase):
+    def joins(self, name: str, text: str) -> Any:
         """A real node with these settings."""
-        path = self.folder / f"{name}.toml"
-        path.write_text(f'[node]\nname = "{name}"\nteam_key = "of these tests"\n{text}', encoding="utf-8")
-        child = self.start("--config", str(path))
+        path = self.file(f'[node]\nname = "{name}"\nteam_key = "of these tests"\n{text}', name)
+        child = self.popen("--config", path)
         self.addCleanup(child.communicate)
         self.addCleanup(child.kill)
         return child
@@ -324,9 +323,9 @@ class NodeTests(LiveTests):
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as silent:
             silent.bind((HOST, 0))
             known = f'known_nodes = ["{HOST}:{silent.getsockname()[1]}"]\n'
-            self.node("b", f'roles = ["bootstrap"]\ntunnel_port = {number}\n')
+            self.joins("b", f'roles = ["bootstrap"]\ntunnel_port = {number}\n')
             until(lambda: takes(number))
-            child = self.node("a", f'{known}tunnels = ["wss://{HOST}:{number}"]\n')
+            child = self.joins("a", f'{known}tunnels = ["wss://{HOST}:{number}"]\n')
             silent.settimeout(PATIENCE_S)
             silent.recv(2000)
             began, lines = time.monotonic(), []
