@@ -178,8 +178,4 @@ class ActionPageTests(PageCase):
             page.locator(".stop").click()
             page.locator(".halted").wait_for()
             self.sound_by_day_and_night(page)
-            page.locator(".device").first.focus()
-            page.keyboard.press("Enter")
-            page.locator("dialog[open] .knob").first.wait_for()
-            self.sound_by_day_and_night(page)
             page.context.close()

@@ -195,7 +195,7 @@ class PageTests(PageCase):
             self.assertIn(words, dialog.inner_text())
         page.go_back()
         dialog.wait_for(state="hidden")
-        page.locator(".device").nth(2).focus()
+        page.locator(".device").first.focus()
         page.keyboard.press("Enter")
         dialog.wait_for()
         page.keyboard.press("Escape")

@@ -57,8 +57,9 @@ class PhoneViewTests(BrowserCase, TeamCase):
     def test_take_part_and_stop(self) -> None:
         """By touch and by keyboard alone, on three screens: it shows what it sees and what it is asked, and stops."""
         for screen in (PHONE, TABLET, DESK):
+            look = self.sound_by_day_and_night if screen is PHONE else self.sound
             page = self.opened(screen)
-            self.sound_by_day_and_night(page)
+            look(page)
             button = page.get_by_role("button", name="Take part", exact=True)
             if screen.get("has_touch"):
                 button.tap()
@@ -67,10 +68,10 @@ class PhoneViewTests(BrowserCase, TeamCase):
                 page.keyboard.press("Enter")
             page.locator(".phone .said", has_text="Look for the red target").wait_for()
             page.locator(".phone", has_text="Target at about 0.2").wait_for()
-            self.sound_by_day_and_night(page)
+            look(page)
             page.get_by_role("button", name="Stop taking part").click()
             page.locator(".phone .trouble", has_text="takes no part any more").wait_for()
-            self.sound_by_day_and_night(page)
+            look(page)
             page.context.close()
 
     def test_leave_while_hidden(self) -> None:
