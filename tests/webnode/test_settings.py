@@ -26,13 +26,13 @@ class TunerTests(SynchronousTestCase):
         """The settings of a device, as it tells."""
         asked = read_settings(self.team.desk, self.team.services[name].assembly.node.uuid)
         self.team.clock.advance(0.1)
-        return {row["key"]: row["value"] for row in self.successResultOf(asked)}
+        return {str(row["key"]): row["value"] for row in self.successResultOf(asked)}
 
     def change(self, **changes: Any) -> dict[str, Any]:
         """Change settings of dog1; what it tells then."""
         asked = change_settings(self.team.desk, self.node.uuid, changes)
         self.team.clock.advance(0.1)
-        return {row["key"]: row["value"] for row in self.successResultOf(asked)}
+        return {str(row["key"]): row["value"] for row in self.successResultOf(asked)}
 
     def refusal(self, **changes: Any) -> Refusal:
         """Why dog1 does not change them."""
