@@ -20,7 +20,6 @@ from twisted.web.static import Data
 from tests.webnode.memory import MemoryDesk
 from tests.webnode.picture import jpeg
 from webnode.board import Board
-from webnode.errors import PortTaken
 from webnode.route import Route
 from webnode.routes.table import TABLE
 from webnode.server import WORKERS, WebService
@@ -157,14 +156,6 @@ class WebServiceTests(TestCase):
                 taken += read(slow)
         self.assertLess(len(held), 200_000)
         self.assertLess(len(taken), 400_000)
-
-    def test_tell_of_taken_port(self) -> None:
-        """A port that another program holds is told in one line that says where and what to do."""
-        second = self.service(self.web.port)
-        words = str(self.assertRaises(PortTaken, second.startService))
-        self.assertIn(f"127.0.0.1:{self.web.port}", words)
-        self.assertIn("choose another port", words)
-        self.assertNotIn("\n", words)
 
     async def test_serve_at_further_doors(self) -> None:
         """A further door serves the same page, a route's own resource as well, and is closed with the first."""

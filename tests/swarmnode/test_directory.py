@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
-import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -12,11 +9,11 @@ from typing import Any
 from twisted.internet.defer import Deferred
 
 from middleware.diagnostics.survey import inventory
-from middleware.entangled.control.place import made
 from middleware.frontend.client import TeamClient
 from swarmnode.asker import Asker
 from swarmnode.team.verb import TeamVerbs
 from tests.fleet import FleetCase, SwarmFleet
+from tests.swarmnode.shell import socket_folder
 from webnode.ledger import state_from
 from webnode.state import Departed
 from webnode.team import TeamDesk
@@ -53,10 +50,7 @@ class SplitTests(FleetCase):
     def test_shell(self) -> None:
         """What ``swarm links``, ``chaos`` and ``deploy`` ask for is every device, in the order of joining."""
         fleet = self.apart()
-        folder = Path(tempfile.mkdtemp())
-        self.addCleanup(shutil.rmtree, folder)
-        self.patch(os, "environ", {**os.environ, "XDG_RUNTIME_DIR": str(folder)})
-        made("dog2").touch()
+        socket_folder(self, "dog2")
         verbs = TeamVerbs(NoVerbs(), fleet.nodes[2])
 
         def ask(path: Path, request: dict[str, Any]) -> Iterator[dict[str, Any]]:

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import os
-import shutil
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,11 +13,10 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.diagnostics.survey import ENDING_S, links, team
 from middleware.entangled.control.link import link
-from middleware.entangled.control.place import made
 from middleware.entangled.errors import Refused
 from swarmnode.links import main
 from swarmnode.rehearsal import VirtualTeam
-from tests.swarmnode.shell import Shell
+from tests.swarmnode.shell import Shell, socket_folder
 
 FAR = {"id": "cd" * 20, "address": f"~{'cd' * 20}:1", "way": "carried", "by": "ef" * 20, "for": 150.0, "relayed": True}
 NEAR = {"id": "ef" * 20, "address": "192.168.1.9:8484", "way": "lan", "by": "", "for": 7500.0, "relayed": False}
@@ -30,11 +26,7 @@ class LinksTests(SynchronousTestCase):
     """Behaviour of the command."""
 
     def setUp(self) -> None:
-        # Trial's own folders are deeper than the path of a socket may be.
-        folder = Path(tempfile.mkdtemp())
-        self.addCleanup(shutil.rmtree, folder)
-        self.patch(os, "environ", {**os.environ, "XDG_RUNTIME_DIR": str(folder)})
-        made("vaio").touch()
+        socket_folder(self, "vaio")
         self.links: Any = [{**NEAR, "times": [0.002] * 10}, {**FAR, "times": [0.08] * 9 + [None]}]
 
     def ask(self, path: Path, request: dict[str, Any]) -> Iterator[dict[str, Any]]:

@@ -3,29 +3,20 @@
 from __future__ import annotations
 
 import json
-import os
-import shutil
-import tempfile
-from pathlib import Path
 
 from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.entangled.control.place import made
 from middleware.tasks.task import Task
 from swarmnode.asker import Refusal
 from swarmnode.rehearsal import VirtualTeam
 from swarmnode.why import chosen, main
-from tests.swarmnode.shell import Shell
+from tests.swarmnode.shell import Shell, socket_folder
 
 
 class WhyTests(SynchronousTestCase):
     def setUp(self) -> None:
-        # Trial's own folders are deeper than the path of a socket may be.
-        self.folder = Path(tempfile.mkdtemp())
-        self.addCleanup(shutil.rmtree, self.folder)
-        self.patch(os, "environ", {**os.environ, "XDG_RUNTIME_DIR": str(self.folder)})
-        made("vaio").touch()
+        socket_folder(self, "vaio")
         self.team = VirtualTeam(4)
         self.addCleanup(self.team.stop)
         self.shell = Shell(self.team, self.team.services["vaio"].assembly.node)
