@@ -7,7 +7,7 @@ reactor's thread, and what it waits for is waited for here, for a bounded time.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection
 from functools import partial
 from typing import Any
 
@@ -47,7 +47,6 @@ def create_app(
     on_reactor: OnReactor = _here,
     hosts: Collection[str] = (),
     wall: Callable[[], float] = lambda: 0.0,
-    table: Sequence[Route] = TABLE,
 ) -> Flask:
     """The application.
 
@@ -60,7 +59,7 @@ def create_app(
     app.json.sort_keys = False  # type: ignore[attr-defined]
 
     # A phone whose page is being closed can still send a last word, but no header with it.
-    unmarked = {(str(route.method), _rule(route.path)) for route in table if route.role == "phone"}
+    unmarked = {(str(route.method), _rule(route.path)) for route in TABLE if route.role == "phone"}
     lets_in = partial(on_reactor, board.fallbacks.lets_in)
     _guard(app, lets_in, hosts, lambda: (request.method, str(request.url_rule)) not in unmarked)
     _explain(app)
@@ -73,7 +72,7 @@ def create_app(
             who = on_reactor(board.sessions.visitor, _token(), now)
             guarded(route.role, who)
             given = checked(route, path, request.args, {} if route.method == "GET" else _body())
-            ask = Ask(given, who, board, read(), _id(), request.remote_addr or "", now, tuple(table))
+            ask = Ask(given, who, board, read(), _id(), request.remote_addr or "", now, TABLE)
             told = on_reactor(dispatch.carry_out, route, ask, limit_s=route.limit_s)
             is_content = isinstance(told, Content)
             response = app.response_class(told.body, content_type=told.kind) if is_content else jsonify(told)
@@ -82,7 +81,7 @@ def create_app(
 
         app.add_url_rule(_rule(route.path), route.name, answer, methods=[route.method])
 
-    for route in table:
+    for route in TABLE:
         if route.answer is not None:
             serve(route)
     return app

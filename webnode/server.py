@@ -37,7 +37,7 @@ from webnode.fallback import urls_at
 from webnode.guard import headers, refusal
 from webnode.live import Events, Shots, shown
 from webnode.resource import JsonResource, Refused
-from webnode.route import Route, guarded
+from webnode.route import guarded
 from webnode.routes.table import TABLE
 from webnode.state import State
 from webnode.visitor import Role
@@ -139,12 +139,11 @@ class Root(Resource):
         board: Board,
         wall: Callable[[], float],
         hosts: Collection[str] = (),
-        table: Sequence[Route] = TABLE,
     ) -> None:
         super().__init__()
         self._flask = flask
         self._native = [
-            (tuple(path.strip("/").encode().split(b"/")), resource, _role_of(path, table))
+            (tuple(path.strip("/").encode().split(b"/")), resource, _role_of(path))
             for path, resource in sorted(native.items(), key=lambda item: -item[0].count("/"))
         ]
         self._board = board
@@ -204,9 +203,9 @@ def _begins(asked: Sequence[bytes], pattern: Sequence[bytes]) -> bool:
     )
 
 
-def _role_of(path: str, table: Sequence[Route]) -> Role:
+def _role_of(path: str) -> Role:
     """The role that the native route at ``path``, or below it, wants; one that no route names is for operators."""
-    roles = [route.role for route in table if route.answer is None and f"{route.path}/".startswith(f"{path}/")]
+    roles = [route.role for route in TABLE if route.answer is None and f"{route.path}/".startswith(f"{path}/")]
     return roles[0] if roles else "operator"
 
 
@@ -256,7 +255,6 @@ class WebService(Service):
         wall: Callable[[], float],
         hosts: Collection[str] = (),
         doors: Sequence[Door] = (),
-        table: Sequence[Route] = TABLE,
         live: Callable[[], State] | None = None,
         version: Callable[[], object] | None = None,
     ) -> None:
@@ -265,12 +263,12 @@ class WebService(Service):
         self._wanted = port
         self._doors = doors
         self._pool = ThreadPool(1, WORKERS, "web")
-        flask = WSGIResource(reactor, self._pool, create_app(read, board, caller(reactor), hosts, wall, table))
+        flask = WSGIResource(reactor, self._pool, create_app(read, board, caller(reactor), hosts, wall))
         self._events = Events(live or read, reactor, wall, board, version)
         self._shots = Shots(board.desk.watch, reactor)
         native: dict[str, Resource] = {"/events": self._events, "/shot": self._shots, "/static": Files()}
-        native.update({route.path: route.native(board, reactor) for route in table if route.native is not None})
-        root = Root(flask, native, board, wall, hosts, table)
+        native.update({route.path: route.native(board, reactor) for route in TABLE if route.native is not None})
+        root = Root(flask, native, board, wall, hosts)
         self.site = QuietSite(root, requestFactory=CappedRequest, timeout=30)
         self.site.displayTracebacks = False
         limited(self.site, board.limits)

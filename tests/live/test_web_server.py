@@ -15,13 +15,10 @@ from twisted.internet.task import deferLater
 from twisted.trial.unittest import TestCase
 from twisted.web.client import Agent, HTTPConnectionPool, readBody
 from twisted.web.http_headers import Headers
-from twisted.web.static import Data
 
 from tests.webnode.memory import MemoryDesk
 from tests.webnode.picture import jpeg
 from webnode.board import Board
-from webnode.route import Route
-from webnode.routes.table import TABLE
 from webnode.server import WORKERS, WebService
 from webnode.state import State, state_of
 from webnode.visitor import OpenSessions
@@ -158,21 +155,18 @@ class WebServiceTests(TestCase):
         self.assertLess(len(taken), 400_000)
 
     async def test_serve_at_further_doors(self) -> None:
-        """A further door serves the same page, a route's own resource as well, and is closed with the first."""
+        """A further door serves the same page and is closed with the first."""
         opened: list[Any] = []
 
         def door(site: Any) -> Any:
             opened.append(reactor.listenTCP(0, site, interface="127.0.0.1"))
             return opened[0]
 
-        native = Route(
-            "GET", "/api/v1/note", "A note", "anyone", None, native=lambda board, clock: Data(b"hi", "text/plain")
-        )
         board = Board(self.desk, OpenSessions())
-        web = WebService(reactor, "127.0.0.1", 0, self.read, board, lambda: 1e9, doors=[door], table=[*TABLE, native])
+        web = WebService(reactor, "127.0.0.1", 0, self.read, board, lambda: 1e9, doors=[door])
         web.startService()
         url = f"http://127.0.0.1:{opened[0].getHost().port}".encode()
-        for path, words in ((b"/", b"vaio"), (b"/api/v1/note", b"hi"), (b"/api/v1/state", b"dog1")):
+        for path, words in ((b"/", b"vaio"), (b"/sw.js", b"caches"), (b"/api/v1/state", b"dog1")):
             self.assertIn(words, await readBody(await self.agent.request(b"GET", url + path)))
         await maybeDeferred(web.stopService)
         self.assertTrue(opened[0].disconnected)

@@ -16,10 +16,9 @@ from webnode.app import create_app
 from webnode.board import Board
 from webnode.fallback import Fallbacks, Page
 from webnode.guard import HEADERS
-from webnode.routes.table import TABLE
 from webnode.server import sent
 from webnode.state import Departed, State, state_of
-from webnode.visitor import OpenSessions, Sessions
+from webnode.visitor import OpenSessions
 
 YARD: dict[str, Any] = {"walls": [3.0, 2.4], "dogs": [], "target": None}
 
@@ -34,10 +33,10 @@ class AppTests(SynchronousTestCase):
         self.state = state_of(dogs[:2], [{"id": "t1", "title": "Search"}], {}, departed=gone, node="vaio")
         self.client = self.client_of(lambda: self.state)
 
-    def client_of(self, read: Any, sessions: Sessions | None = None, table: Any = TABLE) -> FlaskClient:
+    def client_of(self, read: Any) -> FlaskClient:
         fallbacks = Fallbacks(Page("02", "http://other:8080"))
-        self.board = Board(self.desk, sessions or OpenSessions(), fallbacks=fallbacks)
-        app = create_app(read, self.board, wall=lambda: 1e9, table=table)
+        self.board = Board(self.desk, OpenSessions(), fallbacks=fallbacks)
+        app = create_app(read, self.board, wall=lambda: 1e9)
         app.logger.setLevel(logging.CRITICAL + 1)
         return app.test_client()
 
