@@ -16,6 +16,8 @@ from twisted.logger import Logger
 from twisted.python.failure import Failure
 from zope.interface import implementer
 
+from drivers.timer import Timer
+
 FIRST_RETRY_S = 0.1
 LAST_RETRY_S = 2
 RETRY_FACTOR = 1.6
@@ -355,18 +357,16 @@ class _MemoryLine:
 
     def __init__(self, connector: MemoryConnector, clock: IReactorTime, caller: Caller) -> None:
         self._connector = connector
-        self._clock = clock
         self._caller = caller
         self._retry_s = FIRST_RETRY_S
         self._link: MemoryLink | None = None
         self._is_wanted = True
-        self._pending: Any = clock.callLater(0.0, self._try)
+        self._pending = Timer(clock)
+        self._pending.set(0.0, self._try)
 
     def hang_up(self) -> Deferred[None]:
         self._is_wanted = False
-        if self._pending is not None:
-            self._pending.cancel()
-            self._pending = None
+        self._pending.cancel()
         if self._link is not None:
             self._link.close()
         return succeed(None)
@@ -377,14 +377,13 @@ class _MemoryLine:
     def link_down(self) -> None:
         self._link = None
         if self._is_wanted:
-            self._pending = self._clock.callLater(FIRST_RETRY_S, self._try)
+            self._pending.set(FIRST_RETRY_S, self._try)
         self._caller.link_down()
 
     def _try(self) -> None:
-        self._pending = None
         self._link = self._connector.opened(self)
         if self._link is None:
-            self._pending = self._clock.callLater(self._retry_s, self._try)
+            self._pending.set(self._retry_s, self._try)
             self._retry_s = min(self._retry_s * RETRY_FACTOR, LAST_RETRY_S)
             return
         self._retry_s = FIRST_RETRY_S

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 from twisted.internet.defer import Deferred, succeed
 from twisted.internet.interfaces import IReactorTime
@@ -12,6 +11,7 @@ from drivers.aibo.link import Datagrams, Port
 from drivers.aibo.picture import REQUEST, Closing, Message, Picture, PictureReader, decoded
 from drivers.errors import BadFrame
 from drivers.link import Connector, Link
+from drivers.timer import Timer
 
 ASK_S = 0.5
 """The request for datagrams is sent so often until the first arrives, and again when they cease."""
@@ -38,7 +38,7 @@ class Camera:
         self._datagrams = datagrams
         self._reader = PictureReader()
         self._link: Link | None = None
-        self._ask: Any = None
+        self._ask = Timer(clock)
         self._heard_at = -SILENT_S
 
     @property
@@ -56,9 +56,7 @@ class Camera:
 
     def close(self) -> Deferred[None]:
         """Fetch no more; it can be opened again."""
-        if self._ask is not None:
-            self._ask.cancel()
-            self._ask = None
+        self._ask.cancel()
         link, self._link = self._link, None
         if link is not None:
             link.close()
@@ -95,6 +93,6 @@ class Camera:
             self.port.drop()
 
     def _keep_asking(self) -> None:
-        self._ask = self._clock.callLater(ASK_S, self._keep_asking)
+        self._ask.set(ASK_S, self._keep_asking)
         if self._link is not None and self.is_silent:
             self._link.send(REQUEST)

@@ -10,6 +10,7 @@ from twisted.internet.interfaces import IReactorTime
 from twisted.internet.protocol import DatagramProtocol
 
 from drivers.link import Connector, Line, Link
+from drivers.timer import Timer
 
 WAITS = (0.5, 1.0, 2.0, 5.0)
 """A port that was just closed does not accept at once; so long the dog's own clients wait as well."""
@@ -81,8 +82,9 @@ class Port:
         link, self.opened_at = self._link, None
         closed = line.hang_up()
         if link is not None and not closed.called:
-            patience = self._clock.callLater(FLUSH_S, link.close)
-            closed.addCallback(lambda _: patience.cancel() if patience.active() else None)
+            patience = Timer(self._clock)
+            patience.set(FLUSH_S, link.close)
+            closed.addCallback(lambda _: patience.cancel())
         return closed
 
     def link_up(self, link: Link) -> None:

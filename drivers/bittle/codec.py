@@ -67,7 +67,7 @@ class LineReader:
     """Cuts the robot's bytes into lines, however they are cut; counts and drops what is no text."""
 
     def __init__(self) -> None:
-        self.bad_lines = 0
+        self.bad_frames = 0
         self._rest = bytearray()
         self._is_lost = False
 
@@ -79,7 +79,7 @@ class LineReader:
             del self._rest[: at + 1]
             is_lost, self._is_lost = self._is_lost, False
             if is_lost or len(line) > MAX_LINE or not _is_text(line):
-                self.bad_lines += 1
+                self.bad_frames += 1
             elif line:
                 yield line.decode()
         if len(self._rest) > MAX_LINE:
