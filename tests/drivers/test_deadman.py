@@ -40,12 +40,10 @@ from drivers.registry import driver_for
 from drivers.rosbridge.driver import ASK_S, RosbridgeDriver
 from sim.robots.emulator.aibo_dog import AiboEmulator
 from sim.robots.emulator.bittle import Bittle
-from sim.robots.emulator.body import MemoryBody
 from sim.robots.emulator.create2 import Create2
 from sim.robots.emulator.rosbridge import RosbridgeRobot
+from tests.drivers.contract import RobotCase
 from tests.formats.rfc6455 import masked
-
-STEP = 0.005
 
 
 class Way(Open):
@@ -297,14 +295,15 @@ class BaseDriverTests(SynchronousTestCase):
         self.assertNotIn("halts", Puppet(self.clock, None).diagnostics())
 
 
-class LastWordTests(SynchronousTestCase):
+class LastWordTests(RobotCase):
     """The bytes by which each robot is halted."""
 
-    def setUp(self) -> None:
+    def build(self) -> None:
         """A switch of memory."""
-        self.clock = Clock()
-        self.body = MemoryBody()
         self.switch = MemoryDeadMan()
+
+    def tearDown(self) -> None:
+        """The robots go on."""
 
     def word(self, driver: BaseDriver, settle: float = 1.0) -> LastWord:
         """What it is guarded by, once it is connected."""
@@ -313,11 +312,6 @@ class LastWordTests(SynchronousTestCase):
         self.successResultOf(connected)
         assert self.switch.word is not None
         return self.switch.word
-
-    def pass_time(self, seconds: float) -> None:
-        """Turn the clock."""
-        for _ in range(round(seconds / STEP)):
-            self.clock.advance(STEP)
 
     def test_aibo(self) -> None:
         """Forward, strafe and rotate of nothing, to the walk server alone."""
