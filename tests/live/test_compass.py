@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Generator
 from importlib.util import find_spec
 from typing import Any
 
 from twisted.internet import reactor as running
-from twisted.internet.defer import Deferred, inlineCallbacks
-from twisted.internet.task import deferLater
 from twisted.trial.unittest import TestCase
 
 from drivers.link import TcpLinkFactory
@@ -17,6 +14,7 @@ from drivers.registry import driver_for
 from sim.robots.emulator.body import MemoryBody
 from sim.robots.emulator.compass import NmeaCompass
 from sim.robots.emulator.pty import PtyPort
+from tests.live.waiting import wait
 
 reactor: Any = running
 
@@ -31,36 +29,33 @@ class LiveCompassTests(TestCase):
         self.compass = NmeaCompass(reactor, MemoryBody(values={"compass.heading": math.pi / 2}), 20.0)
         self.compass.start()
 
-    @inlineCallbacks
-    def follow(self, **options: object) -> Generator[Deferred[Any], Any, None]:
+    async def follow(self, **options: object) -> None:
         """The heading arrives, does so again after the link was lost, and the end leaves nothing open."""
         driver = driver_for("compass", {"rate": 20, **options}, "dog", reactor)
         try:
-            yield driver.connect()
+            await driver.connect()
             seen = driver.observe()
             assert seen is not None
             self.assertAlmostEqual(float(seen.values["compass.heading"]), math.pi / 2, 6)
             if "host" in options:
                 self.compass.clients[0].link.close()
                 while driver.diagnostics()["reconnects"] < 1:
-                    yield deferLater(reactor, 0.02)
+                    await wait(0.02)
         finally:
-            yield driver.disconnect()
+            await driver.disconnect()
 
-    @inlineCallbacks
-    def test_over_the_network(self) -> Generator[Deferred[Any], Any, None]:
+    async def test_over_the_network(self) -> None:
         """Over TCP, a link that is lost is opened again."""
         port = reactor.listenTCP(0, TcpLinkFactory(self.compass.accept), interface="127.0.0.1")
-        yield self.follow(host="127.0.0.1", port=port.getHost().port)
+        await self.follow(host="127.0.0.1", port=port.getHost().port)
         self.compass.stop()
-        yield port.stopListening()
-        yield deferLater(reactor, 0.05)
+        await port.stopListening()
+        await wait(0.05)
 
-    @inlineCallbacks
-    def test_on_a_cable(self) -> Generator[Deferred[Any], Any, None]:
+    async def test_on_a_cable(self) -> None:
         """Over a serial device."""
         port = PtyPort(reactor, self.compass.accept)
-        yield self.follow(device=port.path)
+        await self.follow(device=port.path)
         self.compass.stop()
         port.close()
 

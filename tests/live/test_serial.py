@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from random import Random
 from typing import Any
 
 from twisted.internet import reactor
-from twisted.internet.defer import Deferred
-from twisted.internet.interfaces import IReactorTime
-from twisted.internet.task import deferLater
 from twisted.trial.unittest import SkipTest, TestCase
 
 from drivers.create2.driver import Create2Driver
@@ -23,22 +19,12 @@ from sim.robots.emulator.bittle import Bittle
 from sim.robots.emulator.body import MemoryBody
 from sim.robots.emulator.create2 import Create2
 from sim.robots.emulator.pty import PtyPort
+from tests.live.waiting import CLOCK, until, wait
 
 try:
     import serial  # noqa: F401
 except ImportError as missing:
     raise SkipTest("needs the extra serial") from missing
-
-CLOCK = IReactorTime(reactor)
-
-
-async def until(is_so: Callable[[], bool], seconds: float = 20.0) -> None:
-    """Wait until it is so."""
-    end = CLOCK.seconds() + seconds
-    while not is_so():
-        if CLOCK.seconds() > end:
-            raise AssertionError(f"not within {seconds} s")
-        await deferLater(CLOCK, 0.01)
 
 
 async def walked(driver: Driver, body: MemoryBody) -> None:
@@ -56,11 +42,8 @@ class BittleTests(TestCase):
 
     timeout = 30
 
-    def test_walks_over_a_real_port(self) -> Deferred[None]:
+    async def test_walks_over_a_real_port(self) -> None:
         """Over a real serial device the dog connects, stands, walks, stops at its deadline, and lies down."""
-        return Deferred.fromCoroutine(self._walk())
-
-    async def _walk(self) -> None:
         body = MemoryBody()
         robot = Bittle(body, CLOCK, Random(1))
         port = PtyPort(reactor, robot.accept)
@@ -71,11 +54,8 @@ class BittleTests(TestCase):
             port.close()
             robot.stop()
 
-    def test_walks_over_a_real_network(self) -> Deferred[None]:
+    async def test_walks_over_a_real_network(self) -> None:
         """Over HTTP on loopback the dog of either board does the same."""
-        return Deferred.fromCoroutine(self._walk_by_http())
-
-    async def _walk_by_http(self) -> None:
         for board in ("biboard", "nyboard"):
             body = MemoryBody()
             robot = Bittle(body, CLOCK, Random(1), board=board)
@@ -84,7 +64,7 @@ class BittleTests(TestCase):
             try:
                 await walked(driver_for("bittle", options, "dog", CLOCK), body)
                 await until(lambda robot=robot: robot.is_limp)  # type: ignore[misc]
-                await deferLater(CLOCK, 0.3)
+                await wait(0.3)
             finally:
                 await listening.stopListening()
                 robot.stop()
@@ -107,15 +87,13 @@ class Create2PtyTests(TestCase):
         self.path = self.mktemp()
         self.port = PtyPort(reactor, self.robot.accept, self.path)
         self.drivers: list[Driver] = []
+        self.addCleanup(self.leave)
 
-    async def _tear_down(self) -> None:
+    async def leave(self) -> None:
         for driver in self.drivers:
             await driver.disconnect()
         self.port.close()
         self.robot.stop()
-
-    def tearDown(self) -> Any:
-        return Deferred.fromCoroutine(self._tear_down())
 
     def driver(self) -> Create2Driver:
         """A driver of that port."""
@@ -124,11 +102,8 @@ class Create2PtyTests(TestCase):
         assert isinstance(driver, Create2Driver)
         return driver
 
-    def test_drives_over_a_real_port(self) -> Deferred[None]:
+    async def test_drives_over_a_real_port(self) -> None:
         """Over a real serial device it connects, is enabled, drives, stops at its deadline, and is left off."""
-        return Deferred.fromCoroutine(self._drive())
-
-    async def _drive(self) -> None:
         driver = self.driver()
         await driver.connect()
         await driver.enable()
@@ -140,11 +115,8 @@ class Create2PtyTests(TestCase):
         await driver.disconnect()
         await until(lambda: self.robot.mode == 0)
 
-    def test_outlives_a_pulled_cable(self) -> Deferred[None]:
+    async def test_outlives_a_pulled_cable(self) -> None:
         """The cable is pulled and plugged in again: stale, no such device, then ready with the motors on."""
-        return Deferred.fromCoroutine(self._pull())
-
-    async def _pull(self) -> None:
         driver = self.driver()
         await driver.connect()
         await driver.enable()
@@ -153,14 +125,11 @@ class Create2PtyTests(TestCase):
         await until(lambda: "no such device" in driver.problem)
         self.port = PtyPort(reactor, self.robot.accept, self.path)
         await until(lambda: driver.state == "ready" and self.robot.mode == 2)
-        await deferLater(CLOCK, 0.05)
+        await wait(0.05)
         driver.act({"base.vx": 0.1}, Permit(1, CLOCK.seconds() + 0.3))
 
-    def test_names_a_busy_port(self) -> Deferred[None]:
+    async def test_names_a_busy_port(self) -> None:
         """A second driver of the same port is told that it is busy, and gets it when the first has gone."""
-        return Deferred.fromCoroutine(self._share())
-
-    async def _share(self) -> None:
         first, second = self.driver(), self.driver()
         await first.connect()
         connected = second.connect()
@@ -169,11 +138,8 @@ class Create2PtyTests(TestCase):
         await connected
         self.assertEqual(second.problem, "")
 
-    def test_names_what_is_no_port(self) -> Deferred[None]:
+    async def test_names_what_is_no_port(self) -> None:
         """A file that is no serial device, and one that may not be opened, are named."""
-        return Deferred.fromCoroutine(self._misname())
-
-    async def _misname(self) -> None:
         plain = self.mktemp()
         with open(plain, "wb"):
             pass
