@@ -84,8 +84,22 @@ Accept = Callable[[Link], Receiver]
 """What the yard does with a new link: it returns who shall hear what arrives."""
 
 
+class StreamLink(protocol.Protocol):
+    """A link over one open transport of Twisted."""
+
+    def fileno(self) -> int:
+        """The open descriptor, for another process to share; -1 on a closed link."""
+        transport: Any = self.transport
+        return int(transport.fileno()) if self.connected and transport is not None else -1
+
+    def send(self, data: bytes) -> None:
+        """Send bytes; does nothing on a closed link."""
+        if self.connected and self.transport is not None:
+            self.transport.write(data)
+
+
 @implementer(IPushProducer)
-class TcpLink(protocol.Protocol):
+class TcpLink(StreamLink):
     """A link over one TCP connection; both sides use it."""
 
     def __init__(self, accept: Accept) -> None:
@@ -107,16 +121,6 @@ class TcpLink(protocol.Protocol):
             return None
         there = transport.getPeer()
         return there.host, there.port
-
-    def fileno(self) -> int:
-        """The open descriptor, for another process to share; -1 on a closed link."""
-        transport: Any = self.transport
-        return int(transport.fileno()) if self.connected and transport is not None else -1
-
-    def send(self, data: bytes) -> None:
-        """Send bytes; does nothing on a closed link."""
-        if self.connected and self.transport is not None:
-            self.transport.write(data)
 
     def close(self) -> None:
         """Close now, and throw away what has not left yet."""
@@ -155,6 +159,16 @@ class TcpLink(protocol.Protocol):
         self._is_busy = True
 
 
+def reactor_or_running(reactor: Any) -> Any:
+    """``reactor``, or the running one where it is None."""
+    if reactor is None:
+        # Importing it installs it: that is the business of whoever runs a process, not of this module.
+        from twisted.internet import reactor as running
+
+        return running
+    return reactor
+
+
 class TcpLinkFactory(protocol.Factory):
     """Makes a ``TcpLink`` for each connection."""
 
@@ -181,12 +195,7 @@ class TcpConnector:
 
     def call(self, host: str, port: int, caller: Caller) -> Line:
         """Keep ``caller`` connected to the yard at this address, with back-off, until the line hangs up."""
-        reactor = self._reactor
-        if reactor is None:
-            # Importing it installs it: that is the business of whoever runs a process, not of this module.
-            from twisted.internet import reactor as running
-
-            reactor = running
+        reactor = reactor_or_running(self._reactor)
 
         def accept(link: Link) -> Receiver:
             caller.link_up(link)

@@ -17,7 +17,15 @@ from twisted.logger import Logger
 from twisted.python.failure import Failure
 
 from drivers.errors import UsageError
-from drivers.link import FIRST_RETRY_S, LAST_RETRY_S, RETRY_FACTOR, Caller, Line
+from drivers.link import (
+    FIRST_RETRY_S,
+    LAST_RETRY_S,
+    RETRY_FACTOR,
+    Caller,
+    Line,
+    StreamLink,
+    reactor_or_running,
+)
 from drivers.timer import Timer
 
 FLUSH_S = 1.0
@@ -64,11 +72,7 @@ class SerialConnector:
 
         Raises ``UsageError`` where pyserial is missing.
         """
-        reactor = self._reactor
-        if reactor is None:
-            from twisted.internet import reactor as running
-
-            reactor = running
+        reactor = reactor_or_running(self._reactor)
         return SerialLine(host, port, caller, reactor, _opener() if self._opener is None else self._opener)
 
 
@@ -132,7 +136,7 @@ class SerialLine:
         self.problem = problem
 
 
-class _SerialLink(protocol.Protocol):
+class _SerialLink(StreamLink):
     """A link over one open device."""
 
     def __init__(self, line: SerialLine, caller: Caller) -> None:
@@ -143,15 +147,6 @@ class _SerialLink(protocol.Protocol):
     def is_busy(self) -> bool:
         transport: Any = self.transport
         return transport is not None and len(transport.dataBuffer) + transport._tempDataLen > BACKLOG
-
-    def fileno(self) -> int:
-        """The open descriptor, for another process to share; -1 on a closed link."""
-        transport: Any = self.transport
-        return int(transport.fileno()) if self.connected and transport is not None else -1
-
-    def send(self, data: bytes) -> None:
-        if self.connected and self.transport is not None:
-            self.transport.write(data)
 
     def close(self) -> None:
         transport: Any = self.transport

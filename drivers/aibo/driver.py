@@ -10,9 +10,8 @@ from twisted.internet.defer import Deferred, fail, gatherResults, succeed
 from twisted.internet.interfaces import IReactorTime
 
 from drivers.aibo import menu, sense
-from drivers.aibo.camera import Camera
 from drivers.aibo.codec import LineReader, StateReader, WorldState, command
-from drivers.aibo.link import WAITS, Datagrams, Port, UdpDatagrams
+from drivers.aibo.link import WAITS, Camera, Datagrams, Port, UdpDatagrams
 from drivers.aibo.menu import Hello, Load, MenuReader, select
 from drivers.aibo.odometry import Odometry
 from drivers.aibo.option import SOUNDS, Options, checked, described

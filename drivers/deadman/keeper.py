@@ -21,6 +21,7 @@ from zope.interface import implementer
 
 from drivers.deadman.process import CALL, GUARD, HEAD, LEAVE, REST, UNTIL, now
 from drivers.deadman.switch import DeadMan, LastWord
+from drivers.link import reactor_or_running
 
 PROGRAM = Path(__file__).resolve().with_name("process.py")
 LEAVE_S = 0.02
@@ -168,11 +169,7 @@ class Keeper:
 
     @property
     def _reactor(self) -> Any:
-        if self._given_reactor is None:
-            from twisted.internet import reactor as running
-
-            self._given_reactor = running
-        return self._given_reactor
+        return reactor_or_running(self._given_reactor)
 
     def _start(self) -> None:
         self._starting = None

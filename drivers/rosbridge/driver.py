@@ -22,7 +22,7 @@ from drivers.reading import Action, Description, Frame, Value
 from drivers.rosbridge import codec
 from drivers.rosbridge.codec import Answered, Published, Status, decoded, encoded
 from drivers.rosbridge.link import Bridge
-from drivers.rosbridge.option import RATES, TYPES, Options, checked, described, sectors
+from drivers.rosbridge.option import RATES, SECTORS, TYPES, Options, checked, described
 from drivers.timer import Timer
 
 MANIFEST = Manifest()
@@ -59,7 +59,7 @@ class RosbridgeDriver(BaseDriver):
         super().__init__(described(self._options), name, clock, dead_man)
         self._bridge = Bridge(self, connector, clock, self._options.host, self._options.port, self._options.path)
         self._sources = {topic: source for source, topic in self._options.topics.items()}
-        self._sectors = sectors()
+        self._sectors = {name: (math.radians(middle), math.radians(width)) for name, (middle, width) in SECTORS.items()}
         self._told: dict[str, tuple[float, dict[str, Value]]] = {}
         self._frame: Frame | None = None
         self._t_robot = 0.0

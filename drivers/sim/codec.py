@@ -31,7 +31,7 @@ class _Message(Struct, frozen=True, array_like=True, forbid_unknown_fields=True)
     """A message is an array of its tag and its fields."""
 
 
-class Hello(_Message, tag="hello"):
+class Hello(_Message, tag="hello", frozen=True):
     """From a driver: give me the robot, with so many pictures a second (0: none)."""
 
     version: Count
@@ -39,20 +39,20 @@ class Hello(_Message, tag="hello"):
     camera_fps: Number
 
 
-class Overlook(_Message, tag="overlook"):
+class Overlook(_Message, tag="overlook", frozen=True):
     """From the operator: send the truth about the yard, so many times a second."""
 
     version: Count
     rate: Number
 
 
-class Motors(_Message, tag="motors"):
+class Motors(_Message, tag="motors", frozen=True):
     """From a driver: motors on or off."""
 
     on: bool
 
 
-class Drive(_Message, tag="drive"):
+class Drive(_Message, tag="drive", frozen=True):
     """From a driver: walk like this (m/s, m/s, rad/s) for ``ttl`` seconds under fencing ``token``.
 
     ``sent`` is the yard's own time as the driver knew it when the command left: the stamp of the newest frame it had
@@ -67,15 +67,15 @@ class Drive(_Message, tag="drive"):
     sent: Number
 
 
-class Halt(_Message, tag="halt"):
+class Halt(_Message, tag="halt", frozen=True):
     """From a driver: stand still now; never refused."""
 
 
-class Alive(_Message, tag="alive"):
+class Alive(_Message, tag="alive", frozen=True):
     """From either client: still here; a yard that hears nothing for some seconds gives the robot free."""
 
 
-class Order(_Message, tag="order"):
+class Order(_Message, tag="order", frozen=True):
     """From the operator: ``verb`` with ``arguments``; answered by a ``Done`` of the same ``number``."""
 
     number: Count
@@ -83,7 +83,7 @@ class Order(_Message, tag="order"):
     arguments: Annotated[tuple[Entry, ...], Meta(max_length=8)]
 
 
-class Sensors(_Message, tag="sensors"):
+class Sensors(_Message, tag="sensors", frozen=True):
     """From the yard: what the robot feels at ``t`` of the yard's time, and the highest token that it has obeyed."""
 
     t: Number
@@ -92,7 +92,7 @@ class Sensors(_Message, tag="sensors"):
     token: Count
 
 
-class Picture(_Message, tag="picture"):
+class Picture(_Message, tag="picture", frozen=True):
     """From the yard: one camera picture as a JPEG."""
 
     seq: Count
@@ -102,20 +102,20 @@ class Picture(_Message, tag="picture"):
     data: bytes
 
 
-class Truth(_Message, tag="truth"):
+class Truth(_Message, tag="truth", frozen=True):
     """From the yard to the operator: the whole yard as seen from above."""
 
     snapshot: Mapping[str, Any]
 
 
-class Done(_Message, tag="done"):
+class Done(_Message, tag="done", frozen=True):
     """From the yard: the order of this number was carried out, or, where ``problem`` is not empty, why not."""
 
     number: Count
     problem: Text
 
 
-class Refused(_Message, tag="refused"):
+class Refused(_Message, tag="refused", frozen=True):
     """From the yard: no robot for you; ``lasting`` says that asking again will not help."""
 
     reason: Text
@@ -150,7 +150,7 @@ class _Snapshot(TypedDict):
 Message = Hello | Overlook | Motors | Drive | Halt | Alive | Order | Sensors | Picture | Truth | Done | Refused
 _ENCODER = msgpack.Encoder(enc_hook=float)
 """NumPy's numbers are sent as what they are."""
-_DECODER: msgpack.Decoder[Message] = msgpack.Decoder(Message)  # type: ignore[arg-type]
+_DECODER: msgpack.Decoder[Message] = msgpack.Decoder(Message)
 
 
 def encoded(message: Message) -> bytes:

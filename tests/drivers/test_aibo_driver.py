@@ -212,16 +212,6 @@ class AiboDriverTests(Conformance, AiboCase):
         self.assertEqual(self.drivers[0].state, "ready")
         self.assertGreater(self.drivers[0].diagnostics()["bad_frames"], 0)
 
-    def test_stands_a_late_and_broken_wire(self) -> None:
-        """Writes that come 100 ms late, in pieces, are the same dog."""
-        self.dog.faults.split = True
-        self.dog.faults.delay = 0.1
-        driver = self.make_driver()
-        connected = driver.connect()
-        self.pass_time(1.5)
-        self.successResultOf(connected)
-        self.assertEqual(driver.diagnostics()["bad_frames"], 0)
-
     def test_ages_where_readings_are_absurd(self) -> None:
         """Readings that cannot be are dropped and counted, and the last good one ages."""
         driver = self.ready()

@@ -125,13 +125,6 @@ class BittleDriverTests(Conformance, BittleCase):
         self.pass_time(0.2)
         self.assertTrue(self.robot.is_limp)
 
-    def test_lies_down_at_the_end(self) -> None:
-        """Disconnect leaves it lying, its servos off."""
-        driver = self.ready()
-        driver.disconnect()
-        self.pass_time(0.5)
-        self.assertTrue(self.robot.is_limp)
-
     def test_asks_again_for_a_gait_whose_answer_was_lost(self) -> None:
         """A stop that the dog has not confirmed within a second is sent again."""
         driver = self.ready()

@@ -45,7 +45,7 @@ class CameraDriverTests(Conformance, RobotCase):
         runs = []
         for _ in range(2):
             driver, seen = self.make_driver(fps=10), list[int]()
-            driver.subscribe(lambda one, seen=seen: seen.append(one.frame.data[-3]))  # type: ignore[misc]
+            driver.subscribe(lambda one, seen=seen: seen.append(one.frame.data[-3]))
             driver.connect()
             self.pass_time(1.0)
             driver.disconnect()

@@ -169,13 +169,6 @@ class Create2DriverTests(Conformance, Create2Case):
         self.failureResultOf(driver.invoke("dock", fast=1.0), Unsupported)
         self.failureResultOf(driver.invoke("fly"), Unsupported)
 
-    def test_leaves_the_robot_off(self) -> None:
-        """Disconnect ends the interface, so that the robot sleeps and charges as if nobody had asked it."""
-        driver = self.ready()
-        driver.disconnect()
-        self.pass_time(0.1)
-        self.assertEqual(self.robot.mode, 0)
-
     def test_starts_a_rebooted_robot_again(self) -> None:
         """A robot that loses its power while it drives is started again, at rest, and its counters cause no leap."""
         driver = self.ready()

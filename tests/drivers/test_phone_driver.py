@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 
 from drivers.conformance import Conformance
-from drivers.driver import Permit
-from drivers.errors import LinkLost, NotEnabled, StaleCommand, Unsupported
+from drivers.errors import LinkLost, NotEnabled
 from drivers.phone.driver import PhoneDriver
 from drivers.registry import describe, driver_for
 from tests.drivers.contract import RobotCase
@@ -63,30 +62,3 @@ class PhoneDriverTests(Conformance, RobotCase):
         self.failureResultOf(driver.enable(), LinkLost)
         self.pass_time(0.1)
         self.assertEqual((driver.state, driver.diagnostics()["reconnects"]), ("ready", 1.0))
-
-    def test_can_do_nothing_lawfully(self) -> None:
-        """The empty action is done under a lawful permit; any other is unsupported, an old token is refused."""
-        driver = self.ready()
-        self.assertEqual(driver.act({}, self.permit(token=5)), {})
-        self.assertEqual(driver.token, 5)
-        self.assertRaises(Unsupported, driver.act, {"base.vx": 0.0}, self.permit(token=6))
-        self.assertRaises(StaleCommand, driver.act, {}, self.permit(token=4))
-        self.assertRaises(StaleCommand, driver.act, {}, Permit(6, self.now()))
-
-    def test_can_be_switched_off(self) -> None:
-        """Disabled it goes on sensing and acts on nothing; enable lifts that."""
-        driver = self.ready()
-        self.successResultOf(driver.disable())
-        self.assertEqual(driver.state, "stopped")
-        self.assertRaises(NotEnabled, driver.act, {}, self.permit())
-        self.successResultOf(driver.enable())
-        self.assertEqual(driver.act({}, self.permit()), {})
-
-    def test_leaves_before_its_first_look(self) -> None:
-        """Who waits for a phone that never looked is told that it left."""
-        driver = self.make_driver()
-        waiting = driver.connect()
-        driver.disconnect()
-        self.failureResultOf(waiting, LinkLost)
-        driver.look(JPEG, 208, 156, {})
-        self.assertIsNone(driver.observe())

@@ -15,9 +15,8 @@ from drivers.errors import StaleCommand, Unsupported, UsageError
 from drivers.link import MemoryConnector
 from drivers.pyro.brain import Brain, Engine
 from drivers.pyro.camera import Camera
-from drivers.pyro.device import Rows, ranger_of
+from drivers.pyro.device import Geometry, Rows, SensorValue, ranger_of
 from drivers.pyro.robot import TTL_S, PyroRobot
-from drivers.pyro.sensorvalue import Geometry, SensorValue
 from drivers.reading import Frame, Value
 from drivers.registry import describe
 from sim.robots.emulator.aibo_dog import AiboEmulator

@@ -285,16 +285,6 @@ class RosbridgeDriverTests(Conformance, RobotCase):
         self.pass_time(9.0)
         self.assertEqual(driver.state, "ready")
 
-    def test_survives_a_reboot(self) -> None:
-        """A robot that reboots comes back at rest, and its clock may begin again."""
-        driver = self.ready()
-        driver.act({"base.vx": 0.2}, self.permit(seconds=5.0))
-        self.pass_time(0.5)
-        self.robot.reboot()
-        self.pass_time(1.0)
-        self.assertEqual((driver.state, self.true_speed()), ("ready", 0.0))
-        self.assertLess(self.newest(driver).t_robot, 1.5)
-
     def test_is_described_by_its_options(self) -> None:
         """A robot that goes sideways has a limit for it, and sensors are those of its topics."""
         holonomic = describe("rosbridge", {"max_vy": 0.3, "model": "Omni", "imu_topic": "/imu"})

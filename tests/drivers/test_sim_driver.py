@@ -115,15 +115,6 @@ class SimDriverTests(Conformance, RobotCase):
         self.assertEqual(driver.state, "stale")
         self.assertRaises(NotEnabled, driver.act, {"base.vx": 0.1}, self.permit())
 
-    def test_refuses_a_second_connect_and_an_early_enable(self) -> None:
-        """Asking out of order is answered with what to do."""
-        driver = self.make_driver()
-        self.failureResultOf(driver.enable(), LinkLost)
-        connected = driver.connect()
-        self.failureResultOf(driver.connect(), UsageError)
-        self.pass_time(0.1)
-        self.successResultOf(connected)
-
     def test_replays_from_a_seed(self) -> None:
         """The same seed and the same commands give the same observations and pictures, bit by bit."""
 

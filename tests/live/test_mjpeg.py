@@ -48,18 +48,6 @@ class LiveMjpegTests(TestCase):
         url = f"http://127.0.0.1:{port}/stream"
         return driver_for("camera", {"url": url, "width": 128, "height": 96, "fps": 30, **options}, "cam", reactor)
 
-    async def test_comes_back_over_real_sockets(self) -> None:
-        """Pictures flow, a broken connection is opened again, and the end leaves no connection behind."""
-        driver = self.driver(self.number)
-        await driver.connect()
-        await until(lambda: driver.diagnostics()["pictures"] > 10)
-        self.camera.clients[0].link.close()
-        await until(lambda: driver.state == "stale")
-        await until(lambda: driver.state == "ready")
-        self.assertEqual(driver.diagnostics()["reconnects"], 1)
-        await driver.disconnect()
-        await until(lambda: not self.camera.clients)
-
     async def test_watches_a_server_of_others(self) -> None:
         """A stream that Python's own HTTP server writes, in HTTP/1.0 and without lengths, is watched."""
 

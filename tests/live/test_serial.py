@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from random import Random
-from typing import Any
 
 from twisted.internet import reactor
 from twisted.trial.unittest import SkipTest, TestCase
@@ -12,10 +11,8 @@ from twisted.trial.unittest import SkipTest, TestCase
 from drivers.create2.driver import Create2Driver
 from drivers.create2.option import checked
 from drivers.driver import Driver, Permit
-from drivers.link import TcpLinkFactory
 from drivers.registry import driver_for
 from drivers.serial import SerialConnector
-from sim.robots.emulator.bittle import Bittle
 from sim.robots.emulator.body import MemoryBody
 from sim.robots.emulator.create2 import Create2
 from sim.robots.emulator.pty import PtyPort
@@ -25,55 +22,6 @@ try:
     import serial  # noqa: F401
 except ImportError as missing:
     raise SkipTest("needs the extra serial") from missing
-
-
-async def walked(driver: Driver, body: MemoryBody) -> None:
-    """Connect, walk for half a second, see it end, and let the driver go."""
-    await driver.connect()
-    await driver.enable()
-    driver.act({"base.vx": 0.15}, Permit(1, CLOCK.seconds() + 0.5))
-    await until(lambda: body.motion[0] == 0.15, 0.45)
-    await until(lambda: body.motion[0] == 0.0, 1.5)
-    await driver.disconnect()
-
-
-class BittleTests(TestCase):
-    """A Bittle at the end of a pseudo-terminal, and behind a web server."""
-
-    timeout = 30
-
-    async def test_walks_over_a_real_port(self) -> None:
-        """Over a real serial device the dog connects, stands, walks, stops at its deadline, and lies down."""
-        body = MemoryBody()
-        robot = Bittle(body, CLOCK, Random(1))
-        port = PtyPort(reactor, robot.accept)
-        try:
-            await walked(driver_for("bittle", {"port": port.path}, "dog", CLOCK), body)
-            await until(lambda: robot.is_limp)
-        finally:
-            port.close()
-            robot.stop()
-
-    async def test_walks_over_a_real_network(self) -> None:
-        """Over HTTP on loopback the dog of either board does the same."""
-        for board in ("biboard", "nyboard"):
-            body = MemoryBody()
-            robot = Bittle(body, CLOCK, Random(1), board=board)
-            listening = listen(TcpLinkFactory(robot.accept_http))
-            options = {"host": "127.0.0.1", "http_port": listening.getHost().port, "board": board}
-            try:
-                await walked(driver_for("bittle", options, "dog", CLOCK), body)
-                await until(lambda robot=robot: robot.is_limp)  # type: ignore[misc]
-                await wait(0.3)
-            finally:
-                await listening.stopListening()
-                robot.stop()
-
-
-def listen(factory: TcpLinkFactory) -> Any:
-    """A free port of loopback."""
-    running: Any = reactor
-    return running.listenTCP(0, factory, interface="127.0.0.1")
 
 
 class Create2PtyTests(TestCase):
@@ -101,19 +49,6 @@ class Create2PtyTests(TestCase):
         self.drivers.append(driver)
         assert isinstance(driver, Create2Driver)
         return driver
-
-    async def test_drives_over_a_real_port(self) -> None:
-        """Over a real serial device it connects, is enabled, drives, stops at its deadline, and is left off."""
-        driver = self.driver()
-        await driver.connect()
-        await driver.enable()
-        driver.act({"base.vx": 0.1}, Permit(1, CLOCK.seconds() + 0.5))
-        await until(lambda: self.body.motion[0] == 0.1, 0.4)
-        await until(lambda: self.body.motion[0] == 0.0, 1.0)
-        numbers = driver.diagnostics()
-        self.assertEqual(numbers["bad_frames"], 0)
-        await driver.disconnect()
-        await until(lambda: self.robot.mode == 0)
 
     async def test_outlives_a_pulled_cable(self) -> None:
         """The cable is pulled and plugged in again: stale, no such device, then ready with the motors on."""
