@@ -24,11 +24,9 @@ class KeptLink:
         self.is_closed = False
 
     def send(self, data: bytes) -> None:
-        """Keep it."""
         self.said += data
 
     def close(self) -> None:
-        """Keep that it closed."""
         self.is_closed = True
 
 
@@ -39,7 +37,6 @@ class KeptLog:
         self.lines: list[str] = []
 
     def warn(self, form: str, **values: object) -> None:
-        """Keep it."""
         self.lines.append(form.format(**values))
 
     error = warn
@@ -88,7 +85,6 @@ class RobotCase(SynchronousTestCase):
         return driver
 
     def connected(self, settle: float = 0.3, **options: object) -> Any:
-        """A driver that is connected."""
         driver = self.make_driver(**options)
         connected = driver.connect()
         self.pass_time(settle)
@@ -114,11 +110,9 @@ class RobotCase(SynchronousTestCase):
             self.clock.advance(self.STEP_S)
 
     def now(self) -> float:
-        """The turned clock."""
         return self.clock.seconds()
 
     def true_speed(self) -> float:
-        """What the body really does."""
         return math.hypot(*self.body.motion[:2])
 
     def cut_link(self) -> None:
@@ -128,7 +122,6 @@ class RobotCase(SynchronousTestCase):
         self.connector.cut()
 
     def newest(self, driver: Any) -> Observation:
-        """The newest observation, which there is."""
         seen: Observation | None = driver.observe()
         assert seen is not None
         return seen

@@ -46,7 +46,6 @@ BARE = picture.header(0, 0, 104, 80, 7, 8) + b"".join(
 
 
 def felt(dialect: str = T4, t: int = 1000) -> WorldState:
-    """A world state of an ERS-7."""
     return sense.state(FELT, [0.0] * 18, dialect, t, 4)
 
 

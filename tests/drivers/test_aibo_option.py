@@ -145,11 +145,9 @@ class WaitTests(SynchronousTestCase):
         self.assertIn("dog1:9090: it is there, but nothing listens at this port", ear.heard[0])
 
     def lose(self, reactor: Any) -> None:
-        """The port hangs up."""
         reactor.tcpClients[0][2].clientConnectionLost(_Retried(), Failure(ConnectionDone()))
 
     def refuse(self, reactor: Any) -> None:
-        """The port does not listen."""
         reactor.tcpClients[0][2].clientConnectionFailed(_Retried(), Failure(ConnectionRefusedError()))
 
 
@@ -162,7 +160,6 @@ class _Dead:
         self.hung_up: Deferred[None] = Deferred()
 
     def call(self, host: str, port: int, caller: Port) -> _Dead:
-        """Open at once."""
         caller.link_up(self)
         return self
 
@@ -174,7 +171,6 @@ class _Dead:
         return self.hung_up
 
     def close(self) -> None:
-        """Leave at once."""
         self.hung_up.callback(None)
 
 

@@ -205,7 +205,6 @@ class DialogueTests(SynchronousTestCase):
         self.dialogue = Dialogue(self.clock, self.sent.append)
 
     def hear(self, *lines: str) -> None:
-        """The robot says lines."""
         for line in lines:
             self.dialogue.heard(line)
 

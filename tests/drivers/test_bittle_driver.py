@@ -29,7 +29,6 @@ class BittleCase(RobotCase):
     resets = False
 
     def build(self) -> None:
-        """The dog and its wire."""
         self.faults = StreamFaults()
         gaits = {**gait.GAITS, "wkF": gait.Velocity(0.1, 0.0)}
         self.robot = Bittle(self.body, self.clock, Random(1), self.faults, self.board, self.resets, gaits)
@@ -237,13 +236,11 @@ class WifiTests(BittleCase):
     """A BiBoard behind its web server."""
 
     def build(self) -> None:
-        """The same dog, reached by HTTP."""
         super().build()
         self.connector = MemoryConnector(self.clock, self.robot.accept_http)
         self.options = {"gaits": GAITS, "host": "10.0.0.5", "board": self.board}
 
     def walking(self) -> BittleDriver:
-        """One that walks."""
         driver: BittleDriver = self.ready(1.5)
         driver.act({"base.vx": 0.1}, self.permit(seconds=1.5))
         self.pass_time(1.0)

@@ -32,7 +32,6 @@ class CameraDriverTests(Conformance, RobotCase):
     kind = "camera"
 
     def build(self) -> None:
-        """A folder of three pictures."""
         self.folder = Path(self.mktemp())
         self.folder.mkdir()
         for mark in (1, 2, 3):
@@ -172,7 +171,6 @@ class Lens:
 
 class ShotsTests(SynchronousTestCase):
     def capture(self, lens: Lens, **options: Any) -> CaptureShots:
-        """A video that the stand-in shows."""
         with tempfile.NamedTemporaryFile(suffix=".avi", delete=False) as file:
             self.addCleanup(Path(file.name).unlink)
         return CaptureShots(Options(file.name, **options), lambda: lens)

@@ -146,7 +146,6 @@ class SenseTests(SynchronousTestCase):
     """What a frame means."""
 
     def frame(self, **values: int) -> dict[str, int]:
-        """A frame as it is read."""
         return next(StreamReader(IDS).read(stream_frame(IDS, {"capacity": 2000, **values})))
 
     def test_each_bit_has_its_side(self) -> None:
@@ -231,9 +230,3 @@ class OptionTests(SynchronousTestCase):
         for baud in get_args(Baud):
             self.assertLess(size * 10 / baud, codec.FRAME_S, str(baud))
         self.assertRaises(UsageError, describe, "create2", {"port": "/dev/ttyUSB0", "baud": 19200})
-
-    def test_describes_limits(self) -> None:
-        """The description has the limits of the options."""
-        told = describe("create2", {"port": "/dev/ttyUSB0", "max_speed": 0.2})
-        self.assertEqual(told.limits, {"base.vx": (-0.2, 0.2), "base.wz": (-4.25, 4.25)})
-        self.assertEqual(told.kind, "create2")

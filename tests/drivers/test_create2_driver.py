@@ -25,7 +25,6 @@ class Create2Case(RobotCase):
     options = {"port": "memory"}
 
     def build(self) -> None:
-        """Plug it in."""
         self.faults = StreamFaults()
         self.robot = Create2(self.body, self.clock, Random(1), self.faults)
         self.connector = MemoryConnector(self.clock, self.robot.accept)
@@ -247,7 +246,6 @@ class EmulatorTests(SynchronousTestCase):
         self.addCleanup(self.robot.stop)
 
     def received(self, data: bytes) -> None:
-        """Hear the robot."""
         self.said += data
 
     def link_down(self) -> None:

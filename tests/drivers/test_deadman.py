@@ -56,12 +56,10 @@ class Way(Open):
         self._is_answered = is_answered
 
     def say(self, halt: bytes) -> bool:
-        """Keep it."""
         self.said.append(halt)
         return self._is_answered
 
     def close(self) -> None:
-        """Keep that it closed."""
         self.is_open = False
 
 
@@ -149,20 +147,16 @@ class Told(Watch):
         self.told: list[Any] = []
 
     def guard(self, way: Open | Server, halt: bytes) -> None:
-        """Keep it."""
         where = way._descriptor if isinstance(way, Open) else way._address
         self.told.append((type(way), where, halt))
 
     def until(self, moment: float) -> None:
-        """Keep it."""
         self.told.append(moment)
 
     def rest(self) -> None:
-        """Keep it."""
         self.told.append("rest")
 
     def leave(self) -> None:
-        """Keep it."""
         self.told.append("leave")
 
 
@@ -196,7 +190,6 @@ class OrderedDeadMan(MemoryDeadMan):
     """A switch whose end takes until ``ended`` fires."""
 
     def close(self) -> Deferred[None]:
-        """Take a while."""
         super().close()
         self.ended: Deferred[None] = Deferred()
         return self.ended
@@ -217,7 +210,6 @@ class Puppet(BaseDriver):
         self._observed({}, 0.0)
 
     def down(self) -> None:
-        """The link is gone."""
         self._down()
 
     def _open(self) -> None:
@@ -243,7 +235,6 @@ class BaseDriverTests(SynchronousTestCase):
     """What every driver tells its switch, and in which order."""
 
     def setUp(self) -> None:
-        """A driver that is ready."""
         self.clock = Clock()
         self.switch = OrderedDeadMan()
         self.driver = Puppet(self.clock, self.switch)
@@ -299,7 +290,6 @@ class LastWordTests(RobotCase):
     """The bytes by which each robot is halted."""
 
     def build(self) -> None:
-        """A switch of memory."""
         self.switch = MemoryDeadMan()
 
     def tearDown(self) -> None:
@@ -365,13 +355,11 @@ class LastWordTests(RobotCase):
         self.assertIn("twist", self.published(self.switch.word))
 
     def rosbridge(self, robot: RosbridgeRobot) -> RosbridgeDriver:
-        """A driver of that robot."""
         robot.start()
         connector = MemoryConnector(self.clock, robot.accept)
         return RosbridgeDriver({}, connector, self.clock, "robot", self.switch)
 
     def published(self, word: LastWord) -> dict[str, Any]:
-        """The message of such a frame."""
         head, size = word.halt[0], word.halt[1]
         self.assertEqual(head, 0x81)
         at = 2 if size < 0x80 + 126 else 4

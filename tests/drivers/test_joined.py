@@ -48,21 +48,17 @@ class Part(BaseDriver):
         """The part's own clock begins elsewhere."""
 
     def tell(self, frame: Frame | None = None, **values: Value) -> None:
-        """Sense."""
         if not self._is_up:
             self._up()
         self._observed({key.replace("_", "."): value for key, value in values.items()}, self.t, frame=frame)
 
     def refuse(self) -> None:
-        """Be no such part, for good."""
         self._refused(Unsupported("there is no such part"))
 
     def lose(self) -> None:
-        """Lose the link."""
         self._down()
 
     def invoke(self, name: str, **arguments: float | str) -> Deferred[Mapping[str, Value]]:
-        """Hum."""
         return succeed({"hummed": True}) if name == "hum" else super().invoke(name, **arguments)
 
     def _open(self) -> None:
@@ -82,7 +78,6 @@ class Lens(Part):
     camera_fps = 5.0
 
     def set_camera_fps(self, fps: float) -> None:
-        """So many."""
         self.camera_fps = fps
 
 
@@ -107,7 +102,6 @@ class JoinedTests(Conformance, Create2Case):
         return driver
 
     def with_parts(self, *parts: Driver) -> Joined:
-        """A Create 2 with these parts."""
         main = Create2Driver(checked({"port": "memory"}), "vacuum", self.connector, self.clock)
         driver = joined(main, parts, "vacuum")
         self.drivers.append(driver)

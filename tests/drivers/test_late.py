@@ -30,7 +30,6 @@ class WatchedBody(MemoryBody):
     told: list[tuple[float, float, float]] = field(default_factory=list)
 
     def drive(self, vx: float, vy: float, wz: float) -> None:
-        """Move, and keep it."""
         self.told.append((vx, vy, wz))
         super().drive(vx, vy, wz)
 
@@ -46,7 +45,6 @@ class LateTests(RobotCase):
         """The robots go on."""
 
     def enabled(self, kind: str, connector: Any, settle: float = 1.0, **options: object) -> Driver:
-        """A driver whose robot may move."""
         self.kind, self.connector = kind, connector
         driver: Driver = self.ready(settle, **options)
         return driver

@@ -45,7 +45,6 @@ class _Lab(RobotCase):
     options: Mapping[str, object] = {"host": "dog"}
 
     def build(self) -> None:
-        """Connect to the robot."""
         self.plug()
         self.driver = self.make_driver()
         self.pyro = PyroRobot(self.driver, self.clock)
@@ -55,7 +54,6 @@ class _Lab(RobotCase):
         self.assertEqual(connected, [True])
 
     def plug(self) -> None:
-        """Switch a dog on."""
         self.robot = AiboEmulator(self.clock, self.body, Random(1))
         self.robot.start()
         self.connector = self.robot.connector()
@@ -277,20 +275,12 @@ class FilterTests(SynchronousTestCase):
         self.assertEqual(camera.pictures, 1)
         self.assertEqual(camera.filterResults, [[(40, 40, 59, 59, 400), (10, 10, 19, 19, 100)]])
 
-    def test_brightness_without_a_match(self) -> None:
-        """Without a match ``blobify`` takes what is as bright in its channel as it is told."""
-        camera = Camera(104, 80)
-        camera.addFilter("blobify", 0, 180, 200)
-        camera.see(Frame(1, 104, 80, picture(20), 0.0))
-        self.assertEqual(camera.filterResults, [[(20, 32, 35, 47, 256)]])
-
 
 class Create2Tests(_Lab):
     kind = "create2"
     options = {"port": "memory"}
 
     def plug(self) -> None:
-        """Connect a robot on wheels."""
         self.robot = Create2(self.body, self.clock, Random(1))
         self.connector = MemoryConnector(self.clock, self.robot.accept)
 

@@ -34,11 +34,9 @@ class RosbridgeDriverTests(Conformance, RobotCase):
         self.connector = MemoryConnector(self.clock, self.robot.accept)
 
     def values(self, driver: RosbridgeDriver) -> dict[str, Any]:
-        """What it sees."""
         return dict(self.newest(driver).values)
 
     def heard(self, op: str) -> list[dict[str, Any]]:
-        """What the robot was told."""
         return [said for said in self.robot.heard if said["op"] == op]
 
     def test_drives_with_the_type_that_the_robot_listens_to(self) -> None:

@@ -119,7 +119,6 @@ class FrameReaderTests(SynchronousTestCase):
     """A stream of bytes to messages."""
 
     def setUp(self) -> None:
-        """All messages in one stream."""
         self.stream = b"".join(encoded(message) for message in MESSAGES)
         self.reader = FrameReader()
 

@@ -34,13 +34,11 @@ class SimDriverTests(Conformance, RobotCase):
     options = {"robot": "dog1", "camera": False}
 
     def build(self) -> None:
-        """A yard."""
         self.yard = self.robot = Yard(self.clock, Random(1), loaded("three-dogs"))
         self.yard.start()
         self.connector = self.yard.connector()
 
     def true_speed(self) -> float:
-        """What the physics says."""
         motion = self.yard.world.dogs["dog1"].motion
         return math.hypot(motion.vx, motion.vy)
 
@@ -94,17 +92,6 @@ class SimDriverTests(Conformance, RobotCase):
         self.pass_time(0.5)
         self.successResultOf(connected)
 
-    def test_finds_a_yard_that_starts_later(self) -> None:
-        """Connect waits, with back-off, for a yard that is not there yet."""
-        self.connector.is_open = False
-        driver = self.make_driver()
-        connected = driver.connect()
-        self.pass_time(5.0)
-        self.assertNoResult(connected)
-        self.connector.is_open = True
-        self.pass_time(2.2)
-        self.successResultOf(connected)
-
     def test_is_stale_when_the_yard_falls_silent(self) -> None:
         """A yard that sends nothing though its link is open makes the driver stale, and act refuses."""
         driver = self.ready()
@@ -144,11 +131,9 @@ class MuteRobot:
         self.tell()
 
     def tell(self) -> None:
-        """Say what is felt, motors off."""
         self.link.send(encoded(Sensors(1.0, {"estop.engaged": True}, {}, 0)))
 
     def received(self, data: bytes) -> None:
-        """Hear, and do nothing."""
         self.heard += data
 
     def link_down(self) -> None:
@@ -168,7 +153,6 @@ class SimDriverAloneTests(SynchronousTestCase):
         pump(self.clock, 0.02)
 
     def accept(self, link: Link) -> Receiver:
-        """Take the driver's call."""
         self.robots.append(MuteRobot(link))
         return self.robots[-1]
 

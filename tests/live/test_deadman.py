@@ -52,18 +52,15 @@ class TimedBody(MemoryBody):
     told: list[tuple[float, tuple[float, float, float]]] = field(default_factory=list)
 
     def drive(self, vx: float, vy: float, wz: float) -> None:
-        """Move, and keep it."""
         super().drive(vx, vy, wz)
         self.told.append((now(), self.motion))
 
     def halt(self) -> None:
-        """Stand still, and keep it."""
         super().halt()
         self.told.append((now(), self.motion))
 
     @property
     def is_moving(self) -> bool:
-        """Whether it moves now."""
         return any(self.motion)
 
     def rested_at(self) -> float:
@@ -105,7 +102,6 @@ class Puppeteer:
         return found[count - 1]
 
     def tell(self, line: str) -> None:
-        """Say something to it."""
         assert self.process.stdin is not None
         self.process.stdin.write(line.encode() + b"\n")
         self.process.stdin.flush()
@@ -118,7 +114,6 @@ class Puppeteer:
         return int(pid), float(halts)
 
     def end(self) -> None:
-        """Leave nothing behind."""
         if self.process.poll() is None:
             self.process.kill()
         self.process.wait()
@@ -192,15 +187,12 @@ class Wire:
         self.near.setblocking(False)
 
     def fileno(self) -> int:
-        """The descriptor."""
         return self.near.fileno()
 
     def send(self, data: bytes) -> None:
-        """Send it."""
         self.near.send(data)
 
     def close(self) -> None:
-        """Close both ends."""
         self.near.close()
         self.far.close()
 

@@ -67,7 +67,6 @@ class DriverCommandTests(TestCase):
         return int(child.returncode)
 
     async def set_off(self, keyboard: int) -> None:
-        """Hold "w" until the dog walks."""
         until = IReactorTime(reactor).seconds() + 10.0
         while self.body.motion[0] < 0.03 and IReactorTime(reactor).seconds() < until:
             os.write(keyboard, b"w")

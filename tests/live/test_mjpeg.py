@@ -28,7 +28,6 @@ class LiveMjpegTests(TestCase):
     timeout = 60
 
     def setUp(self) -> None:
-        """A camera on a free port."""
         self.body = MemoryBody(jpeg=jpeg(1))
         self.camera = MjpegCamera(reactor, self.body, 30.0)
         self.camera.start()

@@ -44,7 +44,6 @@ class Create2PtyTests(TestCase):
         self.robot.stop()
 
     def driver(self) -> Create2Driver:
-        """A driver of that port."""
         driver = driver_for("create2", {"port": self.path}, "vacuum", CLOCK)
         self.drivers.append(driver)
         assert isinstance(driver, Create2Driver)

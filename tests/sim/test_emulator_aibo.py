@@ -30,15 +30,12 @@ class Client:
         self.link: Link | None = None
 
     def link_up(self, link: Link) -> None:
-        """Take the link."""
         self.link = link
 
     def link_down(self) -> None:
-        """Lose it."""
         self.link = None
 
     def received(self, data: bytes) -> None:
-        """Keep bytes."""
         self.heard += data
 
 
@@ -52,7 +49,6 @@ class AiboEmulatorTests(SynchronousTestCase):
         self.dog = self.made()
 
     def made(self, dialect: str = "T4") -> AiboEmulator:
-        """A dog of one's own."""
         dog = AiboEmulator(self.clock, self.body, random.Random(1), dialect)
         dog.start()
         self.addCleanup(dog.stop)
@@ -68,7 +64,6 @@ class AiboEmulatorTests(SynchronousTestCase):
         return client
 
     def pass_time(self, seconds: float) -> None:
-        """Turn the clock."""
         self.clock.pump([0.002] * round(seconds / 0.002))
 
     def say(self, client: Client, data: bytes) -> bytes:
@@ -266,7 +261,6 @@ class AiboServerTests(SynchronousTestCase):
     """Which ports of an emulated dog listen."""
 
     def setUp(self) -> None:
-        """A dog that is served."""
         self.reactor = Ports()
         self.dog = AiboEmulator(self.reactor, MemoryBody(), random.Random(1))
         self.server = AiboServer(self.reactor, self.dog)

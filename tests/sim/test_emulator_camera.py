@@ -27,7 +27,6 @@ class MjpegCameraTests(SynchronousTestCase):
         self.assertEqual(self.clock.getDelayedCalls(), [])
 
     def pictures(self, wire: KeptLink) -> list[bytes]:
-        """What the client sees."""
         return StreamReader().read(wire.said)
 
     def test_serves_several_clients(self) -> None:
@@ -69,14 +68,3 @@ class MjpegCameraTests(SynchronousTestCase):
         self.assertEqual((endless.said, endless.is_closed), (b"", True))
         self.camera.stop()
         self.assertTrue(posts.is_closed and late.is_closed)
-
-    def test_leaves_out_what_a_body_does_not_see(self) -> None:
-        """A body without a picture sends none, and the stream goes on when it has one again."""
-        wire = KeptLink()
-        self.camera.accept(wire).received(request("cam", "/"))
-        self.body.jpeg = None
-        self.clock.pump([0.0625] * 16)
-        self.assertEqual(self.pictures(wire), [])
-        self.body.jpeg = b"\xff\xd8b\xff\xd9"
-        self.clock.pump([0.0625] * 16)
-        self.assertEqual(self.pictures(wire), [b"\xff\xd8b\xff\xd9"] * 8)
