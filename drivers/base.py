@@ -262,8 +262,6 @@ class BaseDriver:
         """
         return self._gate.deadline is not None and not self._gate.is_over(self._clock.seconds())
 
-    # -- inside -----------------------------------------------------------------------------------------------------
-
     def _guard(self) -> None:
         """Tell the dead man's switch by what the robot is halted now."""
         word = None if self._dead_man is None else self._last_word()

@@ -35,7 +35,6 @@ PURE = (
     "agents.report",
     "agents.state",
     "drivers.aibo.menu",
-    "drivers.aibo.odometry",
     "drivers.aibo.picture",
     "drivers.aibo.sense",
     "drivers.errors",

@@ -13,7 +13,6 @@ from drivers.aibo import menu, sense
 from drivers.aibo.codec import LineReader, StateReader, WorldState, command
 from drivers.aibo.link import WAITS, Camera, Datagrams, Port, UdpDatagrams
 from drivers.aibo.menu import Hello, Load, MenuReader, select
-from drivers.aibo.odometry import Odometry
 from drivers.aibo.option import SOUNDS, Options, checked, described
 from drivers.aibo.picture import Picture
 from drivers.base import ENGAGED, BaseDriver, heard_at
@@ -78,7 +77,7 @@ class AiboDriver(BaseDriver):
         self._main_at: float | None = None
         self._is_engaged = True
         self._walk = (0.0, 0.0, 0.0)
-        self._odometry = Odometry()
+        self._odometry = sense.Odometry()
         self._heard_at = self._watch_at = 0.0
         self._frame: Frame | None = None
         self._started: set[str] = set()

@@ -87,21 +87,13 @@ class Stack:
 
 
 @dataclass(frozen=True)
-class Push:
-    """A menu opened."""
+class Word:
+    """A message of one word: ``push`` and ``pop`` for a menu that opens and closes, ``goodbye`` at the end."""
+
+    word: str
 
 
-@dataclass(frozen=True)
-class Pop:
-    """A menu closed."""
-
-
-@dataclass(frozen=True)
-class Goodbye:
-    """The dog is closing the link."""
-
-
-Message = Refresh | Status | Load | Close | Hello | Stack | Push | Pop | Goodbye
+Message = Refresh | Status | Load | Close | Hello | Stack | Word
 _Lines = Generator[None, str, Message]
 
 
@@ -181,8 +173,8 @@ def _written(message: Message, has_four_fields: bool) -> Iterator[str]:
             yield from ("hello", str(count))
         case Stack(titles):
             yield from ("stack_dump", str(len(titles)), *titles)
-        case _:
-            yield type(message).__name__.lower()
+        case Word(word):
+            yield word
 
 
 class MenuReader:
@@ -229,12 +221,8 @@ class MenuReader:
 def _message(word: str) -> _Lines:
     """Takes the lines after ``word`` one by one, and ends with the message."""
     match word:
-        case "push":
-            return Push()
-        case "pop":
-            return Pop()
-        case "goodbye":
-            return Goodbye()
+        case "push" | "pop" | "goodbye":
+            return Word(word)
         case "refresh":
             return (yield from _refresh())
         case "status":

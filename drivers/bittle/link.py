@@ -112,8 +112,6 @@ class HttpLine:
         """Close now."""
         self._fall("closed")
 
-    # -- inside -----------------------------------------------------------------------------------------------------
-
     def _rise(self) -> None:
         self._is_up = True
         self._misses = 0

@@ -95,8 +95,6 @@ class CameraDriver(SensingDriver):
         if self._is_up:
             self._down()
 
-    # -- inside -----------------------------------------------------------------------------------------------------
-
     def _open(self) -> None:
         self._began = self._clock.seconds()
         self._film.start(self, self._fps)

@@ -87,8 +87,6 @@ class StreamFilm:
         if call is self._call:
             self._give_up("it has hung up")
 
-    # -- inside -----------------------------------------------------------------------------------------------------
-
     def _ring(self) -> None:
         place = self._place
         call = self._call = _Call(self, codec.request(place.name, place.path, place.login))

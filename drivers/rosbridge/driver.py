@@ -313,8 +313,6 @@ class RosbridgeDriver(BaseDriver):
         if self._is_up:
             self._guard()
 
-    # -- inside -----------------------------------------------------------------------------------------------------
-
     def _fail_calls(self, error: Exception) -> None:
         self._settling.cancel()
         calls, self._calls = self._calls, {}

@@ -129,8 +129,6 @@ class Bridge:
         if socket.fault and not self._is_held:
             self._on_fault(socket.fault)
 
-    # -- inside -----------------------------------------------------------------------------------------------------
-
     def _fresh(self) -> WebSocket:
         return WebSocket(f"{self._host}:{self._port}", self._path)
 

@@ -161,15 +161,15 @@ class MenuTests(SynchronousTestCase):
 
     MESSAGES: tuple[menu.Message, ...] = (
         menu.Hello(3),
-        menu.Push(),
+        menu.Word("push"),
         Load("org.tekkotsu.mon.WalkGUI", "WalkGUI", 10050),
         Load("org.tekkotsu.mon.VisionGUI", "RawVisionGUI", 10011, '"raw" "10011" "udp"'),
-        menu.Pop(),
+        menu.Word("pop"),
         Refresh("Root", (Item(2, True, "TekkotsuMon", "one\ntwo\nthree"), Item(0, False, "----------"))),
         menu.Status("walking\nagain"),
         menu.Close("WalkGUI"),
         menu.Stack(("Root", "TekkotsuMon")),
-        menu.Goodbye(),
+        menu.Word("goodbye"),
     )
 
     def test_golden_lines(self) -> None:
@@ -194,8 +194,8 @@ class MenuTests(SynchronousTestCase):
         shown = Refresh(
             "Root", (Item(2, True, "Mon", "all servers"), Item(0, False, "7", ""), Item(0, False, "x", "5"))
         )
-        stream = menu.encoded(shown, has_four_fields=True) + menu.encoded(menu.Pop())
-        self.assertEqual(list(MenuReader().read(stream)), [shown, menu.Pop()])
+        stream = menu.encoded(shown, has_four_fields=True) + menu.encoded(menu.Word("pop"))
+        self.assertEqual(list(MenuReader().read(stream)), [shown, menu.Word("pop")])
 
     def test_drops_what_is_no_message(self) -> None:
         """Unknown words, wrong counts and endless lines are counted, and the next message is read."""
@@ -208,11 +208,11 @@ class MenuTests(SynchronousTestCase):
             "\u0663",
         ):
             reader = MenuReader()
-            stream = bad.encode() + b"\n" + menu.encoded(menu.Pop())
-            self.assertEqual(list(reader.read(stream)), [menu.Pop()])
+            stream = bad.encode() + b"\n" + menu.encoded(menu.Word("pop"))
+            self.assertEqual(list(reader.read(stream)), [menu.Word("pop")])
             self.assertEqual(reader.bad_lines, 1, bad)
         reader = MenuReader()
-        self.assertEqual(list(reader.read(b"x" * 9999 + b"\npop\n")), [menu.Pop()])
+        self.assertEqual(list(reader.read(b"x" * 9999 + b"\npop\n")), [menu.Word("pop")])
         self.assertEqual(reader.bad_lines, 1)
 
     def test_drops_a_menu_without_an_end(self) -> None:
@@ -221,7 +221,7 @@ class MenuTests(SynchronousTestCase):
         reader = MenuReader()
         list(reader.read(("refresh\nRoot\n200\n" + item * 30).encode()))
         self.assertGreater(reader.bad_lines, 0)
-        self.assertEqual(list(reader.read(b"pop\n")), [menu.Pop()])
+        self.assertEqual(list(reader.read(b"pop\n")), [menu.Word("pop")])
 
     @settings(deadline=None, max_examples=200)
     @given(st.lists(st.sampled_from(["refresh", "status", "load", "0", "1", "5", "", "pop", "x", "\x00"]), max_size=60))

@@ -228,8 +228,6 @@ class AiboEmulator:
         if data:
             client.outlet.send(data)
 
-    # -- inside -----------------------------------------------------------------------------------------------------
-
     @property
     def _ms(self) -> int:
         return (self.start_ms + round((self._clock.seconds() - self._booted_at) * 1000.0)) % 2**32

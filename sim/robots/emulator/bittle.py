@@ -127,8 +127,6 @@ class Bittle:
         if not self._busy.is_set:
             self._next()
 
-    # -- inside -----------------------------------------------------------------------------------------------------
-
     def _on_unfinished(self) -> None:
         command = bytes(self._rest)
         self._rest.clear()

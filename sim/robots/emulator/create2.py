@@ -81,8 +81,6 @@ class Create2:
         self._tick.cancel()
         self._boot.cancel()
 
-    # -- inside -----------------------------------------------------------------------------------------------------
-
     def _on_command(self, command: codec.Command) -> None:
         if command.opcode == codec.RESET:
             self.reboot()

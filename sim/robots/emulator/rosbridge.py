@@ -151,8 +151,6 @@ class RosbridgeRobot:
             return True, {"success": True, "message": "docked"}
         return False, f"Service {name} does not exist"
 
-    # -- inside -----------------------------------------------------------------------------------------------------
-
     def _hang_up(self) -> None:
         self._stop.cancel()
         self._body.halt()
