@@ -34,12 +34,12 @@ REAP_S, END_S = 0.01, 1.0
 log = Logger()
 
 
-def kept(robot: str, reactor: Any = None) -> DeadMan | None:
+def kept(robot: str) -> DeadMan | None:
     """A switch for ``robot``, or None, said once in the log, on a system where there can be none."""
     if os.name != "posix" or not hasattr(socket, "send_fds") or not sys.executable or not PROGRAM.exists():
         log.warn("{robot}: no dead man's switch on this system; when this node freezes, nobody halts it", robot=robot)
         return None
-    return Keeper(robot, reactor)
+    return Keeper(robot)
 
 
 @implementer(IReadDescriptor)

@@ -69,18 +69,12 @@ class Probe:
     """One probe of ``driver``, which is disconnected at its end; ``problems`` are asked for what is wrong."""
 
     def __init__(
-        self,
-        driver: Driver,
-        clock: IReactorTime,
-        seconds: float,
-        problems: Callable[[], Sequence[str]],
-        patience: float = PATIENCE_S,
+        self, driver: Driver, clock: IReactorTime, seconds: float, problems: Callable[[], Sequence[str]]
     ) -> None:
         self._driver = driver
         self._clock = clock
         self._seconds = seconds
         self._problems = problems
-        self._patience = patience
         self._began = clock.seconds()
         self._first: float | None = None
         self._seen = 0
@@ -93,7 +87,7 @@ class Probe:
 
     def start(self) -> Deferred[Finding]:
         """Begin; fires with what was found, and does not fail."""
-        self._timer.set(min(SURE_S, self._patience), self._on_doubt)
+        self._timer.set(SURE_S, self._on_doubt)
         self._driver.subscribe(self._on_observation)
         self._driver.connect().addCallbacks(self._on_connected, self._on_refused)
         return self._found
@@ -117,7 +111,7 @@ class Probe:
         if self._problems():
             self.end()
         else:
-            self._timer.set(max(0.0, self._patience - SURE_S), self.end)
+            self._timer.set(PATIENCE_S - SURE_S, self.end)
 
     def _on_refused(self, failure: Failure) -> None:
         if not self._is_over:
@@ -139,7 +133,7 @@ class Probe:
         frame = None if newest is None else newest.frame
         problems = [*([self._refusal] if self._refusal else []), *self._problems()]
         if self._first is None and not problems:
-            problems.append(f"nothing came within {self._patience:g} s; is it switched on, and do the options fit?")
+            problems.append(f"nothing came within {PATIENCE_S:g} s; is it switched on, and do the options fit?")
         if self._first is not None and rate < SLOW * promised:
             problems.append(f"it is slow: {rate:.1f} of {promised:g} observations a second; is it far, or busy?")
         if "camera" in body.capabilities and self._first is not None and not self._pictures:

@@ -11,7 +11,6 @@ from drivers.bittle.driver import BittleDriver
 from drivers.conformance import Conformance
 from drivers.errors import LinkLost, NotEnabled, Unsupported
 from drivers.link import MemoryConnector
-from middleware.faults.stream import StreamFaults
 from sim.robots.emulator.bittle import BEHAVIOUR_S, NEVER, Bittle
 from tests.drivers.contract import KeptLink, RobotCase
 
@@ -29,9 +28,9 @@ class BittleCase(RobotCase):
     resets = False
 
     def build(self) -> None:
-        self.faults = StreamFaults()
         gaits = {**gait.GAITS, "wkF": gait.Velocity(0.1, 0.0)}
-        self.robot = Bittle(self.body, self.clock, Random(1), self.faults, self.board, self.resets, gaits)
+        self.robot = Bittle(self.body, self.clock, Random(1), self.board, self.resets, gaits)
+        self.faults = self.robot.faults
         self.connector = MemoryConnector(self.clock, self.robot.accept)
 
     def tearDown(self) -> None:

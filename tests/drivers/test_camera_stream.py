@@ -15,7 +15,6 @@ from drivers.driver import Filming
 from drivers.errors import LinkLost, UsageError
 from drivers.link import MemoryConnector
 from drivers.registry import describe
-from middleware.faults.stream import StreamFaults
 from sim.robots.emulator.camera import MjpegCamera
 from tests.drivers.contract import KeptLog, RobotCase
 from tests.drivers.test_camera_driver import jpeg
@@ -32,8 +31,8 @@ class StreamTests(Conformance, RobotCase):
 
     def build(self) -> None:
         self.body.jpeg = jpeg(1)
-        self.faults = StreamFaults()
-        self.camera = self.robot = MjpegCamera(self.clock, self.body, 30.0, faults=self.faults)
+        self.camera = self.robot = MjpegCamera(self.clock, self.body, 30.0)
+        self.faults = self.camera.faults
         self.camera.start()
         self.connector = MemoryConnector(self.clock, self.camera.accept)
 

@@ -12,7 +12,6 @@ from drivers.conformance import Conformance
 from drivers.create2 import codec
 from drivers.errors import LinkLost, NoReply, NotEnabled, Unsupported, UsageError
 from drivers.link import MemoryConnector
-from middleware.faults.stream import StreamFaults
 from sim.robots.emulator.body import MemoryBody
 from sim.robots.emulator.create2 import Create2
 from tests.drivers.contract import RobotCase
@@ -25,8 +24,8 @@ class Create2Case(RobotCase):
     options = {"port": "memory"}
 
     def build(self) -> None:
-        self.faults = StreamFaults()
-        self.robot = Create2(self.body, self.clock, Random(1), self.faults)
+        self.robot = Create2(self.body, self.clock, Random(1))
+        self.faults = self.robot.faults
         self.connector = MemoryConnector(self.clock, self.robot.accept)
 
 

@@ -51,12 +51,11 @@ class Bittle:
         body: Body,
         clock: IReactorTime,
         rng: random.Random,
-        faults: StreamFaults | None = None,
         board: str = "biboard",
         resets: bool = False,
         gaits: Mapping[str, Velocity] = GAITS,
     ) -> None:
-        self.faults = StreamFaults() if faults is None else faults
+        self.faults = StreamFaults()
         self.board = board
         self.heard: list[bytes] = []
         self.joints = [0] * 16

@@ -11,7 +11,6 @@ from drivers.camera import codec
 from drivers.camera.option import checked, place_of
 from drivers.errors import UsageError
 from drivers.link import Link
-from middleware.faults.stream import StreamFaults
 from sim.robots.emulator.body import Body
 from sim.robots.emulator.outlet import Broadcast, Client, Outlet
 from sim.robots.emulator.wire import Table, TcpWire, Wire
@@ -52,15 +51,8 @@ class MjpegCamera(Broadcast[_Client]):
 
     make_client = _Client
 
-    def __init__(
-        self,
-        clock: IReactorTime,
-        body: Body,
-        fps: float = 15.0,
-        rng: random.Random | None = None,
-        faults: StreamFaults | None = None,
-    ) -> None:
-        super().__init__(clock, body, fps, rng, faults)
+    def __init__(self, clock: IReactorTime, body: Body, fps: float = 15.0) -> None:
+        super().__init__(clock, body, fps)
         self.status = "200 OK"
         self.kind = f"{codec.KIND};boundary={codec.BOUNDARY}"
         self.has_length = True

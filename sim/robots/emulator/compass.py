@@ -10,7 +10,6 @@ from twisted.internet.interfaces import IReactorTime
 
 from drivers.compass.codec import eastward, sentence
 from drivers.compass.option import checked
-from middleware.faults.stream import StreamFaults
 from sim.robots.emulator.body import Body
 from sim.robots.emulator.outlet import Broadcast, Client
 from sim.robots.emulator.wire import CableWire, Table, TcpWire, Wire
@@ -26,15 +25,8 @@ class NmeaCompass(Broadcast[Client]):
 
     make_client = Client
 
-    def __init__(
-        self,
-        clock: IReactorTime,
-        body: Body,
-        rate: float = 10.0,
-        rng: random.Random | None = None,
-        faults: StreamFaults | None = None,
-    ) -> None:
-        super().__init__(clock, body, rate, rng, faults)
+    def __init__(self, clock: IReactorTime, body: Body, rate: float = 10.0) -> None:
+        super().__init__(clock, body, rate)
         self.kinds: tuple[str, ...] = ("HDG",)
         self.deviation = 0.0
         self.variation = 0.0

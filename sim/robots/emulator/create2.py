@@ -35,8 +35,8 @@ class Create2:
     ``faults`` spoils what it says; ``reboot`` is a power cut; ``left`` and ``right`` are its wheel counters, in counts.
     """
 
-    def __init__(self, body: Body, clock: IReactorTime, rng: random.Random, faults: StreamFaults | None = None) -> None:
-        self.faults = StreamFaults() if faults is None else faults
+    def __init__(self, body: Body, clock: IReactorTime, rng: random.Random) -> None:
+        self.faults = StreamFaults()
         self.mode = OFF
         self.left = self.right = 0.0
         self.played: list[int] = []

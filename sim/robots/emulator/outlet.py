@@ -64,15 +64,13 @@ class Broadcast(Generic[AnyClient]):
 
     make_client: type[AnyClient]
 
-    def __init__(
-        self, clock: IReactorTime, body: Body, rate: float, rng: random.Random | None, faults: StreamFaults | None
-    ) -> None:
-        self.faults = StreamFaults() if faults is None else faults
+    def __init__(self, clock: IReactorTime, body: Body, rate: float) -> None:
+        self.faults = StreamFaults()
         self.clients: list[AnyClient] = []
         self._clock = clock
         self._body = body
         self._interval = 1.0 / rate
-        self._rng = random.Random(0) if rng is None else rng
+        self._rng = random.Random(0)
         self._due = 0.0
         self._timer = Timer(clock)
 

@@ -55,13 +55,11 @@ class RosbridgeRobot:
         clock: IReactorTime,
         body: Body,
         rng: Random,
-        faults: StreamFaults | None = None,
         velocity_type: str = "geometry_msgs/msg/Twist",
-        has_rosapi: bool = True,
     ) -> None:
-        self.faults = faults or StreamFaults()
+        self.faults = StreamFaults()
         self.velocity_type = velocity_type
-        self.has_rosapi = has_rosapi
+        self.has_rosapi = True
         self.rosapi_s = 0.0
         self.has_motor_power = True
         self.ignored = 0
