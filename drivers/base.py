@@ -61,7 +61,7 @@ class BaseDriver:
         self._is_open = self._is_closed = self._is_up = self._is_heard = False
         self._connecting: Deferred[Description] | None = None
         self._wants_motors: bool | None = None
-        self._switching: tuple[bool, Deferred[bool]] | None = None
+        self._switching: list[tuple[bool, Deferred[bool]]] = []
         self._switch_end = Timer(clock)
         self._motion = dict.fromkeys(description.limits, 0.0)
         self._end = Timer(clock)
@@ -277,22 +277,24 @@ class BaseDriver:
         if ENGAGED not in self._newest.values:
             return succeed(True)
         switched: Deferred[bool] = Deferred()
-        self._switching = (on, switched)
+        self._switching.append((on, switched))
         late = NoReply(f"{self._name} did not switch its motors within {self.SWITCH_S:g} s")
         self._switch_end.set(self.SWITCH_S, self._fail_switching, late)
         return switched
 
     def _settle_switching(self, is_engaged: object) -> None:
-        if self._switching is not None and is_engaged is (not self._switching[0]):
-            (_, switched), self._switching = self._switching, None
+        done = [switched for on, switched in self._switching if is_engaged is (not on)]
+        self._switching = [(on, switched) for on, switched in self._switching if is_engaged is not (not on)]
+        if not self._switching:
             self._switch_end.cancel()
+        for switched in done:
             switched.callback(True)
 
     def _fail_switching(self, error: Exception) -> None:
         self._switch_end.cancel()
-        switching, self._switching = self._switching, None
-        if switching is not None:
-            switching[1].errback(error)
+        waiting, self._switching = self._switching, []
+        for _, switched in waiting:
+            switched.errback(error)
 
     def _on_cancelled_connecting(self, _connecting: object) -> None:
         self._connecting = None

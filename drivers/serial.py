@@ -96,8 +96,8 @@ class SerialLine:
 
     def hang_up(self) -> Deferred[None]:
         """Let what was sent leave, close the device, stop trying; fires when it is closed."""
-        self._pending.cancel()
         if self._link is None:
+            self._pending.cancel()
             return succeed(None)
         if self._gone is None:
             self._gone = Deferred()

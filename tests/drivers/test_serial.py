@@ -156,11 +156,12 @@ class SerialTests(SynchronousTestCase):
         self.assertEqual(self.clock.getDelayedCalls(), [])
 
     def test_hangs_up_on_a_device_that_takes_nothing(self) -> None:
-        """A device that never takes the last bytes is closed after a second all the same."""
+        """A device that never takes the last bytes is closed after a second, also where it is hung up on twice."""
         line = self.line()
         self.clock.advance(0.0)
         self.links[0].send(b"stop")
         gone = line.hang_up()
+        line.hang_up()
         self.clock.advance(FLUSH_S)
         self.successResultOf(gone)
         self.assertEqual(self.clock.getDelayedCalls(), [])

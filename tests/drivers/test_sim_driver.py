@@ -6,6 +6,7 @@ import json
 import math
 from random import Random
 
+from twisted.internet.defer import Deferred
 from twisted.internet.task import Clock
 from twisted.trial.unittest import SynchronousTestCase
 
@@ -164,6 +165,16 @@ class SimDriverAloneTests(SynchronousTestCase):
         pump(self.clock, 0.2)
         self.failureResultOf(enabled, NoReply)
         self.assertIn(encoded(Motors(True)), self.robots[0].heard)
+
+    def test_answers_every_switch(self) -> None:
+        """A switch that is asked for while another one fails is answered as the last one is."""
+        again: list[Deferred[bool]] = []
+        self.driver.enable().addErrback(lambda _: again.append(self.driver.enable()))
+        last = self.driver.disable()
+        pump(self.clock, 1.1)
+        for switched in (*again, last):
+            self.failureResultOf(switched, NoReply)
+        self.assertEqual(len(again), 1)
 
     def test_lives_on_after_bad_bytes(self) -> None:
         """Rubbish and messages that only clients send are counted and dropped."""
