@@ -78,6 +78,12 @@ def is_alive(pid: int) -> bool:
     return state != "Z"
 
 
+def ignores_signals(pid: int) -> bool:
+    """Whether a process has come so far that it ignores SIGTERM."""
+    status = Path(f"/proc/{pid}/status").read_text()
+    return bool(int(status.partition("SigIgn:")[2].split()[0], 16) >> (signal.SIGTERM - 1) & 1)
+
+
 class Puppeteer:
     """Starts and reads the program that drives, in a session of its own."""
 
@@ -361,6 +367,7 @@ class AiboDeadManTests(DeadManCase):
         """Ctrl-C and SIGTERM do not end the switch before its program; then both end, and the dog stands."""
         puppeteer = await self.driven("aibo", **self.options)
         pid, _ = await puppeteer.switch()
+        await until(lambda: ignores_signals(pid))
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             os.kill(pid, number)
         await self.walking(puppeteer, 5.0)

@@ -65,6 +65,21 @@ class LiveRosbridgeTests(TestCase):
         self.addCleanup(port.stopListening)
         self.addCleanup(self.robot.stop)
 
+    async def test_drives_over_tcp(self) -> None:
+        """Connected over TCP the robot drives, stops at the deadline, and after a reboot the link is opened again."""
+        driver = RosbridgeDriver({"port": self.port}, TcpConnector(reactor), reactor)
+        await driver.connect()
+        self.addCleanup(driver.disconnect)
+        await driver.enable()
+        driver.act({"base.vx": 0.2}, Permit(1, reactor.seconds() + 0.4))
+        await until(lambda: self.body.motion[0] == 0.2)
+        await until(lambda: self.body.motion[0] == 0.0)
+        self.robot.reboot()
+        await until(lambda: driver.state == "stale")
+        await until(lambda: driver.state == "ready")
+        self.assertEqual(driver.diagnostics()["reconnects"], 1.0)
+        self.assertEqual(driver.diagnostics()["bad_frames"], 0)
+
     async def test_other_client_takes_it_for_a_robot(self) -> None:
         """Another client, roslibpy, subscribes, publishes, calls, and is told of a service that is not there."""
 
