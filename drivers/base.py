@@ -7,8 +7,8 @@ tells what it hears (``_up _observed _down _refused``).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, Protocol
 
 from twisted.internet.defer import Deferred, fail, gatherResults, succeed
 from twisted.internet.interfaces import IReactorTime
@@ -18,8 +18,10 @@ from drivers.deadman.switch import DeadMan, LastWord
 from drivers.driver import Permit
 from drivers.errors import LinkLost, NoReply, NotEnabled, Unsupported, UsageError
 from drivers.gate import Gate
+from drivers.link import Connector, Line, Link
 from drivers.reading import Action, Description, Frame, Observation, Value
 from drivers.subscribers import Subscribers
+from drivers.timer import Timer
 
 ENGAGED = "estop.engaged"
 """Whether the robot's own switch keeps its motors off; a robot without one leaves the key out."""
@@ -59,9 +61,10 @@ class BaseDriver:
         self._is_open = self._is_closed = self._is_up = self._is_heard = False
         self._connecting: Deferred[Description] | None = None
         self._wants_motors: bool | None = None
-        self._switching: list[tuple[bool, Deferred[bool], Any]] = []
+        self._switching: list[tuple[bool, Deferred[bool]]] = []
+        self._switch_end = Timer(clock)
         self._motion = dict.fromkeys(description.limits, 0.0)
-        self._end: Any = None
+        self._end = Timer(clock)
         self._newest: Observation | None = None
         self._seen = Subscribers[Observation](name, self.log)
         self._counts = dict.fromkeys(("frames", "bad_frames", "pictures", "bytes", "links", "refused"), 0)
@@ -147,8 +150,7 @@ class BaseDriver:
         if self._dead_man is not None:
             self._dead_man.until(permit.deadline - now)
         done = self._drive(self._motion, permit)
-        self._cancel_end()
-        self._end = self._clock.callLater(permit.deadline - now, self._on_end)
+        self._end.set(permit.deadline - now, self.stop)
         return dict(done)
 
     def stop(self) -> Action:
@@ -260,8 +262,6 @@ class BaseDriver:
         """
         return self._gate.deadline is not None and not self._gate.is_over(self._clock.seconds())
 
-    # -- inside -----------------------------------------------------------------------------------------------------
-
     def _guard(self) -> None:
         """Tell the dead man's switch by what the robot is halted now."""
         word = None if self._dead_man is None else self._last_word()
@@ -277,26 +277,23 @@ class BaseDriver:
         if ENGAGED not in self._newest.values:
             return succeed(True)
         switched: Deferred[bool] = Deferred()
-        self._switching.append((on, switched, self._clock.callLater(self.SWITCH_S, self._on_no_switch)))
+        self._switching.append((on, switched))
+        late = NoReply(f"{self._name} did not switch its motors within {self.SWITCH_S:g} s")
+        self._switch_end.set(self.SWITCH_S, self._fail_switching, late)
         return switched
 
     def _settle_switching(self, is_engaged: object) -> None:
-        waiting, self._switching = self._switching, []
-        for on, switched, timer in waiting:
-            if is_engaged is (not on):
-                timer.cancel()
-                switched.callback(True)
-            else:
-                self._switching.append((on, switched, timer))
-
-    def _on_no_switch(self) -> None:
-        self._fail_switching(NoReply(f"{self._name} did not switch its motors within {self.SWITCH_S:g} s"))
+        done = [switched for on, switched in self._switching if is_engaged is (not on)]
+        self._switching = [(on, switched) for on, switched in self._switching if is_engaged is not (not on)]
+        if not self._switching:
+            self._switch_end.cancel()
+        for switched in done:
+            switched.callback(True)
 
     def _fail_switching(self, error: Exception) -> None:
+        self._switch_end.cancel()
         waiting, self._switching = self._switching, []
-        for _, switched, timer in waiting:
-            if timer.active():
-                timer.cancel()
+        for _, switched in waiting:
             switched.errback(error)
 
     def _on_cancelled_connecting(self, _connecting: object) -> None:
@@ -308,25 +305,102 @@ class BaseDriver:
         if connecting is not None:
             connecting.errback(error)
 
-    def _on_end(self) -> None:
-        self._end = None
-        self.stop()
-
     def _rest(self) -> None:
-        self._cancel_end()
+        self._end.cancel()
         self._gate.close()
         if self._dead_man is not None:
             self._dead_man.rest()
         for key in self._motion:
             self._motion[key] = 0.0
 
-    def _cancel_end(self) -> None:
-        if self._end is not None and self._end.active():
-            self._end.cancel()
-        self._end = None
-
     def _shut(self) -> Deferred[None] | None:
         self._is_closed = True
         self._rest()
         self._fail_switching(LinkLost(f"{self._name}: disconnected"))
         return None if self._dead_man is None else self._dead_man.close()
+
+
+class SensingDriver(BaseDriver):
+    """What only senses, and moves as whoever holds it does.
+
+    It has no motors: ``enable`` is always granted while readings come, and of actions there is only ``{}``.
+    """
+
+    def _drive(self, motion: Action, permit: Permit) -> Action:
+        return motion
+
+    def _switch(self, on: bool) -> Deferred[bool]:
+        if self.state == "stale":
+            return fail(LinkLost(f"{self._name} is stale; wait until it is heard again"))
+        return super()._switch(on)
+
+
+class Reader(Protocol):
+    """What cuts the bytes of a robot into messages."""
+
+    bad_frames: int
+
+    def read(self, data: bytes) -> Iterable[Any]:
+        """Return the messages that ``data`` completes."""
+
+
+class LinkedDriver(BaseDriver):
+    """A robot at the other end of one link, which ``connector`` opens to ``place``.
+
+    A kind makes ``_reader`` for each new link, and tells what the robot says (``_heard``).
+    """
+
+    def __init__(
+        self,
+        description: Description,
+        name: str,
+        clock: IReactorTime,
+        connector: Connector,
+        place: tuple[str, int],
+        dead_man: DeadMan | None = None,
+    ) -> None:
+        super().__init__(description, name, clock, dead_man)
+        self._connector = connector
+        self._place = place
+        self._line: Line | None = None
+        self._link: Link | None = None
+        self._reader: Reader
+        self._timer = Timer(clock)
+        self._problem = ""
+
+    @property
+    def problem(self) -> str:
+        """What keeps the robot from being heard, and the remedy; empty where it is heard."""
+        return str(getattr(self._line, "problem", "")) or self._problem
+
+    def received(self, data: bytes) -> None:
+        """Take bytes from the robot; called by the line."""
+        self._counts["bytes"] += len(data)
+        reader = self._reader
+        bad = reader.bad_frames
+        for message in reader.read(data):
+            if self._is_closed:
+                return
+            self._heard(message)
+        self._counts["bad_frames"] += reader.bad_frames - bad
+
+    def _heard(self, message: Any) -> None:
+        """Take one message of the robot."""
+        raise NotImplementedError
+
+    def _open(self) -> None:
+        self._line = self._connector.call(*self._place, self)  # type: ignore[arg-type]
+
+    def _close(self) -> Deferred[None]:
+        self._timer.cancel()
+        return succeed(None) if self._line is None else self._line.hang_up()
+
+    def _send(self, data: bytes) -> None:
+        if self._link is not None:
+            self._link.send(data)
+
+    def _name_problem(self, problem: str) -> None:
+        """Log why the robot is not heard, unless that was logged last."""
+        if problem != self._problem:
+            self.log.warn("{robot}: {problem}", robot=self._name, problem=problem)
+        self._problem = problem

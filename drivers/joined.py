@@ -155,8 +155,6 @@ class Joined:
             counts |= {f"{kind}.{key}": count for key, count in part.diagnostics().items()}
         return counts
 
-    # -- inside -----------------------------------------------------------------------------------------------------
-
     def _on_main(self, _seen: Observation) -> None:
         observation = self.observe()
         if observation is None:

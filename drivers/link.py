@@ -16,6 +16,8 @@ from twisted.logger import Logger
 from twisted.python.failure import Failure
 from zope.interface import implementer
 
+from drivers.timer import Timer
+
 FIRST_RETRY_S = 0.1
 LAST_RETRY_S = 2
 RETRY_FACTOR = 1.6
@@ -82,8 +84,22 @@ Accept = Callable[[Link], Receiver]
 """What the yard does with a new link: it returns who shall hear what arrives."""
 
 
+class StreamLink(protocol.Protocol):
+    """A link over one open transport of Twisted."""
+
+    def fileno(self) -> int:
+        """The open descriptor, for another process to share; -1 on a closed link."""
+        transport: Any = self.transport
+        return int(transport.fileno()) if self.connected and transport is not None else -1
+
+    def send(self, data: bytes) -> None:
+        """Send bytes; does nothing on a closed link."""
+        if self.connected and self.transport is not None:
+            self.transport.write(data)
+
+
 @implementer(IPushProducer)
-class TcpLink(protocol.Protocol):
+class TcpLink(StreamLink):
     """A link over one TCP connection; both sides use it."""
 
     def __init__(self, accept: Accept) -> None:
@@ -105,16 +121,6 @@ class TcpLink(protocol.Protocol):
             return None
         there = transport.getPeer()
         return there.host, there.port
-
-    def fileno(self) -> int:
-        """The open descriptor, for another process to share; -1 on a closed link."""
-        transport: Any = self.transport
-        return int(transport.fileno()) if self.connected and transport is not None else -1
-
-    def send(self, data: bytes) -> None:
-        """Send bytes; does nothing on a closed link."""
-        if self.connected and self.transport is not None:
-            self.transport.write(data)
 
     def close(self) -> None:
         """Close now, and throw away what has not left yet."""
@@ -153,6 +159,16 @@ class TcpLink(protocol.Protocol):
         self._is_busy = True
 
 
+def reactor_or_running(reactor: Any) -> Any:
+    """``reactor``, or the running one where it is None."""
+    if reactor is None:
+        # Importing it installs it: that is the business of whoever runs a process, not of this module.
+        from twisted.internet import reactor as running
+
+        return running
+    return reactor
+
+
 class TcpLinkFactory(protocol.Factory):
     """Makes a ``TcpLink`` for each connection."""
 
@@ -179,12 +195,7 @@ class TcpConnector:
 
     def call(self, host: str, port: int, caller: Caller) -> Line:
         """Keep ``caller`` connected to the yard at this address, with back-off, until the line hangs up."""
-        reactor = self._reactor
-        if reactor is None:
-            # Importing it installs it: that is the business of whoever runs a process, not of this module.
-            from twisted.internet import reactor as running
-
-            reactor = running
+        reactor = reactor_or_running(self._reactor)
 
         def accept(link: Link) -> Receiver:
             caller.link_up(link)
@@ -355,18 +366,16 @@ class _MemoryLine:
 
     def __init__(self, connector: MemoryConnector, clock: IReactorTime, caller: Caller) -> None:
         self._connector = connector
-        self._clock = clock
         self._caller = caller
         self._retry_s = FIRST_RETRY_S
         self._link: MemoryLink | None = None
         self._is_wanted = True
-        self._pending: Any = clock.callLater(0.0, self._try)
+        self._pending = Timer(clock)
+        self._pending.set(0.0, self._try)
 
     def hang_up(self) -> Deferred[None]:
         self._is_wanted = False
-        if self._pending is not None:
-            self._pending.cancel()
-            self._pending = None
+        self._pending.cancel()
         if self._link is not None:
             self._link.close()
         return succeed(None)
@@ -377,14 +386,13 @@ class _MemoryLine:
     def link_down(self) -> None:
         self._link = None
         if self._is_wanted:
-            self._pending = self._clock.callLater(FIRST_RETRY_S, self._try)
+            self._pending.set(FIRST_RETRY_S, self._try)
         self._caller.link_down()
 
     def _try(self) -> None:
-        self._pending = None
         self._link = self._connector.opened(self)
         if self._link is None:
-            self._pending = self._clock.callLater(self._retry_s, self._try)
+            self._pending.set(self._retry_s, self._try)
             self._retry_s = min(self._retry_s * RETRY_FACTOR, LAST_RETRY_S)
             return
         self._retry_s = FIRST_RETRY_S

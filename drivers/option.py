@@ -1,7 +1,9 @@
-"""Option: the options of a driver, converted from a free table; each error with its remedy."""
+"""Option: what tools know of a kind of robot before one is there: its manifest, and the types of its options."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Annotated, TypeVar
 
 from msgspec import Meta
@@ -15,6 +17,22 @@ Port = Annotated[int, Meta(ge=1, le=65535)]
 Fps = Annotated[float, Meta(ge=0, le=MAX_FPS), Unit("pictures a second")]
 Host = Annotated[str, Meta(min_length=1, max_length=253, examples=["192.168.1.20"])]
 Device = Annotated[str, Meta(min_length=1, description="a serial device", examples=["/dev/ttyUSB0"])]
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """One kind of robot; the constant ``MANIFEST`` of its module ``driver``.
+
+    ``library`` is the module that it needs beyond those of every node, ``extra`` the extra of this distribution that
+    installs it, and ``when`` the case in which it is needed, empty for always.  ``example`` are options that describe
+    such a robot; a kind that needs no option has none.  ``is_on_cable`` says that ``port`` may be a serial device.
+    """
+
+    library: str = ""
+    extra: str = ""
+    when: str = ""
+    example: Mapping[str, object] = field(default_factory=dict)
+    is_on_cable: bool = False
 
 
 def convert_options(kind: str, table: object, cls: type[T]) -> T:

@@ -1,6 +1,8 @@
 """Registry: the kind of a robot to its driver, imported only when that kind is asked for.
 
-A kind is built in, an entry point of ``swarm_node.drivers``, or the place of a class, ``module:name``.
+A kind is built in, an entry point of ``swarm_node.drivers``, or the place of a class, ``module:name``.  What is not
+built in is a class, or whatever else can be called with (options, name, clock, connector).  It is foreign code, and
+may fail in any way: that is told in one line which names it, and touches no other driver.
 """
 
 from __future__ import annotations
@@ -11,19 +13,22 @@ from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
 from pkgutil import iter_modules
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from twisted.internet.interfaces import IReactorTime
+from twisted.internet.task import Clock
 
 import drivers
 from drivers.driver import Driver
-from drivers.errors import UsageError
-from drivers.manifest import Manifest
+from drivers.errors import DriverError, UsageError
+from drivers.option import Manifest
 from drivers.reading import Description
 
 if TYPE_CHECKING:
     from drivers.link import Connector
 
+ENTRY_POINTS = "swarm_node.drivers"
+NEEDED = ("description", "state", "connect", "disconnect", "enable", "disable", "act", "stop", "observe", "subscribe")
 Factory = Callable[[Mapping[str, object], str, IReactorTime, "Connector | None"], Driver]
 Describe = Callable[[Mapping[str, object], str], Description]
 Parts = Sequence[tuple[str, Mapping[str, object]]]
@@ -46,9 +51,31 @@ def manifest_of(kind: str) -> Manifest:
 
 def kinds() -> list[str]:
     """The kinds of robot that there are drivers for, those of other distributions as well; none is imported."""
-    from drivers.foreign import places
-
     return sorted({*built_in_kinds(), *places()})
+
+
+def places() -> dict[str, str]:
+    """Each kind that other distributions bring, and its place, ``module:name``; none of them is imported."""
+    from importlib.metadata import entry_points  # heavy, and most nodes never come here
+
+    return {point.name: point.value for point in entry_points(group=ENTRY_POINTS)}
+
+
+def maker(kind: str, place: str) -> Factory:
+    """What makes drivers of ``kind``, out of ``place``; raises ``UsageError`` where it cannot be loaded."""
+    module, _, attribute = place.partition(":")
+    try:
+        make = getattr(import_module(module), attribute)
+    except Exception as error:  # a module of somebody else may fail in any way
+        raise UsageError(f"driver {kind!r} cannot be loaded: {_told(error)}") from error
+    if not callable(make):
+        raise UsageError(f"driver {kind!r} cannot be loaded: {place} cannot be called")
+    return partial(_made, kind, make)
+
+
+def description_of(make: Factory, options: Mapping[str, object], name: str) -> Description:
+    """What such a robot is: a driver is made for that and thrown away, as making one opens nothing."""
+    return make(options, name, Clock(), None).description
 
 
 def driver_for(
@@ -103,11 +130,26 @@ def _naming(number: int) -> Iterator[None]:
 def _found(kind: str, attribute: str) -> object:
     if kind in built_in_kinds():
         return getattr(import_module(f"drivers.{kind}.driver"), attribute)
-    from drivers.foreign import description_of, maker, places  # most nodes never come here
-
     place = kind if ":" in kind else places().get(kind)
     if place is None:
         remedy = "of your own: module:Class"
         raise UsageError(f"no driver for robots of kind {kind!r}; known are {', '.join(kinds())}; {remedy}")
     make = maker(kind, place)
     return make if attribute == "make_driver" else partial(description_of, make)
+
+
+def _made(kind: str, make: Factory, options: Mapping[str, object], name: str, clock: Any, connector: Any) -> Driver:
+    try:
+        driver = make(options, name, clock, connector)
+        missing = [each for each in NEEDED if not hasattr(driver, each)]
+        if missing or not isinstance(driver.description, Description):
+            raise TypeError(f"it is no Driver: it lacks {', '.join(missing) or 'a Description'}")
+    except DriverError:
+        raise
+    except Exception as error:  # foreign code
+        raise UsageError(f"driver {kind!r} cannot be made with these options: {_told(error)}") from error
+    return driver
+
+
+def _told(error: Exception) -> str:
+    return " ".join(f"{type(error).__name__}: {error}".split())[:300]

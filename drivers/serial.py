@@ -17,7 +17,16 @@ from twisted.logger import Logger
 from twisted.python.failure import Failure
 
 from drivers.errors import UsageError
-from drivers.link import FIRST_RETRY_S, LAST_RETRY_S, RETRY_FACTOR, Caller, Line
+from drivers.link import (
+    FIRST_RETRY_S,
+    LAST_RETRY_S,
+    RETRY_FACTOR,
+    Caller,
+    Line,
+    StreamLink,
+    reactor_or_running,
+)
+from drivers.timer import Timer
 
 FLUSH_S = 1.0
 """What was sent before hanging up has so long to leave."""
@@ -63,11 +72,7 @@ class SerialConnector:
 
         Raises ``UsageError`` where pyserial is missing.
         """
-        reactor = self._reactor
-        if reactor is None:
-            from twisted.internet import reactor as running
-
-            reactor = running
+        reactor = reactor_or_running(self._reactor)
         return SerialLine(host, port, caller, reactor, _opener() if self._opener is None else self._opener)
 
 
@@ -86,18 +91,17 @@ class SerialLine:
         self._link: _SerialLink | None = None
         self._retry_s = FIRST_RETRY_S
         self._gone: Deferred[None] | None = None
-        self._pending: Any = reactor.callLater(0.0, self._try)
+        self._pending = Timer(reactor)
+        self._pending.set(0.0, self._try)
 
     def hang_up(self) -> Deferred[None]:
         """Let what was sent leave, close the device, stop trying; fires when it is closed."""
-        if self._pending is not None and self._pending.active():
-            self._pending.cancel()
-        self._pending = None
         if self._link is None:
+            self._pending.cancel()
             return succeed(None)
         if self._gone is None:
             self._gone = Deferred()
-            self._pending = self._reactor.callLater(FLUSH_S, self._link.close)
+            self._pending.set(FLUSH_S, self._link.close)
             self._link.leave()
         return self._gone
 
@@ -105,21 +109,20 @@ class SerialLine:
         """Learn from the link that the device is closed."""
         self._link = None
         gone, self._gone = self._gone, None
-        if self._pending is not None and self._pending.active():
-            self._pending.cancel()
-        self._pending = None if gone else self._reactor.callLater(FIRST_RETRY_S, self._try)
+        self._pending.cancel()
+        if gone is None:
+            self._pending.set(FIRST_RETRY_S, self._try)
         self._caller.link_down()
         if gone is not None:
             gone.callback(None)
 
     def _try(self) -> None:
-        self._pending = None
         link = _SerialLink(self, self._caller)
         try:
             self._opener(link, self._device, self._baud, self._reactor)
         except (OSError, ValueError) as error:
             self._name(problem_of(error))
-            self._pending = self._reactor.callLater(self._retry_s, self._try)
+            self._pending.set(self._retry_s, self._try)
             self._retry_s = min(self._retry_s * RETRY_FACTOR, LAST_RETRY_S)
             return
         self._retry_s = FIRST_RETRY_S
@@ -133,7 +136,7 @@ class SerialLine:
         self.problem = problem
 
 
-class _SerialLink(protocol.Protocol):
+class _SerialLink(StreamLink):
     """A link over one open device."""
 
     def __init__(self, line: SerialLine, caller: Caller) -> None:
@@ -144,15 +147,6 @@ class _SerialLink(protocol.Protocol):
     def is_busy(self) -> bool:
         transport: Any = self.transport
         return transport is not None and len(transport.dataBuffer) + transport._tempDataLen > BACKLOG
-
-    def fileno(self) -> int:
-        """The open descriptor, for another process to share; -1 on a closed link."""
-        transport: Any = self.transport
-        return int(transport.fileno()) if self.connected and transport is not None else -1
-
-    def send(self, data: bytes) -> None:
-        if self.connected and self.transport is not None:
-            self.transport.write(data)
 
     def close(self) -> None:
         transport: Any = self.transport

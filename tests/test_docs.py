@@ -13,7 +13,7 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from agents import body, engagement, guarded, loop, means
 from agents.catalogue import TASKS
-from drivers import rules
+from drivers import conformance
 from drivers.aibo.option import PORTS
 from drivers.compass.option import PORT as COMPASS_PORT
 from drivers.create2.codec import FRAME_S as STREAM_S
@@ -96,7 +96,7 @@ FIGURES: Sequence[tuple[str, str]] = (
     ("deployment", f"does not answer within {runner.PATIENCE_S:g} s, raises"),
     ("deployment", f"an answer has more than {frame.MAX_ANSWER // 1024} KiB"),
     ("deployment", f"nobody has asked it for {deployment.IDLE_S:g} s"),
-    ("drivers", f"in every state, at rest within {rules.HALT_S:g} s"),
+    ("drivers", f"in every state, at rest within {conformance.HALT_S:g} s"),
     ("drivers", f"While driving a key counts for {pilot.KEY_S:g} s"),
     ("faults", f"Seconds are {kinds.MIN_S:g} to {kinds.MAX_S:g}, {kinds.USUAL_S:g} where"),
     ("faults", f"later than {takeover.TARGET_S:g} s, or nobody took over"),

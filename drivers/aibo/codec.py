@@ -11,11 +11,12 @@ import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from drivers.aibo.cursor import Cursor, Short
 from drivers.errors import BadFrame
 
 T4, T2 = "T4", "T2"
 MAX_LINE = 4096
+MAX_COUNT = 256
+MAX_MODEL = 32
 MODEL_START = b"ERS-"
 PID_JOINTS = 18
 COMMAND = 5
@@ -36,24 +37,79 @@ class WorldState:
     duties: tuple[float, ...]
 
 
-@dataclass(frozen=True)
-class Gains:
-    """The gains P, I and D of each joint at ``t`` ms."""
-
-    t: int
-    pids: tuple[tuple[float, float, float], ...]
-
-
 def command(letter: str, value: float) -> bytes:
     """A walk command (``f s r`` and the digits) or a head command (``t p r``), -1 to 1."""
     return struct.pack("<cf", letter.encode("ascii"), value)
 
 
-def pose(positions: Sequence[float]) -> bytes:
-    """All joints at once, in radians, as the joint writer of Tekkotsu 2.x reads them."""
-    if len(positions) != PID_JOINTS:
-        raise ValueError(f"a pose has {PID_JOINTS} joints, not {len(positions)}")
-    return struct.pack(f"<{PID_JOINTS}f", *positions)
+class Short(Exception):
+    """A packet goes on beyond the bytes at hand: it has at least ``need`` bytes."""
+
+    def __init__(self, need: int) -> None:
+        super().__init__(need)
+        self.need = need
+
+
+def string(text: str) -> bytes:
+    """A string as the dog saves one: its length, its bytes and a NUL."""
+    data = text.encode("latin-1")
+    return struct.pack("<I", len(data)) + data + b"\0"
+
+
+class Cursor:
+    """Takes fields from the front of ``data``; raises ``Short`` at its end, ``BadFrame`` for what cannot be."""
+
+    def __init__(self, data: bytes) -> None:
+        self.at = 0
+        self._data = data
+
+    def take(self, size: int) -> bytes:
+        """So many bytes."""
+        piece = self._data[self.at : self.at + size]
+        if len(piece) < size:
+            raise Short(self.at + size)
+        self.at += size
+        return piece
+
+    def words(self, count: int) -> tuple[int, ...]:
+        """So many unsigned numbers."""
+        return struct.unpack(f"<{count}I", self.take(4 * count))
+
+    def floats(self, count: int) -> tuple[float, ...]:
+        """So many floats."""
+        return struct.unpack(f"<{count}f", self.take(4 * count))
+
+    def count(self) -> int:
+        """How many follow."""
+        (count,) = self.words(1)
+        if count > MAX_COUNT:
+            raise BadFrame(f"{count} values in a row are more than any dog has")
+        return count
+
+    def row(self) -> tuple[float, ...]:
+        """A count, and so many floats."""
+        return self.floats(self.count())
+
+    def until_nul(self) -> str:
+        """A short name that ends with a NUL."""
+        end = self._data.find(b"\0", self.at, self.at + MAX_MODEL)
+        if end < 0:
+            if len(self._data) - self.at >= MAX_MODEL:
+                raise BadFrame("a name without its end")
+            raise Short(len(self._data) + 1)
+        text = self._data[self.at : end]
+        self.at = end + 1
+        return text.decode("latin-1")
+
+    def string(self, limit: int) -> str:
+        """A string of at most ``limit`` bytes, as ``string`` makes them."""
+        (length,) = self.words(1)
+        if length > limit:
+            raise BadFrame(f"a name of {length} bytes")
+        data = self.take(length + 1)
+        if data[-1]:
+            raise BadFrame("a name without its end")
+        return data[:-1].decode("latin-1")
 
 
 class CommandReader:
@@ -100,10 +156,9 @@ def encoded(state: WorldState) -> bytes:
     return head + b"".join(_counted(row) for row in (state.outputs, state.sensors, state.buttons, state.duties))
 
 
-def encoded_gains(gains: Gains) -> bytes:
-    """The packet of ``gains``."""
-    flat = [value for row in gains.pids for value in row]
-    return struct.pack("<II", gains.t, len(gains.pids)) + _floats(flat)
+def encoded_gains(t: int, pids: Sequence[tuple[float, float, float]]) -> bytes:
+    """The packet of port 10032: the gains P, I and D of each joint at ``t`` ms."""
+    return struct.pack("<II", t, len(pids)) + _floats([value for row in pids for value in row])
 
 
 def _floats(row: Sequence[float]) -> bytes:
@@ -149,23 +204,3 @@ def _state(cursor: Cursor, has_model: bool) -> WorldState:
     if joints != PID_JOINTS:
         raise BadFrame(f"neither dialect begins so: no model, and {joints} joints")
     return WorldState(T2, "", t, 0, cursor.floats(joints), cursor.row(), cursor.row(), cursor.floats(joints))
-
-
-class GainReader:
-    """Cuts the stream of port 10032 into gains; raises ``BadFrame`` where it is none, as ``StateReader`` does."""
-
-    def __init__(self) -> None:
-        self._rest = bytearray()
-
-    def read(self, data: bytes) -> Iterator[Gains]:
-        """Yield the gains that ``data`` completes."""
-        self._rest += data
-        while True:
-            cursor = Cursor(bytes(self._rest))
-            try:
-                (t,) = cursor.words(1)
-                flat = cursor.floats(3 * cursor.count())
-            except Short:
-                return
-            del self._rest[: cursor.at]
-            yield Gains(t, tuple(zip(flat[::3], flat[1::3], flat[2::3], strict=True)))

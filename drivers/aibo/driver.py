@@ -5,17 +5,14 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any
 
 from twisted.internet.defer import Deferred, fail, gatherResults, succeed
 from twisted.internet.interfaces import IReactorTime
 
-from drivers.aibo import recipe, sense
-from drivers.aibo.camera import Camera
+from drivers.aibo import menu, sense
 from drivers.aibo.codec import LineReader, StateReader, WorldState, command
-from drivers.aibo.link import WAITS, Datagrams, Port, UdpDatagrams
+from drivers.aibo.link import WAITS, Camera, Datagrams, Port, UdpDatagrams
 from drivers.aibo.menu import Hello, Load, MenuReader, select
-from drivers.aibo.odometry import Odometry
 from drivers.aibo.option import SOUNDS, Options, checked, described
 from drivers.aibo.picture import Picture
 from drivers.base import ENGAGED, BaseDriver, heard_at
@@ -24,8 +21,9 @@ from drivers.deadman.switch import DeadMan, LastWord
 from drivers.driver import Permit
 from drivers.errors import BadFrame, LinkLost, NotEnabled, Unsupported
 from drivers.link import Connector, TcpConnector
-from drivers.manifest import Manifest
+from drivers.option import Manifest
 from drivers.reading import Action, Description, Frame, Value
+from drivers.timer import Timer
 
 MANIFEST = Manifest(example={"host": "192.168.0.51"})
 
@@ -79,14 +77,13 @@ class AiboDriver(BaseDriver):
         self._main_at: float | None = None
         self._is_engaged = True
         self._walk = (0.0, 0.0, 0.0)
-        self._odometry = Odometry()
+        self._odometry = sense.Odometry()
         self._heard_at = self._watch_at = 0.0
         self._frame: Frame | None = None
         self._started: set[str] = set()
         self._named: set[str] = set()
         self._asked_at: dict[str, float] = {}
-        self._again: Any = None
-        self._watch: Any = None
+        self._again, self._watch = Timer(clock), Timer(clock)
 
     @property
     def camera_fps(self) -> float:
@@ -101,7 +98,7 @@ class AiboDriver(BaseDriver):
             if self._hellos >= 2:
                 self._camera.open()
         else:
-            self._tell(recipe.stopped(["camera"]))
+            self._tell(menu.stopped(["camera"]))
             self._camera.close()
 
     def invoke(self, name: str, **arguments: float | str) -> Deferred[Mapping[str, Value]]:
@@ -134,12 +131,10 @@ class AiboDriver(BaseDriver):
         self._on_watch()
 
     def _close(self) -> Deferred[None]:
-        for timer in (self._again, self._watch):
-            if timer is not None and timer.active():
-                timer.cancel()
-        self._again = self._watch = None
+        self._again.cancel()
+        self._watch.cancel()
         self._ports["estop"].send(b"stop\n")
-        self._tell(recipe.stopped(sorted(self._started)))
+        self._tell(menu.stopped(sorted(self._started)))
         closing = [port.close() for port in self._ports.values()] + [self._camera.close()]
         return gatherResults(closing).addCallback(lambda _: None)
 
@@ -172,23 +167,20 @@ class AiboDriver(BaseDriver):
         return None if link is None else LastWord(_walking(0.0, 0.0, 0.0), link)
 
     def _say_walk(self, f: float, s: float, r: float) -> None:
-        if self._again is not None:
-            self._again.cancel()
-            self._again = None
+        self._again.cancel()
         self._walk = (f, s, r)
         self._ports["walk"].send(_walking(f, s, r))
         if any(self._walk):
-            self._again = self._clock.callLater(AGAIN_S, self._on_again)
+            self._again.set(AGAIN_S, self._on_again)
 
     def _on_again(self) -> None:
-        self._again = None
         if self._may_move:
             self._say_walk(*self._walk)
         else:
             self.stop()
 
     def _start_lines(self, services: list[str]) -> list[str]:
-        return recipe.started(services, self._options.camera_transport, self._fps, self._options.camera_width)
+        return menu.started(services, self._options.camera_transport, self._fps, self._options.camera_width)
 
     def _tell(self, lines: list[str]) -> None:
         if lines:
@@ -215,7 +207,7 @@ class AiboDriver(BaseDriver):
         if len(arguments) != 1 or not isinstance(name, str) or not ANY_SOUND.fullmatch(name):
             raise Unsupported('play takes the name of a sound file on the stick, as in sound = "mew.wav"')
         self._need("main")
-        self._tell(recipe.sound(name))
+        self._tell(menu.sound(name))
         return {}
 
     def _need(self, service: str) -> Port:
@@ -240,8 +232,8 @@ class AiboDriver(BaseDriver):
     def _on_main_up(self) -> None:
         self._counts["bad_frames"] += self._menu.bad_lines
         self._menu, self._hellos, self._main_at = MenuReader(), 0, self._clock.seconds()
-        services = [service for service in recipe.SERVERS if service != "camera" or self._fps > 0]
-        self._tell(recipe.greeting() + self._start_lines(services))
+        services = [service for service in menu.SERVERS if service != "camera" or self._fps > 0]
+        self._tell(menu.greeting() + self._start_lines(services))
 
     def _on_main(self, data: bytes) -> None:
         for message in self._menu.read(data):
@@ -355,7 +347,7 @@ class AiboDriver(BaseDriver):
         now = self._clock.seconds()
         self._heard_at = heard_at(self._heard_at, self._watch_at, now)
         self._watch_at = now + WATCH_S
-        self._watch = self._clock.callLater(WATCH_S, self._on_watch)
+        self._watch.set(WATCH_S, self._on_watch)
         if self._main_at is not None and now - self._main_at > STARTED_S and self._ports["main"].is_up:
             self._name_once("main", "main control does not answer; its ports are tried all the same")
             self._open_ports()
@@ -382,7 +374,7 @@ class AiboDriver(BaseDriver):
         now = self._clock.seconds()
         if now - max(since, self._asked_at.get(service, 0.0)) > ASK_S:
             self._asked_at[service] = now
-            self._tell([select(name) for name in recipe.SERVERS[service]])
+            self._tell([select(name) for name in menu.SERVERS[service]])
 
     def _name_once(self, what: str, problem: str) -> None:
         if what not in self._named:

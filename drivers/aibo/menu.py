@@ -2,11 +2,14 @@
 
 Commands are lines; what comes back are words on lines of their own, each with a known number of lines after it.  The
 menu (``refresh``) has five fields an item, or four from Tekkotsu 2.x, which shows in its first item.
+
+The servers are called differently in each generation of Tekkotsu: each name is sent, and the dog ignores those that
+it does not know.  A running server is called ``#name``, so starting it again does nothing.
 """
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from dataclasses import dataclass
 
 from drivers.aibo.codec import LineReader
@@ -17,6 +20,14 @@ MAX_MESSAGE = 4096
 """No menu of a dog has so many lines."""
 HELLO = "!hello"
 EMPTY_SLOT = "----------"
+SERVERS: dict[str, tuple[str, ...]] = {
+    "estop": ("EStop Remote Control", "EStopControllerBehavior", "EStopController"),
+    "state": ("World State Serializer",),
+    "walk": ("Walk Remote Control", "WalkController"),
+    "head": ("Head Remote Control", "HeadController"),
+    "camera": ("Raw Cam Server", "RawCam"),
+}
+PICTURE_MS = 1000.0 / 30.0
 
 
 @dataclass(frozen=True)
@@ -76,21 +87,13 @@ class Stack:
 
 
 @dataclass(frozen=True)
-class Push:
-    """A menu opened."""
+class Word:
+    """A message of one word: ``push`` and ``pop`` for a menu that opens and closes, ``goodbye`` at the end."""
+
+    word: str
 
 
-@dataclass(frozen=True)
-class Pop:
-    """A menu closed."""
-
-
-@dataclass(frozen=True)
-class Goodbye:
-    """The dog is closing the link."""
-
-
-Message = Refresh | Status | Load | Close | Hello | Stack | Push | Pop | Goodbye
+Message = Refresh | Status | Load | Close | Hello | Stack | Word
 _Lines = Generator[None, str, Message]
 
 
@@ -107,6 +110,43 @@ def unselect(name: str) -> str:
 def setting(key: str, value: object) -> str:
     """The command that changes the dog's configuration."""
     return f"!set {key}={value}"
+
+
+def greeting() -> list[str]:
+    """What is asked first: who is there, and which menu is open."""
+    return [HELLO, "!dump_stack", "!refresh"]
+
+
+def started(services: Iterable[str], transport: str, fps: float, width: int = 104) -> list[str]:
+    """Settings, then the servers, in both spellings of each; the last line's answer says that all before were read."""
+    lines = [setting("main.worldState_interval", 0), setting("vision.rawcam.transport", transport.upper())]
+    lines += [setting("vision.rawcam.encoding", "color"), setting("vision.rawcam.compression", "jpeg")]
+    lines += sized(width) + paced(fps)
+    lines += [select(name) for service in services for name in SERVERS[service]]
+    return [*lines, HELLO]
+
+
+def sized(width: int) -> list[str]:
+    """The width of the pictures, in pixels: each layer of the camera is half as wide as the one above."""
+    skip = {208: 1, 104: 2}[width]
+    names = (f"vision.rawcam{mark}{channel}_skip" for mark in "._" for channel in ("y", "uv"))
+    return [setting(name, skip + name.endswith("uv_skip")) for name in names]
+
+
+def paced(fps: float) -> list[str]:
+    """The camera's pace: the dog waits from the end of one picture on, so half a picture is taken off the wait."""
+    wait_ms = 0 if fps <= 0 or fps >= 29 else round(1000.0 / fps - PICTURE_MS / 2.0)
+    return [setting("vision.rawcam.interval", wait_ms), setting("vision.rawcam_interval", wait_ms)]
+
+
+def stopped(services: Iterable[str]) -> list[str]:
+    """What stops these servers."""
+    return [unselect(name) for service in services for name in SERVERS[service]]
+
+
+def sound(name: str) -> list[str]:
+    """What plays a sound from the stick, under the name that its file has there."""
+    return [select("Play Sound"), select(name.upper())]
 
 
 def encoded(message: Message, has_four_fields: bool = False) -> bytes:
@@ -133,8 +173,8 @@ def _written(message: Message, has_four_fields: bool) -> Iterator[str]:
             yield from ("hello", str(count))
         case Stack(titles):
             yield from ("stack_dump", str(len(titles)), *titles)
-        case _:
-            yield type(message).__name__.lower()
+        case Word(word):
+            yield word
 
 
 class MenuReader:
@@ -181,12 +221,8 @@ class MenuReader:
 def _message(word: str) -> _Lines:
     """Takes the lines after ``word`` one by one, and ends with the message."""
     match word:
-        case "push":
-            return Push()
-        case "pop":
-            return Pop()
-        case "goodbye":
-            return Goodbye()
+        case "push" | "pop" | "goodbye":
+            return Word(word)
         case "refresh":
             return (yield from _refresh())
         case "status":

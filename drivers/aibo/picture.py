@@ -11,7 +11,7 @@ import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from drivers.aibo.cursor import Cursor, Short, string
+from drivers.aibo.codec import Cursor, Short, string
 from drivers.errors import BadFrame
 from formats.jpeg import size_of
 

@@ -1,4 +1,4 @@
-"""Sense: what the numbers of a world state mean: names, units and bounds of an ERS-7; pure, both ways.
+"""Sense: what the numbers of a world state mean: names, units and bounds of an ERS-7, and where it should be; pure.
 
 Names are Tekkotsu's.  The signs of the accelerometers are as its headers say; nobody has checked them on a dog.
 """
@@ -31,6 +31,9 @@ _SENSOR_BOUNDS = (
     *((-0.01, 1.5), (-50.0, 150.0), (0.0, 1e5), (0.0, 100.0), (-1e5, 1e5)),
 )
 _CAPACITY_MAH = 2200.0
+WRAP_MS = 2**32
+LONGEST_MS = 1000
+"""After a longer gap nobody knows what the dog did in it."""
 
 
 def is_known(state: WorldState) -> bool:
@@ -94,3 +97,41 @@ def _check(row: Sequence[float], bounds: Sequence[tuple[float, float]]) -> None:
     for value, (low, high) in zip(row, bounds, strict=True):
         if not low <= value <= high:  # NaN is in no bounds
             raise BadFrame(f"{value} lies outside {low} to {high}")
+
+
+class Odometry:
+    """Counts the robot's time on, past its wrap, and adds up the commanded velocity over it."""
+
+    def __init__(self) -> None:
+        self.t = 0.0
+        self._place = [0.0, 0.0, 0.0]
+        self._newest: int | None = None
+
+    def forget(self) -> None:
+        """The link was lost: the next time stamp follows on none."""
+        self._newest = None
+
+    def moment(self, t_ms: int) -> float:
+        """A time stamp near the newest one as seconds of ``t``."""
+        if self._newest is None:
+            return self.t
+        return self.t + ((t_ms - self._newest + WRAP_MS // 2) % WRAP_MS - WRAP_MS // 2) / 1000.0
+
+    def step(self, t_ms: int, vx: float, vy: float, wz: float) -> None:
+        """So the dog moved until ``t_ms``."""
+        gone = 0 if self._newest is None else (t_ms - self._newest) % WRAP_MS
+        if self._newest is None and self.t == 0.0:
+            self.t = t_ms / 1000.0
+        self._newest = t_ms
+        if gone > LONGEST_MS:
+            return
+        dt = gone / 1000.0
+        self.t += dt
+        x, y, yaw = self._place
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        self._place = [x + (vx * cos - vy * sin) * dt, y + (vx * sin + vy * cos) * dt, yaw + wz * dt]
+
+    def values(self) -> dict[str, Value]:
+        """The place under the keys of an observation."""
+        x, y, yaw = self._place
+        return {"odom.x": x, "odom.y": y, "odom.yaw": math.remainder(yaw, math.tau)}

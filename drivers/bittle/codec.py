@@ -12,6 +12,7 @@ from collections.abc import Iterator, Sequence
 from urllib.parse import quote_from_bytes
 
 from drivers.errors import BadFrame
+from formats.head import Head, head, taken
 
 END_TEXT, END_BYTES = b"\n", b"~"
 LEAST_BYTE, MOST_BYTE = -125, 125
@@ -67,7 +68,7 @@ class LineReader:
     """Cuts the robot's bytes into lines, however they are cut; counts and drops what is no text."""
 
     def __init__(self) -> None:
-        self.bad_lines = 0
+        self.bad_frames = 0
         self._rest = bytearray()
         self._is_lost = False
 
@@ -79,7 +80,7 @@ class LineReader:
             del self._rest[: at + 1]
             is_lost, self._is_lost = self._is_lost, False
             if is_lost or len(line) > MAX_LINE or not _is_text(line):
-                self.bad_lines += 1
+                self.bad_frames += 1
             elif line:
                 yield line.decode()
         if len(self._rest) > MAX_LINE:
@@ -178,7 +179,7 @@ def _angles(**degrees: float) -> dict[str, float]:
 
 def request(host: str, path: str) -> bytes:
     """A request of HTTP for ``path``, after which the robot closes."""
-    return f"GET {path} HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n".encode()
+    return head(f"GET {path} HTTP/1.1", f"Host: {host}", "Connection: close")
 
 
 def command_path(board: str, command: bytes) -> str:
@@ -218,32 +219,28 @@ class ResponseReader:
 
     def __init__(self) -> None:
         self._data = bytearray()
+        self._head: Head | None = None
+        self._length: int | None = None
 
     def read(self, data: bytes) -> bytes | None:
         """The body once all of it is there; raises ``BadFrame`` for any status but 200, and for what is no HTTP."""
         self._data += data
         if len(self._data) > self.MAX:
             raise BadFrame("the response is too long")
-        head, gap, body = bytes(self._data).partition(b"\r\n\r\n")
-        if not gap:
+        if self._head is None:
+            self._head = taken(self._data)
+            if self._head is None:
+                return None
+            if not re.match(rb"HTTP/1\.[01] 200\b", self._head.first):
+                raise BadFrame(f"the robot answers {self._head.first[:60]!r}")
+            length = self._head.fields.get(b"content-length", b"")
+            self._length = int(length) if re.fullmatch(rb"\d{1,6}", length) else None
+        if self._length is None or len(self._data) < self._length:
             return None
-        length = self._length(head)
-        return body[:length] if length is not None and len(body) >= length else None
+        return bytes(self._data[: self._length])
 
     def ended(self) -> bytes:
         """The body now that the link is gone; raises ``BadFrame`` where some of it is missing."""
-        head, gap, body = bytes(self._data).partition(b"\r\n\r\n")
-        if not gap or (length := self._length(head)) is not None:
+        if self._head is None or self._length is not None:
             raise BadFrame("the response is cut off")
-        assert length is None
-        return body
-
-    def _length(self, head: bytes) -> int | None:
-        first, *fields = head.split(b"\r\n")
-        if not re.match(rb"HTTP/1\.[01] 200\b", first):
-            raise BadFrame(f"the robot answers {first[:60]!r}")
-        for field in fields:
-            found = re.fullmatch(rb"(?i)content-length:\s*(\d{1,6})\s*", field)
-            if found:
-                return int(found[1])
-        return None
+        return bytes(self._data)

@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from typing import Any
 
-from twisted.internet.defer import Deferred, fail, succeed
+from twisted.internet.defer import Deferred, fail
 from twisted.internet.interfaces import IReactorTime
 from twisted.python.failure import Failure
 
-from drivers.base import ENGAGED, BaseDriver
+from drivers.base import ENGAGED, LinkedDriver
 from drivers.bittle import codec
 from drivers.bittle.dialogue import Dialogue
 from drivers.bittle.gait import REST, STAND, Velocity, chosen
@@ -24,8 +23,8 @@ from drivers.deadman.keeper import kept
 from drivers.deadman.switch import DeadMan, LastWord
 from drivers.driver import Permit
 from drivers.errors import BadFrame, DriverError, LinkLost, NotEnabled, Unsupported
-from drivers.link import Connector, Line, Link, TcpConnector
-from drivers.manifest import Manifest
+from drivers.link import Connector, Link, TcpConnector
+from drivers.option import Manifest
 from drivers.reading import Action, Description, Value
 from drivers.serial import SerialConnector
 
@@ -49,7 +48,7 @@ EMPTY_V, FULL_V = 6.8, 8.4
 """Two lithium cells."""
 
 
-class BittleDriver(BaseDriver):
+class BittleDriver(LinkedDriver):
     """One dog.
 
     ``enable`` has it stand, ``disable`` lie down with its servos off, as it does after ``connect``.  ``act`` returns
@@ -66,20 +65,15 @@ class BittleDriver(BaseDriver):
         clock: IReactorTime,
         dead_man: DeadMan | None = None,
     ) -> None:
-        super().__init__(described(options), name, clock, dead_man)
+        place = (options.host, options.http_port) if options.host else (options.port, int(options.baud))
+        super().__init__(described(options), name, clock, connector, place, dead_man)
         self.STALE_S = 2.0 if options.host else 1.0
         self._options = options
         self._gaits = dict(options.gaits)
         self._moving = {codec.skill(name) for name, velocity in options.gaits if velocity != REST}
-        self._connector = connector
-        self._line: Line | None = None
-        self._link: Link | None = None
-        self._reader = codec.LineReader()
         self._dialogue = Dialogue(clock, self._send)
         self._board = ""
-        self._timer: Any = None
         self._greet_s = GREET_S
-        self._problem = ""
         self._wish = ""
         self._is_sure = True
         self._walk = REST
@@ -90,11 +84,6 @@ class BittleDriver(BaseDriver):
         self._turn = 0
         self._missed: dict[str, int] = {}
         self._values: dict[str, dict[str, Value]] = {}
-
-    @property
-    def problem(self) -> str:
-        """What keeps the robot from being heard, and the remedy; empty where it is heard."""
-        return str(getattr(self._line, "problem", "")) or self._problem
 
     def invoke(self, name: str, **arguments: float | str) -> Deferred[Mapping[str, Value]]:
         """A posture or behaviour by its name, until it is done; ``joint``: turn joints, by their names, to radians."""
@@ -129,18 +118,14 @@ class BittleDriver(BaseDriver):
     # -- to the robot -----------------------------------------------------------------------------------------------
 
     def _open(self) -> None:
-        where, number = self._options.port, int(self._options.baud)
-        if self._options.host:
-            where, number = self._options.host, self._options.http_port
-        self._line = self._connector.call(where, number, self)
+        super()._open()
         if isinstance(self._line, HttpLine):
             self._line.may_leave = self._may_leave
 
     def _close(self) -> Deferred[None]:
-        self._cancel_timer()
         self._send(codec.REST)
         self._dialogue.end(LinkLost(f"{self._name}: disconnected"))
-        return succeed(None) if self._line is None else self._line.hang_up()
+        return super()._close()
 
     def _power(self, on: bool) -> None:
         if on:
@@ -225,10 +210,6 @@ class BittleDriver(BaseDriver):
         """Whether a command that waited is wanted still."""
         return self._may_move or command not in self._moving
 
-    def _send(self, data: bytes) -> None:
-        if self._link is not None:
-            self._link.send(data)
-
     # -- from the robot ---------------------------------------------------------------------------------------------
 
     def link_up(self, link: Link) -> None:
@@ -243,22 +224,15 @@ class BittleDriver(BaseDriver):
         self._link = None
         self._lose(LinkLost(f"the link to {self._name} went away"))
 
-    def received(self, data: bytes) -> None:
-        """Take bytes from the robot; called by the line."""
-        self._counts["bytes"] += len(data)
-        bad = self._reader.bad_lines
-        for line in self._reader.read(data):
-            if self._is_closed:
-                return
-            if codec.is_banner(line) and self._is_up:
-                self._lose(LinkLost(f"{self._name} was started anew"))
-                self._greet()
-            else:
-                self._dialogue.heard(line)
-        self._counts["bad_frames"] += self._reader.bad_lines - bad
+    def _heard(self, line: str) -> None:
+        if codec.is_banner(line) and self._is_up:
+            self._lose(LinkLost(f"{self._name} was started anew"))
+            self._greet()
+        else:
+            self._dialogue.heard(line)
 
     def _lose(self, error: Exception) -> None:
-        self._cancel_timer()
+        self._timer.cancel()
         is_up, self._is_up = self._is_up, False
         self._wish = ""
         self._reckon()
@@ -269,7 +243,7 @@ class BittleDriver(BaseDriver):
             self._down()
 
     def _greet(self) -> None:
-        self._cancel_timer()
+        self._timer.cancel()
         self._dialogue.ask(codec.VERSION, self._greet_s).addCallbacks(self._on_greeted, self._on_no_greeting)
 
     def _on_greeted(self, lines: list[str]) -> None:
@@ -299,10 +273,9 @@ class BittleDriver(BaseDriver):
             self._greet()
 
     def _poll(self) -> None:
-        self._timer = self._clock.callLater(HTTP_POLL_S if self._options.host else POLL_S, self._poll_next)
+        self._timer.set(HTTP_POLL_S if self._options.host else POLL_S, self._poll_next)
 
     def _poll_next(self) -> None:
-        self._timer = None
         if self._running:
             self._poll()
             return
@@ -373,16 +346,6 @@ class BittleDriver(BaseDriver):
         x += self._walk.vx * span * math.cos(middle)
         y += self._walk.vx * span * math.sin(middle)
         self._pose = (x, y, math.remainder(yaw + self._walk.wz * span, math.tau))
-
-    def _name_problem(self, problem: str) -> None:
-        if problem != self._problem:
-            self.log.warn("{robot}: {problem}", robot=self._name, problem=problem)
-        self._problem = problem
-
-    def _cancel_timer(self) -> None:
-        if self._timer is not None and self._timer.active():
-            self._timer.cancel()
-        self._timer = None
 
 
 def _imu(lines: list[str]) -> dict[str, Value]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from typing import Any
 
 from twisted.internet.defer import Deferred, succeed
 from twisted.internet.interfaces import IReactorTime
@@ -13,6 +12,7 @@ from twisted.logger import Logger
 from drivers.bittle import codec
 from drivers.errors import BadFrame
 from drivers.link import Caller, Connector, Line, Link
+from drivers.timer import Timer
 
 ANSWER_S = 3.0
 """A request without a response after so long has failed."""
@@ -52,7 +52,7 @@ class HttpLine:
         self.problem = ""
         self.may_leave: Callable[[bytes], bool] = lambda _: True
         self._connector = connector
-        self._clock = clock
+        self.clock = clock
         self._board = board
         self._host = host
         self._port = port
@@ -64,7 +64,8 @@ class HttpLine:
         self._is_wanted = True
         self._misses = 0
         self._gone: Deferred[None] | None = None
-        self._timer: Any = clock.callLater(0.0, self._rise)
+        self._timer = Timer(clock)
+        self._timer.set(0.0, self._rise)
 
     # -- the line ---------------------------------------------------------------------------------------------------
 
@@ -76,7 +77,7 @@ class HttpLine:
             self._caller.link_down()
         last = self._waiting.pop() if self._waiting else None
         self._waiting.clear()
-        self._cancel_timer()
+        self._timer.cancel()
         if last is not None:
             self._drop()
             self._request = _Request(self, codec.command_path(self._board, last), lambda _: None)
@@ -104,17 +105,14 @@ class HttpLine:
         if len(self._waiting) >= MAX_WAITING:
             self._waiting.popleft()
         self._waiting.append(data)
-        if self._request is None and self._timer is None:
+        if self._request is None and not self._timer.is_set:
             self._next()
 
     def close(self) -> None:
         """Close now."""
         self._fall("closed")
 
-    # -- inside -----------------------------------------------------------------------------------------------------
-
     def _rise(self) -> None:
-        self._timer = None
         self._is_up = True
         self._misses = 0
         link: Link = self
@@ -129,10 +127,10 @@ class HttpLine:
         self._is_up = False
         self._waiting.clear()
         self._drop()
-        self._cancel_timer()
+        self._timer.cancel()
         self._caller.link_down()
         if self._is_wanted:
-            self._timer = self._clock.callLater(RETRY_S, self._rise)
+            self._timer.set(RETRY_S, self._rise)
 
     def _next(self) -> None:
         while self._waiting and not self.may_leave(self._waiting[0]):
@@ -142,7 +140,7 @@ class HttpLine:
         command = self._waiting.popleft()
         path = codec.command_path(self._board, command)
         if self._board == "nyboard":
-            end = self._clock.seconds() + TASK_S
+            end = self.clock.seconds() + TASK_S
             self._request = _Request(self, path, lambda body: self._on_text(body, command, end), command)
         else:
             self._request = _Request(self, path, lambda body: self._on_task(body, command), command)
@@ -152,12 +150,11 @@ class HttpLine:
             return
         # What the robot says after the dongle has answered waits there for the next request, if only for nothing.
         is_done = _has_end(body, command)
-        if not is_done and self._clock.seconds() < end and not self._waiting:
-            self._timer = self._clock.callLater(STATUS_S, self._ask_rest, command, end)
+        if not is_done and self.clock.seconds() < end and not self._waiting:
+            self._timer.set(STATUS_S, self._ask_rest, command, end)
         self._answer(body + b"\n")
 
     def _ask_rest(self, command: bytes, end: float) -> None:
-        self._timer = None
         if self._waiting:
             self._next()
         else:
@@ -168,16 +165,15 @@ class HttpLine:
         task = codec.task_of(body)
         if not self._is_wanted:
             return
-        self._ask_status(task, command, self._clock.seconds() + TASK_S)
+        self._ask_status(task, command, self.clock.seconds() + TASK_S)
 
     def _ask_status(self, task: str, command: bytes, end: float) -> None:
-        self._timer = None
         self._request = _Request(self, codec.status_path(task), lambda body: self._on_status(body, task, command, end))
 
     def _on_status(self, body: bytes, task: str, command: bytes, end: float) -> None:
         result = codec.result_of(body)
-        if result is None and self._clock.seconds() < end:
-            self._timer = self._clock.callLater(STATUS_S, self._ask_status, task, command, end)
+        if result is None and self.clock.seconds() < end:
+            self._timer.set(STATUS_S, self._ask_status, task, command, end)
             return
         lines = (result or b"") + b"\n"
         # That the task is done is what the token says on a cable.
@@ -189,7 +185,7 @@ class HttpLine:
         self._misses = 0
         self.problem = ""
         self._caller.received(lines)
-        if self._request is None and self._timer is None:
+        if self._request is None and not self._timer.is_set:
             self._next()
 
     def failed(self, problem: str) -> None:
@@ -218,10 +214,6 @@ class HttpLine:
         """Open a connection for a request."""
         return self._connector.call(self._host, self._port, request)
 
-    def later(self, seconds: float, call: Callable[[], None]) -> Any:
-        """Call after so long."""
-        return self._clock.callLater(seconds, call)
-
     def met(self, link: Link) -> None:
         """Learn from a request who has taken its connection."""
         self._peer = getattr(link, "peer", None) or self._peer
@@ -245,11 +237,6 @@ class HttpLine:
         if request is not None:
             request.drop()
 
-    def _cancel_timer(self) -> None:
-        if self._timer is not None and self._timer.active():
-            self._timer.cancel()
-        self._timer = None
-
 
 def _has_end(lines: bytes, command: bytes) -> bool:
     return any(codec.is_end(line, chr(command[0])) for line in lines.decode("latin-1").split())
@@ -265,7 +252,8 @@ class _Request:
         self._command = command
         self._reader = codec.ResponseReader()
         self._is_over = self._is_sent = False
-        self._timer = line.later(ANSWER_S, self._on_late)
+        self._timer = Timer(line.clock)
+        self._timer.set(ANSWER_S, self._on_late)
         self._call = line.call(self)
 
     def link_up(self, link: Link) -> None:
@@ -305,8 +293,7 @@ class _Request:
     def drop(self) -> None:
         """Forget it."""
         self._is_over = True
-        if self._timer.active():
-            self._timer.cancel()
+        self._timer.cancel()
         self._call.hang_up()
 
     def _on_late(self) -> None:

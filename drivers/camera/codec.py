@@ -190,10 +190,10 @@ def answer(kind: str = f"{KIND}; boundary={BOUNDARY}", status: str = "200 OK", i
     return "\r\n".join([*lines, "", ""]).encode()
 
 
-def part(jpeg: bytes, has_length: bool = True, boundary: str = BOUNDARY) -> bytes:
+def part(jpeg: bytes, has_length: bool = True) -> bytes:
     """One picture, behind its boundary."""
     length = f"Content-Length: {len(jpeg)}\r\n" if has_length else ""
-    return f"--{boundary}\r\nContent-Type: image/jpeg\r\n{length}\r\n".encode() + jpeg + b"\r\n"
+    return f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\n{length}\r\n".encode() + jpeg + b"\r\n"
 
 
 def chunk(data: bytes) -> bytes:

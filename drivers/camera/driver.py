@@ -10,28 +10,24 @@ from collections.abc import Mapping
 from importlib import import_module
 from typing import Any
 
-from twisted.internet.defer import Deferred, fail
+from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
 
-from drivers.base import BaseDriver
+from drivers.base import SensingDriver
 from drivers.camera.option import Options, checked, described, place_of
 from drivers.camera.shots import CaptureShots, FolderShots, Shot
 from drivers.camera.stream import StreamFilm
 from drivers.camera.thread import ClockFilm, Film, ThreadFilm
-from drivers.driver import Permit
-from drivers.errors import LinkLost
 from drivers.link import Connector, TcpConnector
-from drivers.manifest import Manifest
-from drivers.reading import Action, Description, Frame
+from drivers.option import Manifest
+from drivers.reading import Description, Frame
+from drivers.timer import Timer
 
 MANIFEST = Manifest("cv2", "vision", "but for a folder of JPEGs or an address")
 
 
-class CameraDriver(BaseDriver):
-    """One camera, whose pictures ``film`` brings.
-
-    It has no motors: ``enable`` is always granted while pictures come, and of actions there is only ``{}``.
-    """
+class CameraDriver(SensingDriver):
+    """One camera, whose pictures ``film`` brings."""
 
     def __init__(self, options: Options | Mapping[str, object], film: Film, clock: IReactorTime, name: str) -> None:
         self._options = options if isinstance(options, Options) else checked(options)
@@ -41,7 +37,7 @@ class CameraDriver(BaseDriver):
         self._fps = self._options.fps
         self._began = 0.0
         self._told = ""
-        self._beat: Any = None
+        self._beat = Timer(clock)
         self._frame: Frame | None = None
 
     @property
@@ -55,7 +51,7 @@ class CameraDriver(BaseDriver):
         self._film.set_fps(fps)
         self.STALE_S = max(0.5, 3.0 / fps) if fps > 0 else 0.5
         if fps > 0:
-            self._stop_beat()
+            self._beat.cancel()
         elif was > 0 and self._is_up:
             self._rest_camera()
 
@@ -81,7 +77,7 @@ class CameraDriver(BaseDriver):
         t = self._clock.seconds() - self._began
         self._frame = Frame(self._counts["pictures"], shot.width, shot.height, shot.jpeg, t)
         self._observed({}, t, frame=self._frame)
-        if self._fps <= 0 and self._beat is None and not self._is_closed:
+        if self._fps <= 0 and not self._beat.is_set and not self._is_closed:
             self._rest_camera()
 
     def spoilt(self, reason: str) -> None:
@@ -95,37 +91,22 @@ class CameraDriver(BaseDriver):
             self.log.warn("{robot}: {reason}; trying again", robot=self._name, reason=reason)
         self._told = reason
         self._counts["refused"] += 1
-        self._stop_beat()
+        self._beat.cancel()
         if self._is_up:
             self._down()
-
-    # -- inside -----------------------------------------------------------------------------------------------------
 
     def _open(self) -> None:
         self._began = self._clock.seconds()
         self._film.start(self, self._fps)
 
     def _close(self) -> Deferred[None]:
-        self._stop_beat()
+        self._beat.cancel()
         return self._film.stop()
-
-    def _drive(self, motion: Action, permit: Permit) -> Action:
-        return motion  # whoever holds it moves it
-
-    def _switch(self, on: bool) -> Deferred[bool]:
-        if self.state == "stale":
-            return fail(LinkLost(f"{self._name} is stale; wait for its next picture"))
-        return super()._switch(on)
 
     def _rest_camera(self) -> None:
         """While no pictures are wanted, say that the device is there, or it would count as lost."""
-        self._beat = self._clock.callLater(self.STALE_S / 2, self._rest_camera)
+        self._beat.set(self.STALE_S / 2, self._rest_camera)
         self._observed({}, self._clock.seconds() - self._began, frame=self._frame)
-
-    def _stop_beat(self) -> None:
-        if self._beat is not None and self._beat.active():
-            self._beat.cancel()
-        self._beat = None
 
 
 def make_driver(options: Mapping[str, object], name: str, clock: IReactorTime, connector: Any) -> CameraDriver:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from twisted.internet.defer import Deferred, succeed
 from twisted.internet.interfaces import IReactorTime
 from twisted.logger import Logger
@@ -14,6 +12,7 @@ from drivers.camera.shots import Shot
 from drivers.camera.thread import Retry, Viewer
 from drivers.errors import BadFrame
 from drivers.link import Connector, Line, Link
+from drivers.timer import Timer
 from formats.jpeg import size_of
 
 SILENCE_S = 5.0
@@ -42,7 +41,7 @@ class StreamFilm:
         self._has_shown = False
         self._retry = Retry()
         self._call: _Call | None = None
-        self._timer: Any = None
+        self._timer = Timer(clock)
 
     def start(self, viewer: Viewer, fps: float) -> None:
         """Begin."""
@@ -57,7 +56,7 @@ class StreamFilm:
             return
         if fps <= 0 and self._has_shown:
             self._hang_up()
-        elif fps > 0 and self._timer is None:
+        elif fps > 0 and not self._timer.is_set:
             self._ring()
 
     def stop(self) -> Deferred[None]:
@@ -88,12 +87,10 @@ class StreamFilm:
         if call is self._call:
             self._give_up("it has hung up")
 
-    # -- inside -----------------------------------------------------------------------------------------------------
-
     def _ring(self) -> None:
         place = self._place
         call = self._call = _Call(self, codec.request(place.name, place.path, place.login))
-        self._timer = self._clock.callLater(SILENCE_S, self._on_silence)
+        self._timer.set(SILENCE_S, self._on_silence)
         call.line = self._connector.call(place.host, place.port, call)
 
     def _on_picture(self, jpeg: bytes) -> None:
@@ -103,7 +100,7 @@ class StreamFilm:
             viewer.spoilt(f"a picture of {len(jpeg)} bytes is no whole JPEG")
             return
         self._retry.succeed()
-        self._timer.reset(SILENCE_S)
+        self._timer.set(SILENCE_S, self._on_silence)
         now = self._clock.seconds()
         interval = 1.0 / self._fps if self._fps > 0 else 0.0
         if now < self._due:
@@ -121,7 +118,6 @@ class StreamFilm:
             self._hang_up()
 
     def _on_silence(self) -> None:
-        self._timer = None
         if self._call is not None and self._call.is_up:
             self._give_up(f"{self._place.name} answers, but no pictures come; serves it another already?")
         else:
@@ -130,15 +126,13 @@ class StreamFilm:
     def _give_up(self, reason: str) -> None:
         self._hang_up()
         self._has_shown = False
-        self._timer = self._clock.callLater(self._retry.fail(), self._ring)
+        self._timer.set(self._retry.fail(), self._ring)
         if self._viewer is not None:
             self._viewer.gone(reason)
 
     def _hang_up(self) -> Deferred[None]:
         call, self._call = self._call, None
-        if self._timer is not None and self._timer.active():
-            self._timer.cancel()
-        self._timer = None
+        self._timer.cancel()
         return succeed(None) if call is None or call.line is None else call.line.hang_up()
 
 

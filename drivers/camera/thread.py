@@ -15,6 +15,7 @@ from twisted.internet.interfaces import IReactorTime
 
 from drivers.camera.shots import Shot, Shots
 from drivers.errors import BadFrame, LinkLost
+from drivers.timer import Timer
 
 FIRST_RETRY_S, LAST_RETRY_S = 0.5, 5.0
 JOIN_S = 2.0
@@ -110,46 +111,39 @@ class ClockFilm:
     """Pictures of files, each at its moment of ``clock``: the same run shows the same pictures."""
 
     def __init__(self, shots: Shots, clock: IReactorTime) -> None:
-        self._clock = clock
         self._reel = Reel(shots, self._tell)
         self._viewer: Viewer | None = None
         self._fps = 0.0
-        self._pending: Any = None
+        self._pending = Timer(clock)
 
     def start(self, viewer: Viewer, fps: float) -> None:
         """Begin with the first picture, at once but not within this call."""
         self._viewer, self._fps = viewer, fps
-        self._pending = self._clock.callLater(0.0, self._on_time)
+        self._pending.set(0.0, self._on_time)
 
     def set_fps(self, fps: float) -> None:
         """So many a second from now on; 0: none."""
         self._fps = fps
         if self._viewer is not None:
-            self._cancel()
+            self._pending.cancel()
             if fps > 0:
-                self._pending = self._clock.callLater(1.0 / fps, self._on_time)
+                self._pending.set(1.0 / fps, self._on_time)
 
     def stop(self) -> Deferred[None]:
         """End."""
         self._viewer = None
-        self._cancel()
+        self._pending.cancel()
         self._reel.close()
         return succeed(None)
 
     def _on_time(self) -> None:
-        self._pending = None
         wait = max(self._reel.turn(), 1.0 / self._fps if self._fps > 0 else 0.0)
-        if self._viewer is not None and self._fps > 0 and self._pending is None:
-            self._pending = self._clock.callLater(wait, self._on_time)
+        if self._viewer is not None and self._fps > 0 and not self._pending.is_set:
+            self._pending.set(wait, self._on_time)
 
     def _tell(self, what: str, said: Any) -> None:
         if self._viewer is not None:
             getattr(self._viewer, what)(said)
-
-    def _cancel(self) -> None:
-        if self._pending is not None:
-            self._pending.cancel()
-        self._pending = None
 
 
 class ThreadFilm:

@@ -9,12 +9,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
 
 from twisted.internet.defer import Deferred, fail, succeed
 from twisted.internet.interfaces import IReactorTime
 
-from drivers.base import BaseDriver, heard_at
+from drivers.base import LinkedDriver, heard_at
 from drivers.create2 import codec
 from drivers.create2.odometry import WHEEL_BASE, Odometry
 from drivers.create2.option import SKILLS, Options, checked, described
@@ -23,10 +22,11 @@ from drivers.deadman.keeper import kept
 from drivers.deadman.switch import DeadMan, LastWord
 from drivers.driver import Permit
 from drivers.errors import LinkLost, NoReply, NotEnabled, Unsupported, UsageError
-from drivers.link import Connector, Line, Link
-from drivers.manifest import Manifest
+from drivers.link import Connector, Link
+from drivers.option import Manifest
 from drivers.reading import Action, Description, Value
 from drivers.serial import SerialConnector
+from drivers.timer import Timer
 
 MANIFEST = Manifest("serial", "serial", example={"port": "/dev/ttyUSB0"}, is_on_cable=True)
 
@@ -39,7 +39,7 @@ DOCK_S = 120.0
 """It has so long to find its home base."""
 
 
-class Create2Driver(BaseDriver):
+class Create2Driver(LinkedDriver):
     """One robot at the end of a serial device.
 
     ``enable`` takes the robot into safe (or full) mode, ``disable`` into passive mode.  When the robot leaves safe
@@ -55,28 +55,18 @@ class Create2Driver(BaseDriver):
         clock: IReactorTime,
         dead_man: DeadMan | None = None,
     ) -> None:
-        super().__init__(described(options), name, clock, dead_man)
+        super().__init__(described(options), name, clock, connector, (options.port, options.baud), dead_man)
         self._options = options
-        self._connector = connector
-        self._line: Line | None = None
-        self._link: Link | None = None
-        self._reader = codec.StreamReader(IDS)
+        self._reader: codec.StreamReader = codec.StreamReader(IDS)
         self._odometry = Odometry()
-        self._timer: Any = None
         self._silence_s = SILENCE_S
         self._heard_at = self._watch_at = 0.0
         self._bytes_at_start = 0
         self._mode = ""
         self._event = ""
-        self._problem = ""
         self._docking: Deferred[Mapping[str, Value]] | None = None
-        self._dock_timer: Any = None
+        self._dock_timer = Timer(clock)
         self._counts |= {"safety_events": 0, "jumps": 0}
-
-    @property
-    def problem(self) -> str:
-        """What keeps the robot from being heard, and the remedy; empty where it is heard."""
-        return str(getattr(self._line, "problem", "")) or self._problem
 
     def invoke(self, name: str, **arguments: float | str) -> Deferred[Mapping[str, Value]]:
         """``dock``: seek the home base, until it charges; ``beep``: sound ``hz`` (32 to 12500) for ``s`` seconds."""
@@ -91,15 +81,11 @@ class Create2Driver(BaseDriver):
 
     # -- to the robot -----------------------------------------------------------------------------------------------
 
-    def _open(self) -> None:
-        self._line = self._connector.call(self._options.port, self._options.baud, self)
-
     def _close(self) -> Deferred[None]:
-        self._cancel_timer()
         self._end_docking(LinkLost(f"{self._name}: disconnected"))
         # Without a stop at the end the robot stays awake and drains its battery.
         self._send(codec.drive_direct(0, 0) + codec.pause(False) + bytes((codec.START, codec.STOP)))
-        return succeed(None) if self._line is None else self._line.hang_up()
+        return super()._close()
 
     def _power(self, on: bool) -> None:
         self._end_docking(NotEnabled("enable() or disable() came in between"))
@@ -135,15 +121,13 @@ class Create2Driver(BaseDriver):
         # The robot drives itself now, in passive mode; that is no safety event.
         self._wants_motors = False
         self._docking = Deferred(self._on_cancelled)
-        self._dock_timer = self._clock.callLater(DOCK_S, self._on_no_dock)
+        late = NoReply(f"{self._name} did not find its dock within {DOCK_S:g} s")
+        self._dock_timer.set(DOCK_S, self._end_docking, late)
         self._send(bytes((codec.DOCK,)))
         return self._docking
 
     def _on_cancelled(self, _docking: object) -> None:
         self._end_docking(None)
-
-    def _on_no_dock(self) -> None:
-        self._end_docking(NoReply(f"{self._name} did not find its dock within {DOCK_S:g} s"))
 
     def _on_docked(self) -> None:
         docking, self._docking = self._docking, None
@@ -156,8 +140,7 @@ class Create2Driver(BaseDriver):
         docking, self._docking = self._docking, None
         if docking is None:
             return False
-        if self._dock_timer.active():
-            self._dock_timer.cancel()
+        self._dock_timer.cancel()
         # While it docks it hears no wheel command: control is taken back, and given up at rest.
         self._send(bytes((codec.SAFE,)) + codec.drive_direct(0, 0) + bytes((codec.START,)))
         if error is not None:
@@ -177,10 +160,6 @@ class Create2Driver(BaseDriver):
         self._send(codec.song(0, [(note, round(float(seconds) * 64))]) + codec.play(0))
         return succeed({"beep.hz": 440.0 * 2.0 ** ((note - 69) / 12)})
 
-    def _send(self, data: bytes) -> None:
-        if self._link is not None:
-            self._link.send(data)
-
     # -- from the robot ---------------------------------------------------------------------------------------------
 
     def link_up(self, link: Link) -> None:
@@ -192,22 +171,12 @@ class Create2Driver(BaseDriver):
     def link_down(self) -> None:
         """Bring the motion to rest here; the robot goes on until it is told, if it can be; called by the line."""
         self._link = None
-        self._cancel_timer()
+        self._timer.cancel()
         self._end_docking(LinkLost(f"the link to {self._name} went away"))
         self._down()
 
-    def received(self, data: bytes) -> None:
-        """Take bytes from the robot; called by the line."""
-        self._counts["bytes"] += len(data)
-        bad = self._reader.bad_frames
-        for frame in self._reader.read(data):
-            if self._is_closed:
-                return
-            self._counts["frames"] += 1
-            self._on_frame(frame)
-        self._counts["bad_frames"] += self._reader.bad_frames - bad
-
-    def _on_frame(self, frame: Mapping[str, int]) -> None:
+    def _heard(self, frame: Mapping[str, int]) -> None:
+        self._counts["frames"] += 1
         mode, before = mode_of(frame), self._mode
         if mode in ARMED and not self._is_up:
             return  # it was said before the robot heard the start, which takes it into passive mode
@@ -248,7 +217,7 @@ class Create2Driver(BaseDriver):
         self._odometry.forget()
         self._mode = ""
         self._bytes_at_start = self._counts["bytes"]
-        self._timer = self._clock.callLater(SETTLE_S, self._ask)
+        self._timer.set(SETTLE_S, self._ask)
 
     def _ask(self) -> None:
         self._send(codec.stream(IDS))
@@ -257,7 +226,7 @@ class Create2Driver(BaseDriver):
 
     def _watch_in(self, seconds: float) -> None:
         self._watch_at = self._clock.seconds() + seconds
-        self._timer = self._clock.callLater(seconds, self._watch)
+        self._timer.set(seconds, self._watch)
 
     def _watch(self) -> None:
         now = self._clock.seconds()
@@ -277,16 +246,6 @@ class Create2Driver(BaseDriver):
         if self._is_up:
             self._down()
         self._start()
-
-    def _name_problem(self, problem: str) -> None:
-        if problem != self._problem:
-            self.log.warn("{robot}: {problem}", robot=self._name, problem=problem)
-        self._problem = problem
-
-    def _cancel_timer(self) -> None:
-        if self._timer is not None and self._timer.active():
-            self._timer.cancel()
-        self._timer = None
 
 
 def _is_between(value: float | str, low: float, high: float) -> bool:

@@ -7,6 +7,7 @@ import math
 MM_PER_COUNT = math.pi * 72.0 / 508.8
 WHEEL_BASE = 235.0
 """Millimetres from wheel to wheel."""
+BASE_M, STEP_M = WHEEL_BASE / 1000.0, MM_PER_COUNT / 1000.0
 WINDOW_S = 0.12
 """Speeds are means over so long: one count within one frame would be 30 mm/s."""
 TOP = 0.8
@@ -21,12 +22,10 @@ class Odometry:
     Lengths are metres, angles radians, counter-clockwise; the pose is 0 at first.
     """
 
-    def __init__(self, wheel_base: float = WHEEL_BASE, mm_per_count: float = MM_PER_COUNT) -> None:
+    def __init__(self) -> None:
         self.x = self.y = self.yaw = 0.0
         self.vx = self.wz = 0.0
         self.jumps = 0
-        self._base = wheel_base / 1000.0
-        self._step = mm_per_count / 1000.0
         self._last: tuple[int, int] | None = None
         self._trail: list[tuple[float, float, float]] = []
 
@@ -42,7 +41,7 @@ class Odometry:
         if before is None:
             self._trail = [(now, 0.0, 0.0)]
             return
-        left_m, right_m = (_signed(new - old) * self._step for new, old in zip((left, right), before, strict=True))
+        left_m, right_m = (_signed(new - old) * STEP_M for new, old in zip((left, right), before, strict=True))
         if max(abs(left_m), abs(right_m)) > TOP * (now - self._trail[-1][0]) + SLACK:
             self.jumps += 1
             self.forget()
@@ -55,10 +54,10 @@ class Odometry:
         span = now - self._trail[0][0]
         if span > 0.0:
             left_v, right_v = (sum(step[wheel] for step in self._trail[1:]) / span for wheel in (1, 2))
-            self.vx, self.wz = (left_v + right_v) / 2.0, (right_v - left_v) / self._base
+            self.vx, self.wz = (left_v + right_v) / 2.0, (right_v - left_v) / BASE_M
 
     def _move(self, left: float, right: float) -> None:
-        ahead, turn = (left + right) / 2.0, (right - left) / self._base
+        ahead, turn = (left + right) / 2.0, (right - left) / BASE_M
         # The chord of the arc that both wheels drew.
         chord = ahead if abs(turn) < 1e-9 else 2.0 * ahead / turn * math.sin(turn / 2.0)
         self.x += chord * math.cos(self.yaw + turn / 2.0)

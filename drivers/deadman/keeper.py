@@ -21,6 +21,7 @@ from zope.interface import implementer
 
 from drivers.deadman.process import CALL, GUARD, HEAD, LEAVE, REST, UNTIL, now
 from drivers.deadman.switch import DeadMan, LastWord
+from drivers.link import reactor_or_running
 
 PROGRAM = Path(__file__).resolve().with_name("process.py")
 LEAVE_S = 0.02
@@ -33,12 +34,12 @@ REAP_S, END_S = 0.01, 1.0
 log = Logger()
 
 
-def kept(robot: str, reactor: Any = None) -> DeadMan | None:
+def kept(robot: str) -> DeadMan | None:
     """A switch for ``robot``, or None, said once in the log, on a system where there can be none."""
     if os.name != "posix" or not hasattr(socket, "send_fds") or not sys.executable or not PROGRAM.exists():
         log.warn("{robot}: no dead man's switch on this system; when this node freezes, nobody halts it", robot=robot)
         return None
-    return Keeper(robot, reactor)
+    return Keeper(robot)
 
 
 @implementer(IReadDescriptor)
@@ -168,11 +169,7 @@ class Keeper:
 
     @property
     def _reactor(self) -> Any:
-        if self._given_reactor is None:
-            from twisted.internet import reactor as running
-
-            self._given_reactor = running
-        return self._given_reactor
+        return reactor_or_running(self._given_reactor)
 
     def _start(self) -> None:
         self._starting = None

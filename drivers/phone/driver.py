@@ -6,15 +6,13 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from twisted.internet.defer import Deferred, fail, succeed
+from twisted.internet.defer import Deferred, succeed
 from twisted.internet.interfaces import IReactorTime
 
-from drivers.base import BaseDriver
-from drivers.driver import Permit
-from drivers.errors import LinkLost
-from drivers.manifest import Manifest
+from drivers.base import SensingDriver
+from drivers.option import Manifest
 from drivers.phone.option import Options, checked, described
-from drivers.reading import Action, Description, Frame, Value
+from drivers.reading import Description, Frame, Value
 
 MANIFEST = Manifest()
 
@@ -22,11 +20,8 @@ SIGHT = ("target.bearing", "target.distance")
 """Where the phone's own page sees the red target: radians, left positive, and metres; NaN while it sees none."""
 
 
-class PhoneDriver(BaseDriver):
-    """One phone, whose page sends what it sees.
-
-    It has no motors: ``enable`` is always granted while looks come, and of actions there is only ``{}``.
-    """
+class PhoneDriver(SensingDriver):
+    """One phone, whose page sends what it sees."""
 
     STALE_S = 0.5
 
@@ -52,14 +47,6 @@ class PhoneDriver(BaseDriver):
 
     def _close(self) -> Deferred[None]:
         return succeed(None)
-
-    def _drive(self, motion: Action, permit: Permit) -> Action:
-        return motion  # whoever holds it moves it
-
-    def _switch(self, on: bool) -> Deferred[bool]:
-        if self.state == "stale":
-            return fail(LinkLost("the phone is stale; wait for its next look"))
-        return super()._switch(on)
 
 
 def make_driver(options: Mapping[str, object], name: str, clock: IReactorTime, connector: Any) -> PhoneDriver:

@@ -9,13 +9,18 @@ from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
 from twisted.internet.task import LoopingCall
 
-from drivers.pyro.device import Device
 from drivers.pyro.robot import PyroRobot
+
+SHORT_WAYS = (
+    *("move", "translate", "rotate", "motors", "stop", "update"),
+    *("getDevice", "startDevice", "removeDevice", "hasA", "requires"),
+)
 
 
 class Brain:
     """A brain: override ``setup``, ``step``, and ``destroy`` where there is something to give back."""
 
+    robot: PyroRobot
     pauseTime = 0.1
     """Seconds from step to step."""
 
@@ -24,15 +29,17 @@ class Brain:
         self.engine = engine
         self.stepCount = 0
         self.needToStop = self.needToQuit = 0
-        self._robot = None if engine is None else engine.robot
+        if engine is not None:
+            self.robot = engine.robot
         self.setup(**arguments)
 
-    @property
-    def robot(self) -> PyroRobot:
-        """The robot."""
-        if self._robot is None:
-            raise AttributeError(f"{self.name} was made without an engine, so it has no robot")
-        return self._robot
+    def __getattr__(self, name: str) -> Any:
+        """The short ways to the robot: ``self.move(0.5, 0.0)`` is ``self.robot.move(0.5, 0.0)``."""
+        if name == "robot":
+            raise AttributeError("this brain was made without an engine, so it has no robot")
+        if name not in SHORT_WAYS:
+            raise AttributeError(f"a brain has no {name}")
+        return getattr(self.robot, name)
 
     def setup(self, **arguments: Any) -> None:
         """Get ready."""
@@ -63,52 +70,6 @@ class Brain:
     def getRobot(self) -> PyroRobot:
         """As ``robot``."""
         return self.robot
-
-    # Short ways to the robot.
-
-    def move(self, translate: float, rotate: float) -> None:
-        """As the robot's."""
-        self.robot.move(translate, rotate)
-
-    def translate(self, share: float) -> None:
-        """As the robot's."""
-        self.robot.translate(share)
-
-    def rotate(self, share: float) -> None:
-        """As the robot's."""
-        self.robot.rotate(share)
-
-    def motors(self, left: float, right: float) -> None:
-        """As the robot's."""
-        self.robot.motors(left, right)
-
-    def stop(self) -> None:
-        """As the robot's."""
-        self.robot.stop()
-
-    def update(self) -> None:
-        """As the robot's."""
-        self.robot.update()
-
-    def getDevice(self, kind: str, index: int = 0) -> Device:
-        """As the robot's."""
-        return self.robot.getDevice(kind, index)
-
-    def startDevice(self, name: str, **options: object) -> Device:
-        """As the robot's."""
-        return self.robot.startDevice(name, **options)
-
-    def removeDevice(self, kind: str, index: int | None = None) -> None:
-        """As the robot's."""
-        self.robot.removeDevice(kind, index)
-
-    def hasA(self, kind: str) -> int:
-        """As the robot's."""
-        return self.robot.hasA(kind)
-
-    def requires(self, wanted: str | list[str]) -> int:
-        """As the robot's."""
-        return self.robot.requires(wanted)
 
 
 class Engine:

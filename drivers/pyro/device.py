@@ -1,12 +1,11 @@
-"""Device: what a robot senses, in the devices that brains know: range sensors, bumpers, a position, a battery."""
+"""Device: what a robot has, as brains know it: range sensors, bumpers, a position, a battery, a head."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
-from typing import overload
+from collections.abc import Callable, Iterator, Mapping
+from typing import NamedTuple, overload
 
-from drivers.pyro.sensorvalue import Geometry, SensorValue, unit_named
 from drivers.reading import Description, Value
 
 DIRECTIONS: Mapping[str, float] = {
@@ -15,6 +14,8 @@ DIRECTIONS: Mapping[str, float] = {
     **{"back_right": -135.0, "right": -90.0, "front_right": -45.0},
 }
 """Where a ranger of this name looks, in degrees; one of another name where its capability says ``NAME_deg``."""
+UNITS = ("ROBOTS", "METERS", "CM", "MM", "SCALED", "RAW")
+ALIASES = {"M": "METERS", "ROBOT": "ROBOTS"}
 ARC = math.radians(20.0)
 GROUPS: Mapping[str, tuple[float, float]] = {
     "front": (-22.5, 22.5),
@@ -33,6 +34,72 @@ GROUPS: Mapping[str, tuple[float, float]] = {
     "back-all": (112.5, 247.5),
 }
 """Degrees from the right edge of a group to its left edge."""
+
+
+class Geometry(NamedTuple):
+    """Where a sensor sits on the robot (metres), where it looks (radians, left positive), and how wide it sees."""
+
+    x: float
+    y: float
+    z: float
+    theta: float
+    arc: float
+
+
+class SensorValue:
+    """One reading: ``metres`` from the sensor; where nothing is in reach that is ``most``, the farthest it measures.
+
+    ``unit`` is the one of ``value``; ``radius`` is the robot's.  ``noise`` is 0: what is told is what was measured.
+    """
+
+    noise = 0.0
+
+    def __init__(
+        self, metres: float, most: float, pos: int, geometry: Geometry | None, radius: float, unit: str = "ROBOTS"
+    ) -> None:
+        self.rawValue = most if math.isnan(metres) else min(metres, most)
+        self.pos = pos
+        self.geometry = geometry
+        self._most = most
+        self._radius = radius
+        self._unit = unit
+
+    @property
+    def value(self) -> float:
+        """The distance in the device's unit."""
+        return self.distance()
+
+    def distance(self, unit: str | None = None) -> float:
+        """The distance in ``unit``: ``ROBOTS`` (robots' diameters), ``METERS``, ``CM``, ``MM``, ``SCALED``, ``RAW``."""
+        name = unit_named(unit or self._unit)
+        if name == "ROBOTS":
+            return self.rawValue / (2.0 * self._radius)
+        return self.rawValue * {"CM": 100.0, "MM": 1000.0, "SCALED": 1.0 / self._most}.get(name, 1.0)
+
+    def angle(self, unit: str = "degrees") -> float | None:
+        """Where it looks, left positive; None where nobody knows."""
+        if unit.lower() not in ("degrees", "radians"):
+            raise AttributeError(f"an angle is in degrees or radians, not in {unit!r}")
+        if self.geometry is None:
+            return None
+        return math.degrees(self.geometry.theta) if unit.lower() == "degrees" else self.geometry.theta
+
+    @property
+    def hit(self) -> tuple[float | None, float | None, float | None]:
+        """The point that it measured, in metres from the middle of the robot."""
+        if self.geometry is None:
+            return None, None, None
+        x, y, z, theta, _ = self.geometry
+        return x + self.rawValue * math.cos(theta), y + self.rawValue * math.sin(theta), z
+
+
+def unit_named(name: str) -> str:
+    """The unit called so; raises ``AttributeError``, which names those there are."""
+    upper = name.upper()
+    found = ALIASES.get(upper, upper)
+    if found not in UNITS:
+        raise AttributeError(f"no unit is called {name!r}; there are {', '.join(UNITS)}")
+    return found
 
 
 class Device:
@@ -183,6 +250,73 @@ class Battery(Device):
     def volts(self) -> float | None:
         """The voltage."""
         return _number(self.values.get("power.volts"))
+
+
+class Pose(NamedTuple):
+    """Pan (-1 to 1, left positive), tilt (-1 to 0, down negative), zoom (none), roll (0 to 1: the second tilt)."""
+
+    pan: float
+    tilt: float
+    zoom: float
+    roll: float
+
+
+AXES = {"pan": "pan", "tilt": "tilt", "roll": "nod"}
+"""What the brain calls it, and what the robot does."""
+
+
+class Ptz(Device):
+    """A head; ``look`` turns joints to radians, ``limits`` are those of the robot (``pan_min``, ``pan_max`` ...)."""
+
+    supports = ("pan", "tilt", "roll")
+
+    def __init__(self, look: Callable[[Mapping[str, float]], None], limits: Mapping[str, float | str]) -> None:
+        super().__init__("ptz")
+        self._look = look
+        self._limits = limits
+
+    def pan(self, share: float) -> None:
+        """Look to the left (to 1) or to the right (to -1)."""
+        self._turn(pan=share)
+
+    def tilt(self, share: float) -> None:
+        """Look down (to -1) or ahead (0)."""
+        self._turn(tilt=share)
+
+    def roll(self, share: float) -> None:
+        """Turn the second tilt."""
+        self._turn(roll=share)
+
+    def zoom(self, share: float) -> None:
+        """There is none."""
+
+    def center(self) -> None:
+        """Look ahead."""
+        self._turn(pan=0.0, tilt=0.0, roll=0.0)
+
+    def setPose(self, pan: float, tilt: float, zoom: float = 0.0, roll: float | None = None) -> None:
+        """Turn all at once; the zoom is ignored."""
+        self._turn(pan=pan, tilt=tilt, **({} if roll is None else {"roll": roll}))
+
+    @property
+    def pose(self) -> Pose:
+        """Where the robot says that it looks."""
+        told = {axis: self._share(joint, float(self.values.get(f"ptz.{joint}", 0.0))) for axis, joint in AXES.items()}
+        return Pose(told["pan"], told["tilt"], 0.0, told["roll"])
+
+    def _turn(self, **shares: float) -> None:
+        self._look({AXES[axis]: self._radians(AXES[axis], share) for axis, share in shares.items()})
+
+    def _radians(self, joint: str, share: float) -> float:
+        share = max(-1.0, min(1.0, share))
+        return share * self._limit(joint, "max") if share > 0.0 else -share * self._limit(joint, "min")
+
+    def _share(self, joint: str, radians: float) -> float:
+        limit = self._limit(joint, "max") if radians > 0.0 else -self._limit(joint, "min")
+        return max(-1.0, min(1.0, radians / limit)) if limit else 0.0
+
+    def _limit(self, joint: str, end: str) -> float:
+        return float(self._limits.get(f"{joint}_{end}", 0.0))
 
 
 def ranger_of(description: Description, values: Mapping[str, Value]) -> Rows | None:

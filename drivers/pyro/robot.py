@@ -21,8 +21,7 @@ from twisted.logger import Logger
 from drivers.driver import Driver, Permit
 from drivers.errors import NotEnabled, Unsupported, UsageError
 from drivers.pyro.camera import Camera
-from drivers.pyro.device import Battery, Device, Rows, bumper_of, ranger_of
-from drivers.pyro.ptz import Ptz
+from drivers.pyro.device import Battery, Device, Ptz, Rows, bumper_of, ranger_of
 from drivers.reading import Observation, Value
 
 TOKEN = 1

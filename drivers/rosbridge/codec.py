@@ -70,9 +70,9 @@ def twist(vx: float, vy: float, wz: float) -> dict[str, Any]:
     return {"linear": {"x": vx, "y": vy, "z": 0.0}, "angular": {"x": 0.0, "y": 0.0, "z": wz}}
 
 
-def twist_stamped(vx: float, vy: float, wz: float, frame: str = "base_link") -> dict[str, Any]:
+def twist_stamped(vx: float, vy: float, wz: float) -> dict[str, Any]:
     """geometry_msgs/TwistStamped of ROS 2; its stamp is 0, which bases read as "now": our clock is not theirs."""
-    return {"header": {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": frame}, "twist": twist(vx, vy, wz)}
+    return {"header": {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": "base_link"}, "twist": twist(vx, vy, wz)}
 
 
 # -- from the robot ---------------------------------------------------------------------------------------------------

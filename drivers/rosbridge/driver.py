@@ -17,12 +17,13 @@ from drivers.deadman.switch import DeadMan, LastWord
 from drivers.driver import Permit
 from drivers.errors import BadFrame, LinkLost, NoReply, RobotError
 from drivers.link import Connector, TcpConnector
-from drivers.manifest import Manifest
+from drivers.option import Manifest
 from drivers.reading import Action, Description, Frame, Value
 from drivers.rosbridge import codec
 from drivers.rosbridge.codec import Answered, Published, Status, decoded, encoded
 from drivers.rosbridge.link import Bridge
-from drivers.rosbridge.option import RATES, TYPES, Options, checked, described, sectors
+from drivers.rosbridge.option import RATES, SECTORS, TYPES, Options, checked, described
+from drivers.timer import Timer
 
 MANIFEST = Manifest()
 
@@ -58,7 +59,7 @@ class RosbridgeDriver(BaseDriver):
         super().__init__(described(self._options), name, clock, dead_man)
         self._bridge = Bridge(self, connector, clock, self._options.host, self._options.port, self._options.path)
         self._sources = {topic: source for source, topic in self._options.topics.items()}
-        self._sectors = sectors()
+        self._sectors = {name: (math.radians(middle), math.radians(width)) for name, (middle, width) in SECTORS.items()}
         self._told: dict[str, tuple[float, dict[str, Value]]] = {}
         self._frame: Frame | None = None
         self._t_robot = 0.0
@@ -66,8 +67,7 @@ class RosbridgeDriver(BaseDriver):
         self._is_stamped: bool | None = None
         self._was_stamped = False
         self._velocity = (0.0, 0.0, 0.0)
-        self._repeat: Any = None
-        self._settling: Any = None
+        self._repeat, self._settling = Timer(clock), Timer(clock)
         self._calls: dict[str, tuple[Deferred[Mapping[str, Any]], Any]] = {}
         self._number = 0
         self._warned: set[str] = set()
@@ -126,8 +126,8 @@ class RosbridgeDriver(BaseDriver):
     def _drive(self, motion: Action, permit: Permit) -> Action:
         self._velocity = (motion["base.vx"], motion.get("base.vy", 0.0), motion["base.wz"])
         self._say_velocity()
-        if self._repeat is None:
-            self._repeat = self._clock.callLater(REPEAT_S, self._on_repeat)
+        if not self._repeat.is_set:
+            self._repeat.set(REPEAT_S, self._on_repeat)
         return motion
 
     def _halt(self) -> None:
@@ -135,19 +135,16 @@ class RosbridgeDriver(BaseDriver):
         self._say_velocity()
 
     def _on_repeat(self) -> None:
-        self._repeat = None
         if not self._may_move:
             self.stop()
             return
-        self._repeat = self._clock.callLater(REPEAT_S, self._on_repeat)
+        self._repeat.set(REPEAT_S, self._on_repeat)
         if not self._bridge.is_busy:
             self._say_velocity()
 
     def _quiet(self) -> None:
         self._velocity = (0.0, 0.0, 0.0)
-        if self._repeat is not None:
-            self._repeat.cancel()
-        self._repeat = None
+        self._repeat.cancel()
 
     def _last_word(self) -> LastWord | None:
         link = self._bridge.link
@@ -203,7 +200,7 @@ class RosbridgeDriver(BaseDriver):
     def bridge_down(self) -> None:
         """Bring the motion to rest here, as the base should there; called by the bridge."""
         self._quiet()
-        self._stop_settling()
+        self._settling.cancel()
         self._is_stamped = None
         self._t_robot = 0.0
         self._fail_calls(LinkLost(f"the link to {self._name} went away"))
@@ -275,7 +272,7 @@ class RosbridgeDriver(BaseDriver):
         asked = self._call(TYPE_SERVICE, topic=self._options.velocity_topic)
         asked.addCallbacks(self._on_type, lambda _: None)
         if self._options.velocity_type == "auto":
-            self._settling = self._clock.callLater(ASK_S, self._on_no_type)
+            self._settling.set(ASK_S, self._on_no_type)
 
     def _on_type(self, values: Mapping[str, Any]) -> None:
         topic, found = self._options.velocity_topic, codec.brief(values.get("type", ""), 100)
@@ -284,16 +281,15 @@ class RosbridgeDriver(BaseDriver):
             if known is not None and known is not self._is_stamped:
                 self._on_other_type(known, found)
             return
-        self._stop_settling()
+        self._settling.cancel()
         if known is not None:
             self._settle(known)
             return
         # Nobody listens there yet, or somebody to something else; a base may still be starting.
         self._warn(f"{topic} is {found or 'listened to by nobody'}; is velocity_topic right? asking again")
-        self._settling = self._clock.callLater(ASK_S, self._ask_type)
+        self._settling.set(ASK_S, self._ask_type)
 
     def _on_no_type(self) -> None:
-        self._settling = None
         taken = "TwistStamped" if self._was_stamped else "Twist"
         self._warn(f"no rosapi says which type the velocity has: taking {taken}; velocity_type can say it")
         self._settle(self._was_stamped)
@@ -317,15 +313,8 @@ class RosbridgeDriver(BaseDriver):
         if self._is_up:
             self._guard()
 
-    def _stop_settling(self) -> None:
-        if self._settling is not None and self._settling.active():
-            self._settling.cancel()
-        self._settling = None
-
-    # -- inside -----------------------------------------------------------------------------------------------------
-
     def _fail_calls(self, error: Exception) -> None:
-        self._stop_settling()
+        self._settling.cancel()
         calls, self._calls = self._calls, {}
         for answered, timer in calls.values():
             timer.cancel()

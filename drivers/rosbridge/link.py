@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Protocol
 
 from twisted.internet.defer import Deferred, succeed
 from twisted.internet.interfaces import IReactorTime
@@ -11,6 +11,7 @@ from twisted.logger import Logger
 from drivers.base import heard_at
 from drivers.link import Connector, Line, Link
 from drivers.rosbridge.websocket import WebSocket
+from drivers.timer import Timer
 
 PING_S = 1.0
 SILENCE_S = 3.0
@@ -54,7 +55,7 @@ class Bridge:
         self._hold_s = FIRST_HOLD_S
         self._is_held = False
         self._hold_until = 0.0
-        self._timer: Any = None
+        self._timer = Timer(clock)
         self._told = ""
 
     @property
@@ -80,7 +81,7 @@ class Bridge:
         if self._is_up and self._link is not None:
             self._link.send(self._socket.closing())
         self._is_up, self._is_held = False, True
-        self._cancel()
+        self._timer.cancel()
         return succeed(None) if self._line is None else self._line.hang_up()
 
     def send(self, payload: bytes) -> None:
@@ -96,14 +97,14 @@ class Bridge:
         self._is_held = True
         wait = self._hold_until - self._clock.seconds()
         if wait > 0:
-            self._timer = self._clock.callLater(wait, self._greet, link)
+            self._timer.set(wait, self._greet, link)
         else:
             self._greet(link)
 
     def link_down(self) -> None:
         """Forget the link."""
         self._link = None
-        self._cancel()
+        self._timer.cancel()
         self._sink()
 
     def received(self, data: bytes) -> None:
@@ -128,8 +129,6 @@ class Bridge:
         if socket.fault and not self._is_held:
             self._on_fault(socket.fault)
 
-    # -- inside -----------------------------------------------------------------------------------------------------
-
     def _fresh(self) -> WebSocket:
         return WebSocket(f"{self._host}:{self._port}", self._path)
 
@@ -142,10 +141,9 @@ class Bridge:
 
     def _ping_later(self) -> None:
         self._ping_at = self._clock.seconds() + PING_S
-        self._timer = self._clock.callLater(PING_S, self._on_time)
+        self._timer.set(PING_S, self._on_time)
 
     def _on_time(self) -> None:
-        self._timer = None
         self._heard_at = heard_at(self._heard_at, self._ping_at, self._clock.seconds())
         if self._clock.seconds() - self._heard_at > SILENCE_S:
             self._on_fault(f"nothing whole was heard for {SILENCE_S:g} s")
@@ -161,10 +159,10 @@ class Bridge:
             self.log.warn("rosbridge at {host}:{port}: {reason}", host=self._host, port=self._port, reason=reason)
         self._told = reason
         self._is_held = True
-        self._cancel()
+        self._timer.cancel()
         self._sink()
         if self._link is not None:
-            self._timer = self._clock.callLater(self._hold_s, self._link.close)
+            self._timer.set(self._hold_s, self._link.close)
             self._hold_until = self._clock.seconds() + self._hold_s
             self._hold_s = min(2 * self._hold_s, LAST_HOLD_S)
 
@@ -176,8 +174,3 @@ class Bridge:
         was_up, self._is_up = self._is_up, False
         if was_up:
             self._owner.bridge_down()
-
-    def _cancel(self) -> None:
-        if self._timer is not None and self._timer.active():
-            self._timer.cancel()
-        self._timer = None

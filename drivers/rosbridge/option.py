@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
@@ -132,8 +131,3 @@ def described(options: Options) -> Description:
     return Description(
         "rosbridge", options.model, capabilities, limits, options.radius, rates, tuple(sorted(options.services))
     )
-
-
-def sectors() -> dict[str, tuple[float, float]]:
-    """``SECTORS`` in rad."""
-    return {name: (math.radians(middle), math.radians(width)) for name, (middle, width) in SECTORS.items()}

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
 
-from twisted.internet.defer import Deferred, succeed
 from twisted.internet.interfaces import IReactorTime
 
-from drivers.base import BaseDriver
+from drivers.base import LinkedDriver
 from drivers.driver import Permit
 from drivers.errors import Unsupported
-from drivers.link import Connector, Line, Link, TcpConnector
-from drivers.manifest import Manifest
+from drivers.link import Connector, Link, TcpConnector
+from drivers.option import Manifest
 from drivers.reading import Action, Description, Frame
 from drivers.sim.codec import (
     VERSION,
@@ -36,7 +34,7 @@ MANIFEST = Manifest()
 ALIVE_S = 0.5
 
 
-class SimDriver(BaseDriver):
+class SimDriver(LinkedDriver):
     """One dog of the yard, through links that ``connector`` opens.
 
     After ``connect`` the motors are off and ``estop.engaged`` is true until ``enable``.  ``connect`` fails with
@@ -46,13 +44,9 @@ class SimDriver(BaseDriver):
 
     def __init__(self, options: Options | Mapping[str, object], connector: Connector, clock: IReactorTime) -> None:
         self._options = options if isinstance(options, Options) else checked(options)
-        super().__init__(described(self._options), self._options.robot, clock)
-        self._connector = connector
-        self._line: Line | None = None
-        self._link: Link | None = None
-        self._reader = FrameReader()
+        place = (self._options.host, self._options.port)
+        super().__init__(described(self._options), self._options.robot, clock, connector, place)
         self._has_problem = False
-        self._alive: Any = None
         self._frame: Frame | None = None
 
     @property
@@ -63,30 +57,23 @@ class SimDriver(BaseDriver):
     def set_camera_fps(self, fps: float) -> None:
         """Ask the camera for so many pictures a second from now on; 0: none."""
         self._options = replace(self._options, camera_fps=fps)
-        self._send(Hello(VERSION, self._options.robot, self._options.wanted_fps))
+        self._say(Hello(VERSION, self._options.robot, self._options.wanted_fps))
 
     # -- to the yard ------------------------------------------------------------------------------------------------
 
-    def _open(self) -> None:
-        self._line = self._connector.call(self._options.host, self._options.port, self)
-
-    def _close(self) -> Deferred[None]:
-        self._stop_alive()
-        return succeed(None) if self._line is None else self._line.hang_up()
-
     def _power(self, on: bool) -> None:
-        self._send(Motors(on))
+        self._say(Motors(on))
 
     def _drive(self, motion: Action, permit: Permit) -> Action:
         now, newest = self._clock.seconds(), self._newest
         assert newest is not None  # nothing is driven before
         sent = newest.t_robot + (now - newest.t_host)
         vx, vy, wz = motion["base.vx"], motion["base.vy"], motion["base.wz"]
-        self._send(Drive(vx, vy, wz, permit.token, permit.deadline - now, sent))
+        self._say(Drive(vx, vy, wz, permit.token, permit.deadline - now, sent))
         return motion
 
     def _halt(self) -> None:
-        self._send(Halt())
+        self._say(Halt())
 
     # -- from the yard ----------------------------------------------------------------------------------------------
 
@@ -94,28 +81,18 @@ class SimDriver(BaseDriver):
         """Ask the yard for the robot; called by the line."""
         self._link = link
         self._reader = FrameReader()
-        self._send(Hello(VERSION, self._options.robot, self._options.wanted_fps))
+        self._say(Hello(VERSION, self._options.robot, self._options.wanted_fps))
         self._up()
         self._keep_alive()
 
     def link_down(self) -> None:
         """Bring the motion to rest here, as the yard does there; called by the line."""
         self._link = None
-        self._stop_alive()
+        self._timer.cancel()
         self._down()
 
-    def received(self, data: bytes) -> None:
-        """Take bytes from the yard; called by the line."""
-        self._counts["bytes"] += len(data)
-        bad = self._reader.bad_frames
-        for message in self._reader.read(data):
-            if self._is_closed:
-                return
-            self._counts["frames"] += 1
-            self._on_message(message)
-        self._counts["bad_frames"] += self._reader.bad_frames - bad
-
-    def _on_message(self, message: Message) -> None:
+    def _heard(self, message: Message) -> None:
+        self._counts["frames"] += 1
         match message:
             case Sensors():
                 self._gate.learn(message.token)
@@ -138,18 +115,12 @@ class SimDriver(BaseDriver):
             self.log.warn("yard: {reason}; asking again", reason=message.reason)
         self._has_problem = True
 
-    def _send(self, message: Message) -> None:
-        if self._link is not None:
-            self._link.send(encoded(message))
+    def _say(self, message: Message) -> None:
+        self._send(encoded(message))
 
     def _keep_alive(self) -> None:
-        self._send(Alive())
-        self._alive = self._clock.callLater(ALIVE_S, self._keep_alive)
-
-    def _stop_alive(self) -> None:
-        if self._alive is not None and self._alive.active():
-            self._alive.cancel()
-        self._alive = None
+        self._say(Alive())
+        self._timer.set(ALIVE_S, self._keep_alive)
 
 
 def make_driver(

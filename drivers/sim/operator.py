@@ -15,6 +15,7 @@ from drivers.reading import Value
 from drivers.sim.codec import VERSION, Alive, Done, FrameReader, Order, Overlook, Truth, encoded
 from drivers.sim.option import DEFAULT_PORT
 from drivers.subscribers import Subscribers
+from drivers.timer import Timer
 
 REPLY_S = 2.0
 ALIVE_S = 0.5
@@ -51,7 +52,7 @@ class YardOperator:
         self._reader = FrameReader()
         self._snapshot: Snapshot | None = None
         self._connecting: Deferred[Snapshot] | None = None
-        self._alive: Any = None
+        self._alive = Timer(clock)
         self._seen = Subscribers[Snapshot]("the yard", self.log)
         self._orders: dict[int, tuple[Deferred[bool], Any]] = {}
         self._number = 0
@@ -125,9 +126,7 @@ class YardOperator:
         """Forget what is old; called by the line."""
         self._link = None
         self._snapshot = None
-        if self._alive is not None:
-            self._alive.cancel()
-            self._alive = None
+        self._alive.cancel()
         for number in list(self._orders):
             self._settle(number, LinkLost("the link to the yard went away"))
 
@@ -149,7 +148,7 @@ class YardOperator:
     def _keep_alive(self) -> None:
         if self._link is not None:
             self._link.send(encoded(Alive()))
-            self._alive = self._clock.callLater(ALIVE_S, self._keep_alive)
+            self._alive.set(ALIVE_S, self._keep_alive)
 
     def _order(self, verb: str, *arguments: Value) -> Deferred[bool]:
         if self._link is None:

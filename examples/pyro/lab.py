@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import random
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 from twisted.internet.defer import Deferred
@@ -15,10 +15,10 @@ from drivers.driver import Driver
 from drivers.errors import UsageError
 from drivers.pyro.brain import Brain, Engine
 from drivers.pyro.robot import PyroRobot
-from drivers.reading import Value
 from drivers.registry import driver_for, kinds
 from sim.robots.camera import Camera
 from sim.robots.emulator.aibo_dog import AiboEmulator
+from sim.robots.emulator.dog import DogBody
 from sim.robots.scene import loaded
 from sim.robots.sensor import Sensors
 from sim.robots.world import SUBSTEP, World
@@ -35,9 +35,10 @@ class Pen:
         self.world.place_target_at_random()
         self.dog = self.world.dogs["dog1"]
         self._senses = Sensors(random.Random(seed + 1), self.world, self.dog)
-        self._camera = Camera(random.Random(seed + 2), self.world)
+        camera = Camera(random.Random(seed + 2), self.world)
         self._clock = clock
-        self._emulator = AiboEmulator(clock, self, random.Random(seed + 3))
+        body = DogBody(self.world, self.dog, self._senses, camera)
+        self._emulator = AiboEmulator(clock, body, random.Random(seed + 3))
         self._loop = LoopingCall.withCount(self._turn)
         self._loop.clock = clock
 
@@ -54,24 +55,6 @@ class Pen:
     def driver(self) -> Driver:
         """A driver of the dog, joined through memory."""
         return driver_for("aibo", {"host": "pen"}, "pen", self._clock, self._emulator.connector())
-
-    # What the emulator moves and senses.
-
-    def drive(self, vx: float, vy: float, wz: float) -> None:
-        """Walk like this."""
-        self.world.drive("dog1", vx, vy, wz)
-
-    def halt(self) -> None:
-        """Stand still."""
-        self.world.halt("dog1")
-
-    def sense(self) -> Mapping[str, Value]:
-        """What the dog feels."""
-        return self._senses.values()
-
-    def picture(self, is_halved: bool = False) -> bytes | None:
-        """What it sees."""
-        return self._camera.jpeg(self.dog, is_halved)
 
     def _turn(self, count: int) -> None:
         for _ in range(min(count, 100) * STEPS):

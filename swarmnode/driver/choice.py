@@ -26,20 +26,17 @@ class Choice:
 
     def driver(self, clock: Any, connector: Any) -> Any:
         """A driver of it that is not connected; raises ``UsageError``."""
-        return driver_for(self.kind, self.options, self.name, clock, connector, **self._more())
+        return driver_for(self.kind, self.options, self.name, clock, connector, self.parts)
 
     def description(self) -> Description:
         """What it is; raises ``UsageError``."""
         try:
-            return describe(self.kind, self.options, self.name, **self._more())
+            return describe(self.kind, self.options, self.name, self.parts)
         except UsageError:
             example = manifest_of(self.kind).example
             if self.options or not example:
                 raise
-            return describe(self.kind, example, self.name, **self._more())
-
-    def _more(self) -> dict[str, Any]:
-        return {"parts": self.parts} if self.parts else {}
+            return describe(self.kind, example, self.name, self.parts)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -7,19 +7,22 @@ import json
 import math
 import sys
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TextIO
 
+from drivers.driver import Driver
 from drivers.errors import DriverError
 from middleware.entangled.control.word import printable
 from middleware.errors import BadSetting
 from swarmnode.driver.choice import Choice, add_arguments, chosen, meant
-from swarmnode.driver.ground import Ground, RealGround
+from swarmnode.driver.ground import Ear, Ground, RealGround
 
 FAILED, WRONG = 1, 2
 """Exit codes: the robot is not there or not well; the command is wrong."""
 
 Say = Callable[[Iterable[str]], None]
+Problems = Callable[[], list[str]]
 
 
 def parser() -> argparse.ArgumentParser:
@@ -66,94 +69,84 @@ def main(words: Sequence[str] | None = None, out: TextIO | None = None, ground: 
         choice = chosen(wishes)
         if choice is None:
             return _candidates(wishes, say)
-        return {"probe": _probe, "drive": _drive, "monitor": _monitor}[wishes.verb](wishes, choice, ground, say)
+        return _run(wishes, choice, ground, say)
     except (DriverError, BadSetting) as problem:
         sys.stderr.write(f"swarm driver {wishes.verb}: {printable(str(problem))}\n")
         return WRONG
 
 
 def _list(wishes: argparse.Namespace, say: Say) -> int:
-    from dataclasses import asdict
-
-    from swarmnode.driver.catalogue import catalogue, lines
+    from swarmnode.driver.catalogue import catalogue, catalogue_lines
 
     entries = catalogue()
-    say([json.dumps([asdict(entry) for entry in entries])] if wishes.json else lines(entries))
+    say([json.dumps([asdict(entry) for entry in entries])] if wishes.json else catalogue_lines(entries))
     return 0
 
 
 def _info(wishes: argparse.Namespace, say: Say) -> int:
-    from swarmnode.driver.sheet import as_data, lines
+    from swarmnode.driver.sheet import lines
 
     body = meant(wishes.robot, wishes).description()
-    say([json.dumps(as_data(body))] if wishes.json else lines(body))
+    say([json.dumps(asdict(body))] if wishes.json else lines(body))
     return 0
 
 
 def _candidates(wishes: argparse.Namespace, say: Say) -> int:
-    from dataclasses import asdict
-
-    from swarmnode.driver.candidate import candidates, lines
+    from swarmnode.driver.catalogue import candidate_lines, candidates
 
     found = candidates()
     if wishes.verb != "probe":
         sys.stderr.write(f"swarm driver {wishes.verb}: name the robot by --kind and --option, or by --config\n")
         return WRONG
-    say([json.dumps([asdict(each) for each in found])] if wishes.json else lines(found))
+    say([json.dumps([asdict(each) for each in found])] if wishes.json else candidate_lines(found))
     return 0 if found else FAILED
 
 
-def _probe(wishes: argparse.Namespace, choice: Choice, ground: Ground, say: Say) -> int:
-    from swarmnode.driver.probe import Probe, lines
-    from swarmnode.driver.witness import Ear
-
-    connector, problems = ground.connector(False)
+def _run(wishes: argparse.Namespace, choice: Choice, ground: Ground, say: Say) -> int:
+    """Make a driver of the robot, and probe, drive or monitor it."""
+    connector, of_links = ground.connector(wishes.verb == "drive")
     driver = choice.driver(ground.clock, connector)
     ear = Ear()
+
+    def problems() -> list[str]:
+        return [*of_links(), *ear.heard]
+
     try:
-        probe = Probe(driver, ground.clock, wishes.seconds, lambda: [*problems(), *ear.heard])
-        finding = ground.run(probe.start, probe.end)
+        return {"probe": _probe, "drive": _drive, "monitor": _monitor}[wishes.verb](
+            wishes, driver, ground, say, problems
+        )
     finally:
         ear.close()
+
+
+def _probe(wishes: argparse.Namespace, driver: Driver, ground: Ground, say: Say, problems: Problems) -> int:
+    from swarmnode.driver.probe import Probe, lines
+
+    probe = Probe(driver, ground.clock, wishes.seconds, problems)
+    finding = ground.run(probe.start, probe.end)
     say([json.dumps(finding.as_data())] if wishes.json else lines(finding))
     return 0 if finding.is_there else FAILED
 
 
-def _drive(wishes: argparse.Namespace, choice: Choice, ground: Ground, say: Say) -> int:
+def _drive(wishes: argparse.Namespace, driver: Driver, ground: Ground, say: Say, problems: Problems) -> int:
     from swarmnode.driver.drive import Drive
-    from swarmnode.driver.witness import Ear
 
-    connector, problems = ground.connector(True)
-    driver = choice.driver(ground.clock, connector)
     if not driver.description.limits:
         sys.stderr.write(f"swarm driver drive: a {driver.description.kind} does not move; look at it by monitor\n")
         return WRONG
     terminal = ground.terminal()
-    ear = Ear()
     try:
-        drive = Drive(driver, ground.clock, terminal, lambda: [*problems(), *ear.heard])
+        drive = Drive(driver, ground.clock, terminal, problems)
         return int(ground.run(drive.start, drive.end))
     finally:
         terminal.close()
-        ear.close()
 
 
-def _monitor(wishes: argparse.Namespace, choice: Choice, ground: Ground, say: Say) -> int:
+def _monitor(wishes: argparse.Namespace, driver: Driver, ground: Ground, say: Say, problems: Problems) -> int:
     from swarmnode.driver.monitor import Monitor
-    from swarmnode.driver.witness import Ear
 
-    connector, problems = ground.connector(False)
-    driver = choice.driver(ground.clock, connector)
-    ear = Ear()
-
-    def told() -> list[str]:
-        return [*problems(), *ear.heard]
-
-    try:
-        monitor = Monitor(driver, ground.clock, say, wishes.seconds, wishes.picture, wishes.json, told)
-        return int(ground.run(monitor.start, monitor.end))
-    finally:
-        ear.close()
+    monitor = Monitor(driver, ground.clock, say, wishes.seconds, wishes.picture, wishes.json, problems)
+    return int(ground.run(monitor.start, monitor.end))
 
 
 def _seconds(text: str) -> Any:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Protocol
 
 from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
@@ -12,6 +12,7 @@ from twisted.python.failure import Failure
 
 from drivers.driver import Driver
 from drivers.reading import Observation
+from drivers.timer import Timer
 from swarmnode.driver.pilot import HELP, KEY_S, Pilot
 from swarmnode.driver.probe import PATIENCE_S
 
@@ -50,7 +51,7 @@ class Drive:
         self._told: set[str] = set()
         self._began = clock.seconds()
         self._line_at = -math.inf
-        self._timer: Any = None
+        self._timer = Timer(clock)
         self._is_over = False
         self._ended: Deferred[int] = Deferred()
 
@@ -68,8 +69,7 @@ class Drive:
         """End: stand still, motors off, let go."""
         if not self._is_over:
             self._is_over = True
-            if self._timer is not None and self._timer.active():
-                self._timer.cancel()
+            self._timer.cancel()
             self.pilot.rest()
             leaving = self._driver.disable() if self._driver.state == "ready" else self._driver.disconnect()
             leaving.addErrback(lambda _: None)
@@ -106,7 +106,7 @@ class Drive:
         self._show()
 
     def _on_tick(self) -> None:
-        self._timer = self._clock.callLater(TICK_S, self._on_tick)
+        self._timer.set(TICK_S, self._on_tick)
         self.pilot.tick(self._clock.seconds())
         if self._clock.seconds() - self._line_at > LINE_S - 1e-9:
             self._show()

@@ -15,8 +15,9 @@ from twisted.python.failure import Failure
 
 from drivers.driver import Driver
 from drivers.reading import Frame, Observation
+from drivers.timer import Timer
 from swarmnode.driver.probe import PATIENCE_S
-from swarmnode.driver.unit import shown
+from swarmnode.driver.sheet import plain, shown
 
 SHOW_S = 1.0
 """How often the readings are shown, and a picture saved."""
@@ -50,7 +51,7 @@ class Monitor:
         self._saved = -1
         self._began = clock.seconds()
         self._first_at: float | None = None
-        self._timer: Any = None
+        self._timer = Timer(clock)
         self._is_over = False
         self._ended: Deferred[int] = Deferred()
 
@@ -65,8 +66,7 @@ class Monitor:
         """End, and let the robot go."""
         if not self._is_over:
             self._is_over = True
-            if self._timer is not None and self._timer.active():
-                self._timer.cancel()
+            self._timer.cancel()
             newest = self._driver.observe()
             if newest is None:
                 self.code = 1
@@ -99,7 +99,7 @@ class Monitor:
             if self._is_over or now - self._first_at >= self._seconds - 1e-9:
                 self.end()
                 return
-        self._timer = self._clock.callLater(0.1 if newest is None else SHOW_S, self._on_time)
+        self._timer.set(0.1 if newest is None else SHOW_S, self._on_time)
 
     def _readings(self, newest: Observation, now: float) -> Iterator[str]:
         if self._is_json:
@@ -141,11 +141,8 @@ def readings(state: str, newest: Observation, counts: dict[str, float], now: flo
 
 def as_data(state: str, newest: Observation, now: float) -> dict[str, Any]:
     """An observation as plain data, for JSON; a number that is none is None."""
-    values = {
-        key: None if isinstance(value, float) and not math.isfinite(value) else value
-        for key, value in newest.values.items()
-    }
-    told: dict[str, Any] = {"state": state, "age": now - newest.t_host, "t_robot": newest.t_robot, "values": values}
+    told: dict[str, Any] = {"state": state, "age": now - newest.t_host, "t_robot": newest.t_robot}
+    told["values"] = plain(newest.values)
     if newest.frame is not None:
         told["picture"] = {"seq": newest.frame.seq, "width": newest.frame.width, "height": newest.frame.height}
     return told

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -12,8 +11,9 @@ from twisted.internet.interfaces import IReactorTime
 from twisted.python.failure import Failure
 
 from drivers.driver import Driver
-from drivers.reading import Frame, Observation, Value
-from swarmnode.driver.unit import shown
+from drivers.reading import Observation, Value
+from drivers.timer import Timer
+from swarmnode.driver.sheet import plain, shown
 
 PATIENCE_S = 8.0
 """A robot that has not been seen after so long is given up; the slowest to say what is wrong is the AIBO, after 5 s."""
@@ -62,43 +62,32 @@ class Finding:
     def as_data(self) -> dict[str, Any]:
         """As plain data, for JSON; a number that is none is None."""
         told = {**asdict(self), "is_there": self.is_there}
-        for name in ("readings", "counts"):
-            told[name] = {
-                key: None if isinstance(value, float) and not math.isfinite(value) else value
-                for key, value in told[name].items()
-            }
-        return told
+        return told | {"readings": plain(self.readings), "counts": plain(self.counts)}
 
 
 class Probe:
     """One probe of ``driver``, which is disconnected at its end; ``problems`` are asked for what is wrong."""
 
     def __init__(
-        self,
-        driver: Driver,
-        clock: IReactorTime,
-        seconds: float,
-        problems: Callable[[], Sequence[str]],
-        patience: float = PATIENCE_S,
+        self, driver: Driver, clock: IReactorTime, seconds: float, problems: Callable[[], Sequence[str]]
     ) -> None:
         self._driver = driver
         self._clock = clock
         self._seconds = seconds
         self._problems = problems
-        self._patience = patience
         self._began = clock.seconds()
         self._first: float | None = None
         self._seen = 0
         self._pictures: set[int] = set()
         self._keys: dict[str, None] = {}
         self._refusal = ""
-        self._timer: Any = None
+        self._timer = Timer(clock)
         self._is_over = False
         self._found: Deferred[Finding] = Deferred()
 
     def start(self) -> Deferred[Finding]:
         """Begin; fires with what was found, and does not fail."""
-        self._timer = self._clock.callLater(min(SURE_S, self._patience), self._on_doubt)
+        self._timer.set(SURE_S, self._on_doubt)
         self._driver.subscribe(self._on_observation)
         self._driver.connect().addCallbacks(self._on_connected, self._on_refused)
         return self._found
@@ -107,8 +96,7 @@ class Probe:
         """End now, with what came so far; fires when the robot is let go."""
         if not self._is_over:
             self._is_over = True
-            if self._timer is not None and self._timer.active():
-                self._timer.cancel()
+            self._timer.cancel()
             finding = self._finding()
             self._driver.disconnect().addBoth(lambda _: self._found.callback(finding))
         return self._found
@@ -117,15 +105,13 @@ class Probe:
         self._first = self._clock.seconds() - self._began
         self._seen = 0
         self._pictures.clear()
-        if self._timer.active():
-            self._timer.cancel()
-        self._timer = self._clock.callLater(self._seconds, self.end)
+        self._timer.set(self._seconds, self.end)
 
     def _on_doubt(self) -> None:
         if self._problems():
             self.end()
         else:
-            self._timer = self._clock.callLater(max(0.0, self._patience - SURE_S), self.end)
+            self._timer.set(PATIENCE_S - SURE_S, self.end)
 
     def _on_refused(self, failure: Failure) -> None:
         if not self._is_over:
@@ -144,9 +130,10 @@ class Probe:
         rate = self._seen / lasted if self._first is not None and lasted > 0 else 0.0
         promised = body.rates.get("state", max(body.rates.values(), default=0.0))
         values = {} if newest is None else newest.values
+        frame = None if newest is None else newest.frame
         problems = [*([self._refusal] if self._refusal else []), *self._problems()]
         if self._first is None and not problems:
-            problems.append(f"nothing came within {self._patience:g} s; is it switched on, and do the options fit?")
+            problems.append(f"nothing came within {PATIENCE_S:g} s; is it switched on, and do the options fit?")
         if self._first is not None and rate < SLOW * promised:
             problems.append(f"it is slow: {rate:.1f} of {promised:g} observations a second; is it far, or busy?")
         if "camera" in body.capabilities and self._first is not None and not self._pictures:
@@ -159,7 +146,7 @@ class Probe:
             promised=promised,
             keys=tuple(sorted(self._keys)),
             readings={key: values[key] for key in TOLD if key in values},
-            picture="" if newest is None or newest.frame is None else _size(newest.frame),
+            picture="" if frame is None else f"{frame.width} x {frame.height} {frame.encoding}",
             pictures=len(self._pictures) / lasted if lasted > 0 else 0.0,
             counts=self._driver.diagnostics(),
             problems=tuple(dict.fromkeys(problems)),
@@ -184,7 +171,3 @@ def lines(finding: Finding) -> Iterator[str]:
         yield f"  senses        {' '.join(finding.keys) or 'nothing but pictures'}"
     for problem in finding.problems:
         yield f"  ! {problem}"
-
-
-def _size(frame: Frame) -> str:
-    return f"{frame.width} x {frame.height} {frame.encoding}"

@@ -33,7 +33,7 @@ LOADERS = {
     # Named by the settings of the node's owner, or by a table in the tree.
     "swarmnode.sandbox",
     *("agents.behaviour", "agents.registry", "drivers.registry", "middleware.consensus.servant"),
-    *("middleware.consensus.strategy", "swarmnode.driver.catalogue", "swarmnode.command", "drivers.foreign"),
+    *("middleware.consensus.strategy", "swarmnode.driver.catalogue", "swarmnode.command"),
     "webnode.routes.table",
 }
 HOOKS = {("middleware.entangled.wire.message", hook) for hook in ("ext_hook", "object_hook")}

@@ -1,72 +1,107 @@
-"""The conformance suite on the drivers here: the test case is the bench, and has some words of its own."""
+"""The robots of memory that the tests of drivers use; with ``Conformance`` a test case of them is the bench."""
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from typing import Any
 
 from twisted.internet.task import Clock
+from twisted.trial.unittest import SynchronousTestCase
 
-from drivers.conformance import Conformance
-from drivers.driver import Driver, Permit
+from drivers.driver import Permit
+from drivers.reading import Observation
+from drivers.registry import driver_for
 from sim.robots.emulator.body import MemoryBody
 
-if TYPE_CHECKING:
-    from twisted.trial.unittest import SynchronousTestCase as _Case
-else:
-    _Case = object
+
+class KeptLink:
+    """A link that keeps what is sent."""
+
+    def __init__(self) -> None:
+        self.said = b""
+        self.is_busy = False
+        self.is_closed = False
+
+    def send(self, data: bytes) -> None:
+        self.said += data
+
+    def close(self) -> None:
+        self.is_closed = True
 
 
-class SensingContract(Conformance, _Case):
-    """Conformance of any driver; whoever mixes it in says how one is made and how time passes."""
+class KeptLog:
+    """A log that keeps its warnings and errors."""
 
-    def make_driver(self) -> Driver:
-        """A fresh driver that is not connected."""
-        raise NotImplementedError
+    def __init__(self) -> None:
+        self.lines: list[str] = []
 
-    def pass_time(self, seconds: float) -> None:
-        """Let time pass for driver and robot."""
-        raise NotImplementedError
+    def warn(self, form: str, **values: object) -> None:
+        self.lines.append(form.format(**values))
 
-    def now(self) -> float:
-        """The driver's clock."""
-        raise NotImplementedError
+    error = warn
 
-    def true_speed(self) -> float:
-        """How fast the robot really moves, in m/s; those that move say it."""
-        raise NotImplementedError
+    def debug(self, form: str, **values: object) -> None:
+        """Leave it out."""
 
-    def cut_link(self) -> None:
-        """Break the link as a lost network does; those that have one do it."""
-        raise NotImplementedError
+    info = debug
 
-    def ready(self) -> Driver:
-        """A driver that is connected and enabled."""
-        driver = self.make_driver()
+
+class RobotCase(SynchronousTestCase):
+    """A robot of memory, its drivers, and a clock that is turned by hand; at the end nothing is left on the clock."""
+
+    STEP_S = 0.005
+    END_S = 0.1
+    """How long the robot may go on after its drivers have left."""
+    kind = ""
+    options: Mapping[str, object] = {}
+    robot: Any = None
+    connector: Any = None
+
+    def setUp(self) -> None:
+        """A body on an endless floor, and the robot that moves it."""
+        self.clock = Clock()
+        self.body = MemoryBody()
+        self.drivers: list[Any] = []
+        self.build()
+
+    def build(self) -> None:
+        """Make ``robot`` and ``connector``."""
+
+    def tearDown(self) -> None:
+        """Let all drivers go, and switch the robot off."""
+        for driver in self.drivers:
+            driver.disconnect()
+        self.pass_time(self.END_S)
+        if self.robot is not None:
+            self.robot.stop()
+        self.pass_time(self.END_S)
+        self.assertEqual(self.clock.getDelayedCalls(), [])
+
+    def make_driver(self, **options: object) -> Any:
+        """A fresh driver that is not connected, as the registry makes it."""
+        driver = driver_for(self.kind, {**self.options, **options}, "robot", self.clock, self.connector)
+        self.drivers.append(driver)
+        return driver
+
+    def connected(self, settle: float = 0.3, **options: object) -> Any:
+        driver = self.make_driver(**options)
         connected = driver.connect()
-        self.pass_time(0.3)
+        self.pass_time(settle)
         self.successResultOf(connected)
+        return driver
+
+    def ready(self, settle: float = 0.3, **options: object) -> Any:
+        """A driver that is connected and enabled."""
+        driver = self.connected(settle, **options)
         enabled = driver.enable()
-        self.pass_time(0.3)
+        self.pass_time(settle)
         self.assertIs(self.successResultOf(enabled), True)
         return driver
 
     def permit(self, token: int = 1, seconds: float = 0.5) -> Permit:
         """A permit that holds for some seconds from now."""
         return Permit(token, self.now() + seconds)
-
-
-class DriverContract(SensingContract):
-    """Conformance of a driver whose robot moves."""
-
-
-class BodyContract(DriverContract):
-    """Conformance of a driver whose robot is an emulator over a ``MemoryBody``, both on one turned clock."""
-
-    STEP_S = 0.005
-    clock: Clock
-    body: MemoryBody
-    connector: Any
 
     def pass_time(self, seconds: float) -> None:
         """Turn the clock, and let the body move."""
@@ -75,13 +110,26 @@ class BodyContract(DriverContract):
             self.clock.advance(self.STEP_S)
 
     def now(self) -> float:
-        """The turned clock."""
         return self.clock.seconds()
 
     def true_speed(self) -> float:
-        """What the body really does."""
         return math.hypot(*self.body.motion[:2])
 
     def cut_link(self) -> None:
-        """Break the link, or pull the cable and plug it in again."""
+        """Break the link; it can be opened again."""
+        if self.connector is None:
+            raise NotImplementedError
         self.connector.cut()
+
+    def newest(self, driver: Any) -> Observation:
+        seen: Observation | None = driver.observe()
+        assert seen is not None
+        return seen
+
+    def value(self, driver: Any, key: str) -> Any:
+        """A value of the newest observation; None where it is not told."""
+        return self.newest(driver).values.get(key)
+
+    def near(self, value: Any, wanted: float, off: float = 0.01) -> None:
+        """Fail unless a value is as wanted, but for so much."""
+        self.assertLessEqual(abs(float(value) - wanted), off)

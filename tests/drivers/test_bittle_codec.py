@@ -13,7 +13,7 @@ from drivers.bittle import codec
 from drivers.bittle.codec import LineReader, ResponseReader
 from drivers.bittle.dialogue import MAX_LINES, Dialogue
 from drivers.bittle.gait import GAITS, REST, STAND, Velocity, chosen
-from drivers.errors import BadFrame, LinkLost, NoReply, RobotError, Unsupported, UsageError
+from drivers.errors import BadFrame, LinkLost, NoReply, RobotError, Unsupported
 from drivers.registry import describe
 
 INDICES = "\t".join(str(one) for one in range(16))
@@ -55,7 +55,7 @@ class LineTests(SynchronousTestCase):
         self.assertEqual(list(reader.read(b"x" * 600)), [])
         self.assertEqual(list(reader.read(b"yz\r\nk\r\n")), ["k"])
         self.assertEqual(list(reader.read(b"x" * 513 + b"\nk\n")), ["k"])
-        self.assertEqual(reader.bad_lines, 3)
+        self.assertEqual(reader.bad_frames, 3)
 
     @given(st.binary(max_size=300))
     @settings(max_examples=200, deadline=None)
@@ -205,7 +205,6 @@ class DialogueTests(SynchronousTestCase):
         self.dialogue = Dialogue(self.clock, self.sent.append)
 
     def hear(self, *lines: str) -> None:
-        """The robot says lines."""
         for line in lines:
             self.dialogue.heard(line)
 
@@ -276,29 +275,6 @@ class DialogueTests(SynchronousTestCase):
 
 class OptionTests(SynchronousTestCase):
     """Options of the kind."""
-
-    def test_names_the_wrong_option(self) -> None:
-        """Each wrong option is refused in one line that names its key and what to write."""
-        for key, value in (
-            ("port", 7),
-            ("host", 7),
-            ("host", "10.0.0.1"),
-            ("baud", 9600),
-            ("http_port", 0),
-            ("board", "esp"),
-            ("ultrasonic", [16]),
-            ("gaits", {}),
-            ("gaits", {"w f": [0.1, 0]}),
-            ("gaits", {"wkF": [0.1]}),
-            ("gaits", {"wkF": [math.nan, 0]}),
-            ("gaits", {"vtL": [0, 1]}),
-            ("colour", "red"),
-        ):
-            line = str(self.assertRaises(UsageError, describe, "bittle", {"port": "/dev/ttyUSB0", key: value}))
-            self.assertIn(key, line)
-            self.assertNotIn("\n", line)
-        self.assertIn("port", str(self.assertRaises(UsageError, describe, "bittle", {})))
-        self.assertIn("board", str(self.assertRaises(UsageError, describe, "bittle", {"host": "10.0.0.1"})))
 
     def test_describes_what_the_gaits_can_do(self) -> None:
         """Limits are those of the gaits; a dog that cannot turn has no key to turn; sensors only where they are."""

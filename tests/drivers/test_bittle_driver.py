@@ -6,106 +6,45 @@ import contextlib
 import math
 from random import Random
 
-from twisted.internet.task import Clock
-from twisted.trial.unittest import SynchronousTestCase
-
 from drivers.bittle import gait
 from drivers.bittle.driver import BittleDriver
-from drivers.driver import Driver, Permit
+from drivers.conformance import Conformance
 from drivers.errors import LinkLost, NotEnabled, Unsupported
 from drivers.link import MemoryConnector
-from drivers.reading import Value
-from drivers.registry import driver_for
-from middleware.faults.stream import StreamFaults
 from sim.robots.emulator.bittle import BEHAVIOUR_S, NEVER, Bittle
-from sim.robots.emulator.body import MemoryBody
-from tests.drivers.contract import DriverContract
+from tests.drivers.contract import KeptLink, RobotCase
 
-STEP = 0.005
 GAITS = {"wkF": [0.1, 0.0], "trF": [0.15, 0.0], "bk": [-0.05, 0.0], "vtL": [0.0, 0.5], "vtR": [0.0, -0.5]}
 """What somebody has measured: the contract asks for 0.1 m/s, which these have exactly."""
 
 
-class Dog(SynchronousTestCase):
-    """A dog on an endless floor, on a clock that is turned by hand."""
+class BittleCase(RobotCase):
+    """A dog on a cable."""
 
+    END_S = 2.0
+    kind = "bittle"
+    options = {"port": "memory", "gaits": GAITS}
     board = "biboard"
     resets = False
 
-    def setUp(self) -> None:
-        """The dog and its wire."""
-        self.clock = Clock()
-        self.body = MemoryBody()
-        self.faults = StreamFaults()
-        self.robot = Bittle(
-            self.body, self.clock, Random(1), self.faults, self.board, self.resets,
-            {**gait.GAITS, "wkF": gait.Velocity(0.1, 0.0)},
-        )  # fmt: skip
+    def build(self) -> None:
+        gaits = {**gait.GAITS, "wkF": gait.Velocity(0.1, 0.0)}
+        self.robot = Bittle(self.body, self.clock, Random(1), self.board, self.resets, gaits)
+        self.faults = self.robot.faults
         self.connector = MemoryConnector(self.clock, self.robot.accept)
-        self.drivers: list[BittleDriver] = []
 
     def tearDown(self) -> None:
-        """Nothing is left on the clock once all have gone; nothing was said that changes the robot for good."""
-        for driver in self.drivers:
-            driver.disconnect()
-        self.clock.pump([0.1] * 20)
-        self.robot.stop()
-        self.clock.pump([0.1] * 20)
-        self.assertEqual(self.clock.getDelayedCalls(), [])
+        """Nothing was said that changes the robot for good."""
+        super().tearDown()
         self.assertEqual([one for one in self.robot.heard if chr(one[0]) in NEVER], [])
 
-    def make_driver(self, **options: object) -> BittleDriver:
-        """A driver of that dog."""
-        table = {"port": "memory", "gaits": GAITS, **options}
-        driver = driver_for("bittle", table, "dog", self.clock, self.connector)
-        assert isinstance(driver, BittleDriver)
-        self.drivers.append(driver)
-        return driver
 
-    def pass_time(self, seconds: float) -> None:
-        """Turn the clock, and let the body move."""
-        for _ in range(round(seconds / STEP)):
-            self.body.pass_time(STEP)
-            self.clock.advance(STEP)
-
-    def now(self) -> float:
-        """The turned clock."""
-        return self.clock.seconds()
-
-    def permit(self, token: int = 1, seconds: float = 0.5) -> Permit:
-        """A permit that holds for some seconds from now."""
-        return Permit(token, self.now() + seconds)
-
-    def true_speed(self) -> float:
-        """What the body really does."""
-        return math.hypot(*self.body.motion[:2])
-
-    def cut_link(self) -> None:
-        """Break the link; it can be opened again."""
-        self.connector.cut()
-
-    def value(self, driver: Driver, key: str) -> Value | None:
-        """What the newest observation says."""
-        newest = driver.observe()
-        assert newest is not None
-        return newest.values.get(key)
-
-
-class BittleDriverTests(Dog, DriverContract):
+class BittleDriverTests(Conformance, BittleCase):
     """A Bittle on a cable keeps the contract, and what is its own."""
-
-    def enabled(self, **options: object) -> BittleDriver:
-        """One that stands."""
-        driver = self.make_driver(**options)
-        driver.connect()
-        self.pass_time(0.3)
-        driver.enable()
-        self.pass_time(0.3)
-        return driver
 
     def test_returns_the_gait_that_it_really_has(self) -> None:
         """Act tells the velocity of the nearest gait, and the dog walks as told."""
-        driver = self.enabled()
+        driver = self.ready()
         self.assertEqual(driver.act({"base.vx": 0.06, "base.wz": 0.05}, self.permit()), {"base.vx": 0.1, "base.wz": 0})
         self.pass_time(0.1)
         self.assertEqual(self.body.motion, (0.1, 0.0, 0.0))
@@ -116,7 +55,7 @@ class BittleDriverTests(Dog, DriverContract):
 
     def test_asks_for_a_gait_once(self) -> None:
         """The same wish each tenth of a second is one command, so that the gait does not begin anew each time."""
-        driver = self.enabled()
+        driver = self.ready()
         for _ in range(10):
             driver.act({"base.vx": 0.1}, self.permit())
             self.pass_time(0.1)
@@ -126,26 +65,26 @@ class BittleDriverTests(Dog, DriverContract):
         """Attitude, joints, distance and battery arrive in SI units."""
         self.body.values |= {"imu.roll": 0.2, "range.near": 0.5, "power.level": 0.5}
         self.robot.joints[0], self.robot.joints[8] = 30, -45
-        driver = self.enabled(ultrasonic=[16, 17])
+        driver = self.ready(ultrasonic=[16, 17])
         self.pass_time(3.0)
-        self.assertTrue(math.isclose(float(self.value(driver, "imu.roll") or 0), 0.2, abs_tol=0.01))
-        self.assertAlmostEqual(float(self.value(driver, "joint.head_pan.pos") or 0), math.radians(30))
-        self.assertAlmostEqual(float(self.value(driver, "joint.lf_shoulder.pos") or 0), math.radians(-45))
+        self.near(self.value(driver, "imu.roll"), 0.2, 0.01)
+        self.assertAlmostEqual(self.value(driver, "joint.head_pan.pos"), math.radians(30))
+        self.assertAlmostEqual(self.value(driver, "joint.lf_shoulder.pos"), math.radians(-45))
         self.assertEqual(self.value(driver, "range.front"), 0.5)
-        self.assertAlmostEqual(float(self.value(driver, "power.volts") or 0), 7.6)
-        self.assertAlmostEqual(float(self.value(driver, "power.level") or 0), 0.5)
+        self.assertAlmostEqual(self.value(driver, "power.volts"), 7.6)
+        self.assertAlmostEqual(self.value(driver, "power.level"), 0.5)
         self.assertEqual(self.value(driver, "mode"), "biboard")
 
     def test_reckons_where_it_is(self) -> None:
         """The place is reckoned from the gaits that the dog took."""
-        driver = self.enabled()
+        driver = self.ready()
         driver.act({"base.vx": 0.1}, self.permit(seconds=2.0))
         self.pass_time(2.5)
-        self.assertTrue(math.isclose(float(self.value(driver, "odom.x") or 0), self.body.x, abs_tol=0.02))
+        self.near(self.value(driver, "odom.x"), self.body.x, 0.02)
 
     def test_does_skills(self) -> None:
         """A behaviour fires when it is over; meanwhile the dog is busy and not stale; gaits are no skills."""
-        driver = self.enabled()
+        driver = self.ready()
         driver.act({"base.vx": 0.1}, self.permit(seconds=5.0))
         self.pass_time(0.2)
         done = driver.invoke("hi")
@@ -165,7 +104,7 @@ class BittleDriverTests(Dog, DriverContract):
 
     def test_turns_joints(self) -> None:
         """Joints go by their names, in radians, within their limits; others are refused."""
-        driver = self.enabled()
+        driver = self.ready()
         turned = driver.invoke("joint", head_pan=0.5, lf_knee=9.0)
         self.pass_time(0.1)
         self.successResultOf(turned)
@@ -184,16 +123,9 @@ class BittleDriverTests(Dog, DriverContract):
         self.pass_time(0.2)
         self.assertTrue(self.robot.is_limp)
 
-    def test_lies_down_at_the_end(self) -> None:
-        """Disconnect leaves it lying, its servos off."""
-        driver = self.ready()
-        driver.disconnect()
-        self.pass_time(0.5)
-        self.assertTrue(self.robot.is_limp)
-
     def test_asks_again_for_a_gait_whose_answer_was_lost(self) -> None:
         """A stop that the dog has not confirmed within a second is sent again."""
-        driver = self.enabled()
+        driver = self.ready()
         self.faults.half_open = True
         driver.stop()
         self.pass_time(1.3)
@@ -201,7 +133,7 @@ class BittleDriverTests(Dog, DriverContract):
 
     def test_takes_up_a_rebooted_dog(self) -> None:
         """A dog that starts anew while it walks is greeted by its banner, at rest, and stands again."""
-        driver = self.enabled()
+        driver = self.ready()
         driver.act({"base.vx": 0.1}, self.permit(seconds=9.0))
         self.pass_time(0.5)
         self.robot.reboot()
@@ -217,7 +149,7 @@ class BittleDriverTests(Dog, DriverContract):
 
     def test_walks_on_with_a_dog_whose_banner_was_lost(self) -> None:
         """A dog that starts anew unnoticed is told its gait again, though nobody wishes for another."""
-        driver = self.enabled()
+        driver = self.ready()
         driver.act({"base.vx": 0.1}, self.permit(seconds=9.0))
         self.pass_time(0.5)
         self.faults.drop = 1.0
@@ -231,7 +163,7 @@ class BittleDriverTests(Dog, DriverContract):
 
     def test_takes_up_a_dog_that_was_silent(self) -> None:
         """Silence has a name, and ends as soon as the dog answers again; it was stopped meanwhile."""
-        driver = self.enabled()
+        driver = self.ready()
         driver.act({"base.vx": 0.1}, self.permit(seconds=2.0))
         self.faults.half_open = True
         self.pass_time(9.0)
@@ -243,7 +175,7 @@ class BittleDriverTests(Dog, DriverContract):
 
     def test_lives_with_a_foul_wire(self) -> None:
         """With a tenth of the lines lost and a tenth spoilt, cut anyhow and late, it walks, stops, and counts."""
-        driver = self.enabled()
+        driver = self.ready()
         self.faults.drop = self.faults.garbage = 0.1
         self.faults.split, self.faults.delay = True, 0.01
         for _ in range(40):
@@ -257,21 +189,19 @@ class BittleDriverTests(Dog, DriverContract):
 
     def test_says_that_the_board_is_another(self) -> None:
         """An option that names the wrong board is told from what the robot says of itself."""
-        driver = self.make_driver(board="nyboard")
-        driver.connect()
-        self.pass_time(0.3)
+        driver = self.connected(board="nyboard")
         self.assertIn("biboard", driver.problem)
 
     def test_complains_of_a_gait_that_the_dog_does_not_know(self) -> None:
         """A gait of the options that the firmware lacks is logged and counted, and not asked for again and again."""
-        driver = self.enabled(gaits={"moonF": [0.1, 0.0]})
+        driver = self.ready(gaits={"moonF": [0.1, 0.0]})
         driver.act({"base.vx": 0.1}, self.permit(seconds=3.0))
         self.pass_time(2.0)
         self.assertEqual(self.robot.heard.count(b"kmoonF"), 1)
         self.assertEqual(driver.diagnostics()["refused"], 1)
 
 
-class ResettingTests(Dog):
+class ResettingTests(BittleCase):
     """A board that starts anew when its port is opened."""
 
     resets = True
@@ -286,7 +216,7 @@ class ResettingTests(Dog):
         self.successResultOf(connected)
 
 
-class NyBoardTests(Dog):
+class NyBoardTests(BittleCase):
     """An older board on a cable."""
 
     board = "nyboard"
@@ -294,54 +224,23 @@ class NyBoardTests(Dog):
     def test_is_found_by_its_version(self) -> None:
         """It is known by its version, tells roll and pitch, and is not asked for its battery."""
         self.body.values["imu.pitch"] = -0.3
-        driver = self.make_driver()
-        driver.connect()
-        self.pass_time(3.0)
+        driver = self.connected(3.0)
         self.assertEqual(self.value(driver, "mode"), "nyboard")
-        self.assertTrue(math.isclose(float(self.value(driver, "imu.pitch") or 0), -0.3, abs_tol=0.01))
+        self.near(self.value(driver, "imu.pitch"), -0.3, 0.01)
         self.assertIsNotNone(self.value(driver, "joint.head_pan.pos"))
         self.assertNotIn(b"P", self.robot.heard)
 
 
-class _Kept:
-    """A link that keeps what is sent."""
-
-    is_busy = False
-
-    def __init__(self) -> None:
-        self.said = b""
-        self.is_closed = False
-
-    def send(self, data: bytes) -> None:
-        """Keep it."""
-        self.said += data
-
-    def close(self) -> None:
-        """Keep that."""
-        self.is_closed = True
-
-
-class WifiTests(Dog):
+class WifiTests(BittleCase):
     """A BiBoard behind its web server."""
 
-    def setUp(self) -> None:
-        """The same dog, another door."""
-        super().setUp()
+    def build(self) -> None:
+        super().build()
         self.connector = MemoryConnector(self.clock, self.robot.accept_http)
-
-    def make_driver(self, **options: object) -> BittleDriver:
-        """A driver over Wi-Fi."""
-        return super().make_driver(port="", host="10.0.0.5", board=self.board, **options)
+        self.options = {"gaits": GAITS, "host": "10.0.0.5", "board": self.board}
 
     def walking(self) -> BittleDriver:
-        """One that walks."""
-        driver = self.make_driver()
-        connected = driver.connect()
-        self.pass_time(1.5)
-        self.successResultOf(connected)
-        enabled = driver.enable()
-        self.pass_time(1.5)
-        self.assertIs(self.successResultOf(enabled), True)
+        driver: BittleDriver = self.ready(1.5)
         driver.act({"base.vx": 0.1}, self.permit(seconds=1.5))
         self.pass_time(1.0)
         self.assertGreater(self.true_speed(), 0.05)
@@ -371,7 +270,7 @@ class WifiTests(Dog):
             left = driver.disconnect()
             began = self.now()
             while not left.called and self.now() < began + 4.0:
-                self.pass_time(STEP)
+                self.pass_time(self.STEP_S)
             self.successResultOf(left)
             self.assertEqual(self.robot.heard[-1:], [] if is_dead else [b"d"])
             self.faults.half_open, self.connector.is_open = False, True
@@ -406,24 +305,24 @@ class WifiTests(Dog):
     def test_web_server_outlives_rubbish(self) -> None:
         """What is no request is answered or hung up on, and hours of commands are not all remembered."""
         for data in (b"\r\n\r\n", b"RUBBISH\r\n\r\n", b"GET http://[ HTTP/1.1\r\n\r\n"):
-            link = _Kept()
+            link = KeptLink()
             self.robot.accept_http(link).received(data)
             self.assertTrue(link.said.startswith(b"HTTP/1.1 400 "), data)
-        link = _Kept()
+        link = KeptLink()
         page = self.robot.accept_http(link)
         for _ in range(100):
             page.received(bytes(1000))
         self.assertTrue(link.is_closed)
         path = "/cmd?cmd=j" if self.board == "biboard" else "/action?name=j"
         for _ in range(200):
-            self.robot.accept_http(_Kept()).received(f"GET {path} HTTP/1.1\r\n\r\n".encode())
+            self.robot.accept_http(KeptLink()).received(f"GET {path} HTTP/1.1\r\n\r\n".encode())
             self.pass_time(0.1)
         self.assertLessEqual(len(self.robot.tasks) + len(self.robot.said), 50)
 
     def test_names_the_wrong_board(self) -> None:
         """A web server that knows no such page is named by what it answers."""
         other = "nyboard" if self.board == "biboard" else "biboard"
-        driver = Dog.make_driver(self, port="", host="10.0.0.5", board=other)
+        driver = self.make_driver(board=other)
         connected = driver.connect()
         self.pass_time(6.0)
         self.assertNoResult(connected)
@@ -435,7 +334,7 @@ class WifiTests(Dog):
         for steps in range(0, 60, 3):
             driver = self.make_driver()
             driver.connect().addErrback(lambda _: None)
-            self.clock.pump([STEP] * steps)
+            self.pass_time(self.STEP_S * steps)
             driver.disconnect()
             self.assertEqual(driver.state, "closed")
 

@@ -176,10 +176,3 @@ class RequestTests(SynchronousTestCase):
         self.assertNotIn(b"Authorization", plain)
         login = base64.b64encode(b"anna:s p")
         self.assertIn(b"\r\nAuthorization: Basic " + login + b"\r\n", codec.request("cam", "/", "anna:s p"))
-
-    def test_is_heard_when_whole(self) -> None:
-        """The method of a request is told when its last line is there, and not before."""
-        whole = codec.request("cam", "/")
-        self.assertIsNone(codec.method_of(whole[:-1]))
-        self.assertEqual(codec.method_of(whole), "GET")
-        self.assertEqual(codec.method_of(b"POST / HTTP/1.1\n\n"), "POST")

@@ -9,13 +9,13 @@ from typing import Any
 from twisted.internet.task import Clock
 from twisted.trial.unittest import SynchronousTestCase
 
-from drivers.camera.driver import CameraDriver, film_of
-from drivers.camera.option import Options, checked
+from drivers.camera.driver import film_of
+from drivers.camera.option import Options
 from drivers.camera.shots import CaptureShots, FolderShots, Shot, Shots
 from drivers.camera.thread import ClockFilm, Reel, ThreadFilm
-from drivers.errors import BadFrame, LinkLost, NotEnabled, Unsupported, UsageError
-from drivers.registry import describe, driver_for
-from tests.drivers.contract import SensingContract
+from drivers.conformance import Conformance
+from drivers.errors import BadFrame, LinkLost, NotEnabled, Unsupported
+from tests.drivers.contract import RobotCase
 
 HEAD = b"\xff\xd8\xff\xe0\x00\x04ab\xff\xc0\x00\x0b\x08\x00\x60\x00\x80\x01\x11\x00\x00"
 
@@ -25,60 +25,39 @@ def jpeg(mark: int) -> bytes:
     return HEAD + bytes([mark]) + b"\xff\xd9"
 
 
-class CameraDriverTests(SensingContract, SynchronousTestCase):
+class CameraDriverTests(Conformance, RobotCase):
     """A camera keeps the contract of what senses, and what is its own."""
 
-    def setUp(self) -> None:
-        """A folder of three pictures and a clock that is turned by hand."""
-        self.clock = Clock()
+    STEP_S = 0.01
+    kind = "camera"
+
+    def build(self) -> None:
         self.folder = Path(self.mktemp())
         self.folder.mkdir()
         for mark in (1, 2, 3):
             (self.folder / f"{mark}.jpg").write_bytes(jpeg(mark))
         (self.folder / "notes.txt").write_text("no picture", encoding="utf-8")
-        self.drivers: list[CameraDriver] = []
-
-    def tearDown(self) -> None:
-        """Nothing is left on the clock once all have gone."""
-        for driver in self.drivers:
-            driver.disconnect()
-        self.assertEqual(self.clock.getDelayedCalls(), [])
-
-    def make_driver(self, **options: object) -> CameraDriver:
-        """A driver of the folder."""
-        wanted = checked({"source": str(self.folder), "fps": 20, **options})
-        driver = CameraDriver(wanted, film_of(wanted, self.clock), self.clock, "cam")
-        self.drivers.append(driver)
-        return driver
-
-    def pass_time(self, seconds: float) -> None:
-        """Turn the clock."""
-        self.clock.pump([0.01] * round(seconds / 0.01))
-
-    def now(self) -> float:
-        """The turned clock."""
-        return self.clock.seconds()
+        self.options = {"source": str(self.folder), "fps": 20}
 
     def test_shows_a_folder_by_the_clock(self) -> None:
         """The pictures come in the order of their names at their rate, over and over, the same in each run."""
         runs = []
         for _ in range(2):
             driver, seen = self.make_driver(fps=10), list[int]()
-            driver.subscribe(lambda one, seen=seen: seen.append(one.frame.data[-3]))  # type: ignore[misc]
+            driver.subscribe(lambda one, seen=seen: seen.append(one.frame.data[-3]))
             driver.connect()
             self.pass_time(1.0)
             driver.disconnect()
             runs.append(seen)
         self.assertEqual(runs[0], runs[1])
         self.assertEqual(runs[0], [1, 2, 3, 1, 2, 3, 1, 2, 3, 1])
-        newest = driver.observe()
-        assert newest is not None and newest.frame is not None
-        self.assertEqual((newest.frame.width, newest.frame.height, newest.frame.seq), (128, 96, 10))
+        frame = self.newest(driver).frame
+        assert frame is not None
+        self.assertEqual((frame.width, frame.height, frame.seq), (128, 96, 10))
 
     def test_takes_as_many_pictures_as_are_wanted(self) -> None:
         """Another rate holds at once; with none wanted no picture is taken, and the device stays ready."""
         driver = self.ready()
-        assert isinstance(driver, CameraDriver)
         driver.set_camera_fps(0)
         before = driver.diagnostics()["pictures"]
         self.pass_time(3.0)
@@ -131,28 +110,6 @@ class CameraDriverTests(SensingContract, SynchronousTestCase):
         self.assertGreater(driver.diagnostics()["refused"], 2)
         driver.disconnect()
         self.failureResultOf(connected, LinkLost)
-
-    def test_is_made_by_the_registry(self) -> None:
-        """The kind is known and described without a camera; wrong options are refused with key and remedy."""
-        self.assertIsInstance(driver_for("camera", {"source": str(self.folder)}, "cam", self.clock), CameraDriver)
-        body = describe("camera", {"lens": 70, "ahead": -0.05})
-        self.assertEqual(body.capabilities["camera"]["ahead"], -0.05)
-        self.assertEqual((list(body.capabilities), body.limits), (["camera"], {}))
-        self.assertEqual(body.capabilities["camera"]["fov_h_deg"], 70)
-        wrong: tuple[tuple[str, object], ...] = (
-            *(("source", -1), ("source", ""), ("source", True), ("source", "a\nb"), ("width", 8), ("width", 20.5)),
-            *(
-                ("fps", 0),
-                ("fps", "10"),
-                ("fps", float("nan")),
-                ("lens", True),
-                ("quality", 96),
-                ("ahead", 6),
-                ("colour", "red"),
-            ),
-        )
-        for key, value in wrong:
-            self.assertIn(key, str(self.assertRaises(UsageError, describe, "camera", {key: value})))
 
     def test_asks_a_device_in_a_thread(self) -> None:
         """Cameras get a thread of their own, by number and by device file; files are read by the clock."""
@@ -214,7 +171,6 @@ class Lens:
 
 class ShotsTests(SynchronousTestCase):
     def capture(self, lens: Lens, **options: Any) -> CaptureShots:
-        """A video that the stand-in shows."""
         with tempfile.NamedTemporaryFile(suffix=".avi", delete=False) as file:
             self.addCleanup(Path(file.name).unlink)
         return CaptureShots(Options(file.name, **options), lambda: lens)

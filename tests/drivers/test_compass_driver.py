@@ -4,64 +4,35 @@ from __future__ import annotations
 
 import math
 
-from twisted.internet.task import Clock
-from twisted.trial.unittest import SynchronousTestCase
-
-from drivers.compass.driver import HEADING, SILENCE_S, CompassDriver
+from drivers.compass.driver import HEADING, SILENCE_S
+from drivers.conformance import Conformance
 from drivers.driver import Driver
-from drivers.errors import LinkLost, NotEnabled, Unsupported, UsageError
+from drivers.errors import LinkLost
 from drivers.link import MemoryConnector
-from drivers.registry import describe, driver_for
 from sim.robots.dog import Dog
-from sim.robots.emulator.body import MemoryBody
 from sim.robots.emulator.compass import NmeaCompass
 from sim.robots.scene import Kennel
-from tests.drivers.contract import SensingContract
+from tests.drivers.contract import KeptLink, KeptLog, RobotCase
 
 
-class CompassDriverTests(SensingContract, SynchronousTestCase):
+class CompassDriverTests(Conformance, RobotCase):
     """A compass keeps the contract of what senses, and what is its own."""
 
-    def setUp(self) -> None:
-        """A compass that looks along the x axis, a network of memory, and a clock that is turned by hand."""
-        self.clock = Clock()
-        self.body = MemoryBody(values={HEADING: 0.0})
-        self.compass = NmeaCompass(self.clock, self.body, 20.0)
+    kind = "compass"
+    options = {"rate": 20, "host": "10.0.0.8"}
+
+    def build(self) -> None:
+        """A compass that looks along the x axis."""
+        self.body.values = {HEADING: 0.0}
+        self.compass = self.robot = NmeaCompass(self.clock, self.body, 20.0)
         self.compass.start()
         self.compass.start()
         self.faults = self.compass.faults
         self.connector = MemoryConnector(self.clock, self.compass.accept)
-        self.drivers: list[Driver] = []
-
-    def tearDown(self) -> None:
-        """Nothing is left on the clock once all have gone."""
-        for driver in self.drivers:
-            driver.disconnect()
-        self.compass.stop()
-        self.clock.advance(1.0)
-        self.assertEqual(self.clock.getDelayedCalls(), [])
-
-    def make_driver(self, **options: object) -> CompassDriver:
-        """A driver of that compass, as the registry makes it."""
-        place = {} if "device" in options else {"host": "10.0.0.8"}
-        driver = driver_for("compass", {"rate": 20, **place, **options}, "dog", self.clock, self.connector)
-        assert isinstance(driver, CompassDriver)
-        self.drivers.append(driver)
-        return driver
-
-    def pass_time(self, seconds: float) -> None:
-        """Turn the clock."""
-        self.clock.pump([0.005] * round(seconds / 0.005))
-
-    def now(self) -> float:
-        """The turned clock."""
-        return self.clock.seconds()
 
     def heading(self, driver: Driver) -> float:
         """Degrees of what the newest observation says."""
-        seen = driver.observe()
-        assert seen is not None
-        return math.degrees(float(seen.values[HEADING]))
+        return math.degrees(self.value(driver, HEADING))
 
     def test_turns_as_the_yard_does(self) -> None:
         """The heading is the body's own, counter-clockwise from the x axis: as a dog of the yard tells it."""
@@ -117,26 +88,11 @@ class CompassDriverTests(SensingContract, SynchronousTestCase):
         self.pass_time(3.0)
         self.assertEqual((driver.state, seen), ("ready", {0, 10}))
 
-    def test_is_stale_without_headings(self) -> None:
-        """A lost link is opened again and the compass is ready as before; in between nothing of it is believed."""
-        driver = self.ready()
-        self.connector.cut()
-        self.assertEqual(driver.state, "stale")
-        self.failureResultOf(driver.enable(), LinkLost)
-        self.assertRaises(NotEnabled, driver.act, {}, self.permit())
-        self.pass_time(1.0)
-        self.assertEqual((driver.state, driver.diagnostics()["reconnects"]), ("ready", 1.0))
-        self.assertEqual(driver.act({}, self.permit()), {})
-        self.assertRaises(Unsupported, driver.act, {"base.vx": 0.1}, self.permit())
-
     def test_names_why_there_is_no_heading(self) -> None:
         """No answer, silence, noise and other sentences are each named once; what was heard again is forgotten."""
-        lines: list[str] = []
-        log = type("Log", (), {})()
-        log.warn = lambda text, **facts: lines.append(text.format(**facts))
         self.connector.is_open = False
         driver = self.make_driver()
-        driver.log = log
+        driver.log = log = KeptLog()
         connected = driver.connect()
         self.pass_time(SILENCE_S + 0.1)
         self.assertEqual(driver.problem, "nothing answers at 10.0.0.8:10110; is it on, and in this network?")
@@ -156,7 +112,7 @@ class CompassDriverTests(SensingContract, SynchronousTestCase):
         self.body.values[HEADING] = 0.0
         self.pass_time(1.0)
         self.successResultOf(connected)
-        self.assertEqual((driver.problem, len(lines), len(set(lines))), ("", 4, 4))
+        self.assertEqual((driver.problem, len(log.lines), len(set(log.lines))), ("", 4, 4))
 
     def test_hangs_up_on_silence(self) -> None:
         """A link on which nothing comes any more is closed and opened anew, for the other end may be long gone."""
@@ -172,7 +128,8 @@ class CompassDriverTests(SensingContract, SynchronousTestCase):
     def test_asks_for_the_baud_rate(self) -> None:
         """On a cable, noise is a matter of the baud rate, and a device that is not open is named."""
         self.compass.kinds = ()
-        driver = self.make_driver(device="/dev/ttyUSB1", baud=9600)
+        self.options = {"rate": 20, "device": "/dev/ttyUSB1", "baud": 9600}
+        driver = self.make_driver()
         connected = driver.connect()
         self.connector.is_open = False
         self.pass_time(SILENCE_S + 0.1)
@@ -199,44 +156,9 @@ class CompassDriverTests(SensingContract, SynchronousTestCase):
         counts = driver.diagnostics()
         self.assertTrue(counts["bad_frames"] > 200 and counts["frames"] > 600, counts)
 
-    def test_is_described_by_its_options(self) -> None:
-        """A compass has its one capability and no motor; wrong options are refused with key and remedy."""
-        body = describe("compass", {"device": "/dev/ttyUSB1", "rate": 5})
-        self.assertEqual((body.kind, list(body.capabilities), body.limits), ("compass", ["compass"], {}))
-        self.assertEqual(body.rates, {"compass": 5})
-        for table, word in (
-            ({}, "either"),
-            ({"host": "a", "device": "b"}, "either"),
-            ({"host": ""}, "host"),
-            ({"device": 7}, "device"),
-            ({"host": "a", "port": 0}, "port"),
-            ({"host": "a", "port": True}, "port"),
-            ({"device": "a", "baud": 300}, "baud"),
-            ({"device": "a", "baud": "4800"}, "baud"),
-            ({"host": "a", "mounted_deg": 361}, "mounted_deg"),
-            ({"host": "a", "mounted_deg": float("nan")}, "mounted_deg"),
-            ({"host": "a", "variation_deg": True}, "variation_deg"),
-            ({"host": "a", "rate": 0}, "rate"),
-            ({"host": "a", "colour": "red"}, "colour"),
-        ):
-            line = str(self.assertRaises(UsageError, describe, "compass", table))
-            self.assertIn(word, line)
-            self.assertNotIn("\n", line)
-
     def test_serves_whoever_listens(self) -> None:
         """The emulated compass tells all its clients, but one that does not listen; what they say it does not hear."""
-
-        class Wire:
-            said = b""
-            is_busy = False
-
-            def send(self, data: bytes) -> None:
-                self.said += data
-
-            def close(self) -> None:
-                self.is_busy = True
-
-        slow, quick = Wire(), Wire()
+        slow, quick = KeptLink(), KeptLink()
         one, _ = self.compass.accept(slow), self.compass.accept(quick)
         one.received(b"$PXYZ,1\r\n")
         slow.is_busy = True
@@ -246,4 +168,4 @@ class CompassDriverTests(SensingContract, SynchronousTestCase):
         one.link_down()
         one.link_down()
         self.compass.stop()
-        self.assertTrue(quick.is_busy)
+        self.assertTrue(quick.is_closed)

@@ -102,7 +102,7 @@ class Nostalgic(Rover):
     """Remembers a motion beyond its stop."""
 
     def _rest(self) -> None:
-        self._cancel_end()
+        self._end.cancel()
         self._gate.close()
 
     def stop(self) -> Action:
@@ -121,21 +121,18 @@ class Credulous(Rover):
 class Endless(Rover):
     """Moves on after its deadline."""
 
-    def _on_end(self) -> None:
-        self._end = None
+    def act(self, action: Action, permit: Permit) -> Action:
+        done = dict(super().act(action, permit))
+        self._end.cancel()
+        return done
 
 
 class Abrupt(Rover):
     """Keeps the deadline of the first command though a later one renews it."""
 
-    def _cancel_end(self) -> None:
-        self._kept, self._end = getattr(self, "_kept", None) or self._end, None
-
-    def stop(self) -> Action:
-        kept, self._kept = getattr(self, "_kept", None), None
-        if kept is not None and kept.active():
-            kept.cancel()
-        return dict(super().stop())
+    def act(self, action: Action, permit: Permit) -> Action:
+        self._first = getattr(self, "_first", None) or permit.deadline
+        return dict(super().act(action, Permit(permit.token, self._first)))
 
 
 class Lawless(Rover):

@@ -8,71 +8,34 @@ from random import Random
 from twisted.internet.task import Clock
 from twisted.trial.unittest import SynchronousTestCase
 
+from drivers.conformance import Conformance
 from drivers.create2 import codec
-from drivers.create2.driver import Create2Driver
-from drivers.create2.option import checked
 from drivers.errors import LinkLost, NoReply, NotEnabled, Unsupported, UsageError
 from drivers.link import MemoryConnector
-from drivers.reading import Value
-from drivers.registry import driver_for
-from middleware.faults.stream import StreamFaults
 from sim.robots.emulator.body import MemoryBody
 from sim.robots.emulator.create2 import Create2
-from tests.drivers.contract import BodyContract
-
-STEP = 0.005
+from tests.drivers.contract import RobotCase
 
 
-class Create2DriverTests(BodyContract, SynchronousTestCase):
-    """A Create 2 keeps the contract, and what is its own."""
+class Create2Case(RobotCase):
+    """A Create 2 with a cable of memory."""
 
-    def setUp(self) -> None:
-        """A robot on an endless floor, with a cable of memory, on a clock that is turned by hand."""
-        self.clock = Clock()
-        self.body = MemoryBody()
-        self.faults = StreamFaults()
-        self.robot = Create2(self.body, self.clock, Random(1), self.faults)
+    kind = "create2"
+    options = {"port": "memory"}
+
+    def build(self) -> None:
+        self.robot = Create2(self.body, self.clock, Random(1))
+        self.faults = self.robot.faults
         self.connector = MemoryConnector(self.clock, self.robot.accept)
-        self.drivers: list[Create2Driver] = []
 
-    def tearDown(self) -> None:
-        """Nothing is left on the clock once all have gone."""
-        for driver in self.drivers:
-            driver.disconnect()
-        self.robot.stop()
-        self.clock.advance(0.1)
-        self.clock.advance(0.1)
-        self.assertEqual(self.clock.getDelayedCalls(), [])
 
-    def make_driver(self, **options: object) -> Create2Driver:
-        """A driver of that robot."""
-        driver = Create2Driver(checked({"port": "memory", **options}), "vacuum", self.connector, self.clock)
-        self.drivers.append(driver)
-        return driver
-
-    def ready(self) -> Create2Driver:
-        """One that is connected and enabled."""
-        driver = super().ready()
-        assert isinstance(driver, Create2Driver)
-        return driver
-
-    def value(self, driver: Create2Driver, key: str) -> Value:
-        """What the newest observation says."""
-        newest = driver.observe()
-        assert newest is not None
-        return newest.values[key]
-
-    def test_is_made_by_the_registry(self) -> None:
-        """The registry knows the kind."""
-        driver = driver_for("create2", {"port": "/dev/ttyUSB0"}, "vacuum", self.clock, self.connector)
-        self.assertEqual((driver.state, driver.description.kind), ("idle", "create2"))
+class Create2DriverTests(Conformance, Create2Case):
+    """A Create 2 keeps the contract, and what is its own."""
 
     def test_tells_what_it_feels(self) -> None:
         """Bumpers, ledges, drops, light, battery and mode arrive under the keys of their capabilities."""
         self.body.values |= {"bump.left": True, "cliff.front_right": True, "power.level": 0.5, "range.near": 0.1}
-        driver = self.make_driver()
-        driver.connect()
-        self.pass_time(0.2)
+        driver = self.connected()
         self.assertEqual((self.value(driver, "bump.left"), self.value(driver, "bump.right")), (True, False))
         self.assertIs(self.value(driver, "cliff.front_right"), True)
         self.assertAlmostEqual(float(self.value(driver, "power.level")), 0.5, places=3)
@@ -86,11 +49,11 @@ class Create2DriverTests(BodyContract, SynchronousTestCase):
         driver = self.ready()
         driver.act({"base.vx": 0.2, "base.wz": 0.5}, self.permit(seconds=3.0))
         self.pass_time(2.0)
-        self.assertTrue(math.isclose(float(self.value(driver, "odom.x")), self.body.x, abs_tol=0.01))
-        self.assertTrue(math.isclose(float(self.value(driver, "odom.y")), self.body.y, abs_tol=0.01))
-        self.assertTrue(math.isclose(float(self.value(driver, "odom.yaw")), self.body.yaw, abs_tol=0.02))
-        self.assertTrue(math.isclose(float(self.value(driver, "base.vx")), 0.2, abs_tol=0.01))
-        self.assertTrue(math.isclose(float(self.value(driver, "base.wz")), 0.5, abs_tol=0.05))
+        self.near(self.value(driver, "odom.x"), self.body.x, 0.01)
+        self.near(self.value(driver, "odom.y"), self.body.y, 0.01)
+        self.near(self.value(driver, "odom.yaw"), self.body.yaw, 0.02)
+        self.near(self.value(driver, "base.vx"), 0.2, 0.01)
+        self.near(self.value(driver, "base.wz"), 0.5, 0.05)
         self.assertEqual(driver.diagnostics()["jumps"], 0)
 
     def test_slows_both_wheels_where_one_would_be_too_fast(self) -> None:
@@ -129,11 +92,7 @@ class Create2DriverTests(BodyContract, SynchronousTestCase):
     def test_full_mode_has_no_guards(self) -> None:
         """In full mode, asked for by an option, a ledge does not stop it."""
         self.body.values["cliff.left"] = True
-        driver = self.make_driver(mode="full")
-        driver.connect()
-        self.pass_time(0.2)
-        driver.enable()
-        self.pass_time(0.1)
+        driver = self.ready(mode="full")
         self.assertEqual(self.value(driver, "mode"), "full")
         driver.act({"base.vx": 0.1}, self.permit())
         self.pass_time(0.1)
@@ -142,9 +101,7 @@ class Create2DriverTests(BodyContract, SynchronousTestCase):
     def test_says_when_it_cannot_be_enabled(self) -> None:
         """With a wheel in the air the robot does not go to safe mode: enable fails with NoReply."""
         self.body.values["wheeldrop.right"] = True
-        driver = self.make_driver()
-        driver.connect()
-        self.pass_time(0.2)
+        driver = self.connected()
         enabled = driver.enable()
         self.pass_time(1.1)
         self.failureResultOf(enabled, NoReply)
@@ -210,13 +167,6 @@ class Create2DriverTests(BodyContract, SynchronousTestCase):
         self.failureResultOf(driver.invoke("dock", fast=1.0), Unsupported)
         self.failureResultOf(driver.invoke("fly"), Unsupported)
 
-    def test_leaves_the_robot_off(self) -> None:
-        """Disconnect ends the interface, so that the robot sleeps and charges as if nobody had asked it."""
-        driver = self.ready()
-        driver.disconnect()
-        self.pass_time(0.1)
-        self.assertEqual(self.robot.mode, 0)
-
     def test_starts_a_rebooted_robot_again(self) -> None:
         """A robot that loses its power while it drives is started again, at rest, and its counters cause no leap."""
         driver = self.ready()
@@ -229,7 +179,7 @@ class Create2DriverTests(BodyContract, SynchronousTestCase):
         self.pass_time(4.0)
         self.assertEqual((driver.state, driver.problem), ("ready", ""))
         self.assertLess(self.true_speed(), 0.01)
-        self.assertTrue(math.isclose(float(self.value(driver, "odom.x")), x, abs_tol=0.05))
+        self.near(self.value(driver, "odom.x"), x, 0.05)
         driver.act({"base.vx": 0.1}, self.permit())
 
     def test_takes_nothing_from_before_its_start(self) -> None:
@@ -275,7 +225,7 @@ class Create2DriverTests(BodyContract, SynchronousTestCase):
         driver.act({"base.vx": 0.2}, self.permit(seconds=9.0))
         self.pass_time(3.0)
         self.assertEqual(driver.state, "ready")
-        self.assertTrue(math.isclose(float(self.value(driver, "odom.x")), self.body.x, abs_tol=0.05))
+        self.near(self.value(driver, "odom.x"), self.body.x, 0.05)
         numbers = driver.diagnostics()
         self.assertGreater(numbers["bad_frames"], 5)
         self.assertGreater(numbers["frames"], 100)
@@ -295,7 +245,6 @@ class EmulatorTests(SynchronousTestCase):
         self.addCleanup(self.robot.stop)
 
     def received(self, data: bytes) -> None:
-        """Hear the robot."""
         self.said += data
 
     def link_down(self) -> None:

@@ -40,12 +40,10 @@ from drivers.registry import driver_for
 from drivers.rosbridge.driver import ASK_S, RosbridgeDriver
 from sim.robots.emulator.aibo_dog import AiboEmulator
 from sim.robots.emulator.bittle import Bittle
-from sim.robots.emulator.body import MemoryBody
 from sim.robots.emulator.create2 import Create2
 from sim.robots.emulator.rosbridge import RosbridgeRobot
+from tests.drivers.contract import RobotCase
 from tests.formats.rfc6455 import masked
-
-STEP = 0.005
 
 
 class Way(Open):
@@ -58,12 +56,10 @@ class Way(Open):
         self._is_answered = is_answered
 
     def say(self, halt: bytes) -> bool:
-        """Keep it."""
         self.said.append(halt)
         return self._is_answered
 
     def close(self) -> None:
-        """Keep that it closed."""
         self.is_open = False
 
 
@@ -151,20 +147,16 @@ class Told(Watch):
         self.told: list[Any] = []
 
     def guard(self, way: Open | Server, halt: bytes) -> None:
-        """Keep it."""
         where = way._descriptor if isinstance(way, Open) else way._address
         self.told.append((type(way), where, halt))
 
     def until(self, moment: float) -> None:
-        """Keep it."""
         self.told.append(moment)
 
     def rest(self) -> None:
-        """Keep it."""
         self.told.append("rest")
 
     def leave(self) -> None:
-        """Keep it."""
         self.told.append("leave")
 
 
@@ -198,7 +190,6 @@ class OrderedDeadMan(MemoryDeadMan):
     """A switch whose end takes until ``ended`` fires."""
 
     def close(self) -> Deferred[None]:
-        """Take a while."""
         super().close()
         self.ended: Deferred[None] = Deferred()
         return self.ended
@@ -219,7 +210,6 @@ class Puppet(BaseDriver):
         self._observed({}, 0.0)
 
     def down(self) -> None:
-        """The link is gone."""
         self._down()
 
     def _open(self) -> None:
@@ -245,7 +235,6 @@ class BaseDriverTests(SynchronousTestCase):
     """What every driver tells its switch, and in which order."""
 
     def setUp(self) -> None:
-        """A driver that is ready."""
         self.clock = Clock()
         self.switch = OrderedDeadMan()
         self.driver = Puppet(self.clock, self.switch)
@@ -297,14 +286,14 @@ class BaseDriverTests(SynchronousTestCase):
         self.assertNotIn("halts", Puppet(self.clock, None).diagnostics())
 
 
-class LastWordTests(SynchronousTestCase):
+class LastWordTests(RobotCase):
     """The bytes by which each robot is halted."""
 
-    def setUp(self) -> None:
-        """A switch of memory."""
-        self.clock = Clock()
-        self.body = MemoryBody()
+    def build(self) -> None:
         self.switch = MemoryDeadMan()
+
+    def tearDown(self) -> None:
+        """The robots go on."""
 
     def word(self, driver: BaseDriver, settle: float = 1.0) -> LastWord:
         """What it is guarded by, once it is connected."""
@@ -313,11 +302,6 @@ class LastWordTests(SynchronousTestCase):
         self.successResultOf(connected)
         assert self.switch.word is not None
         return self.switch.word
-
-    def pass_time(self, seconds: float) -> None:
-        """Turn the clock."""
-        for _ in range(round(seconds / STEP)):
-            self.clock.advance(STEP)
 
     def test_aibo(self) -> None:
         """Forward, strafe and rotate of nothing, to the walk server alone."""
@@ -371,13 +355,11 @@ class LastWordTests(SynchronousTestCase):
         self.assertIn("twist", self.published(self.switch.word))
 
     def rosbridge(self, robot: RosbridgeRobot) -> RosbridgeDriver:
-        """A driver of that robot."""
         robot.start()
         connector = MemoryConnector(self.clock, robot.accept)
         return RosbridgeDriver({}, connector, self.clock, "robot", self.switch)
 
     def published(self, word: LastWord) -> dict[str, Any]:
-        """The message of such a frame."""
         head, size = word.halt[0], word.halt[1]
         self.assertEqual(head, 0x81)
         at = 2 if size < 0x80 + 126 else 4

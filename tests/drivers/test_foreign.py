@@ -1,4 +1,4 @@
-"""Tests of ``drivers.foreign``: drivers of other distributions, found by entry points and by their place."""
+"""Tests of drivers of other distributions, found by entry points and by their place."""
 
 from __future__ import annotations
 

@@ -5,14 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from random import Random
 
 from twisted.internet.defer import Deferred, succeed
 from twisted.internet.interfaces import IReactorTime
-from twisted.internet.task import Clock
-from twisted.trial.unittest import SynchronousTestCase
 
 from drivers.base import BaseDriver
+from drivers.conformance import Conformance
 from drivers.create2.driver import Create2Driver
 from drivers.create2.option import checked
 from drivers.driver import Driver, Filming, Permit
@@ -21,14 +19,11 @@ from drivers.joined import Joined, described, joined
 from drivers.link import Caller, Line, MemoryConnector
 from drivers.reading import Action, Description, Frame, Observation, Value
 from drivers.registry import describe, driver_for
-from sim.robots.emulator.body import MemoryBody
 from sim.robots.emulator.camera import MjpegCamera
 from sim.robots.emulator.compass import NmeaCompass
-from sim.robots.emulator.create2 import Create2
-from tests.drivers.contract import BodyContract
+from tests.drivers.contract import KeptLog
 from tests.drivers.test_camera_driver import jpeg
-
-STEP = 0.005
+from tests.drivers.test_create2_driver import Create2Case
 
 
 class Part(BaseDriver):
@@ -53,21 +48,17 @@ class Part(BaseDriver):
         """The part's own clock begins elsewhere."""
 
     def tell(self, frame: Frame | None = None, **values: Value) -> None:
-        """Sense."""
         if not self._is_up:
             self._up()
         self._observed({key.replace("_", "."): value for key, value in values.items()}, self.t, frame=frame)
 
     def refuse(self) -> None:
-        """Be no such part, for good."""
         self._refused(Unsupported("there is no such part"))
 
     def lose(self) -> None:
-        """Lose the link."""
         self._down()
 
     def invoke(self, name: str, **arguments: float | str) -> Deferred[Mapping[str, Value]]:
-        """Hum."""
         return succeed({"hummed": True}) if name == "hum" else super().invoke(name, **arguments)
 
     def _open(self) -> None:
@@ -87,34 +78,23 @@ class Lens(Part):
     camera_fps = 5.0
 
     def set_camera_fps(self, fps: float) -> None:
-        """So many."""
         self.camera_fps = fps
 
 
-class JoinedTests(BodyContract, SynchronousTestCase):
+class JoinedTests(Conformance, Create2Case):
     """A Create 2 with a camera on its back keeps the contract."""
 
-    def setUp(self) -> None:
-        """A robot on an endless floor, a folder of pictures, and a clock that is turned by hand."""
-        self.clock = Clock()
-        self.body = MemoryBody()
-        self.robot = Create2(self.body, self.clock, Random(1))
-        self.connector = MemoryConnector(self.clock, self.robot.accept)
+    END_S = 0.2
+
+    def build(self) -> None:
+        """A folder of pictures in the place of the camera."""
+        super().build()
         self.folder = Path(self.mktemp())
         self.folder.mkdir()
         for mark in (1, 2, 3):
             (self.folder / f"{mark}.jpg").write_bytes(jpeg(mark))
-        self.drivers: list[Driver] = []
 
-    def tearDown(self) -> None:
-        """Nothing is left on the clock once all have gone."""
-        for driver in self.drivers:
-            driver.disconnect()
-        self.robot.stop()
-        self.pass_time(0.2)
-        self.assertEqual(self.clock.getDelayedCalls(), [])
-
-    def make_driver(self) -> Driver:
+    def make_driver(self, **options: object) -> Driver:
         """A Create 2 with a camera, as the registry makes it."""
         camera = ("camera", {"source": str(self.folder), "fps": 10})
         driver = driver_for("create2", {"port": "memory"}, "vacuum", self.clock, self.connector, [camera])
@@ -122,17 +102,10 @@ class JoinedTests(BodyContract, SynchronousTestCase):
         return driver
 
     def with_parts(self, *parts: Driver) -> Joined:
-        """A Create 2 with these parts."""
         main = Create2Driver(checked({"port": "memory"}), "vacuum", self.connector, self.clock)
         driver = joined(main, parts, "vacuum")
         self.drivers.append(driver)
         return driver
-
-    def newest(self, driver: Driver) -> Observation:
-        """The newest observation, which there is."""
-        seen = driver.observe()
-        assert seen is not None
-        return seen
 
     def test_shows_what_its_parts_see(self) -> None:
         """The device has the camera's capability before it connects, and its pictures in the robot's observations."""
@@ -305,8 +278,8 @@ class JoinedTests(BodyContract, SynchronousTestCase):
     def test_outlives_a_part_that_is_none(self) -> None:
         """A part that is refused for good is named once, and the robot goes on; one that never came is no news."""
         compass, absent = Part(self.clock), Part(self.clock, "camera")
-        driver, lines = self.with_parts(compass, absent), list[str]()
-        driver.log = type("Log", (), {"error": lambda _self, text, **facts: lines.append(text.format(**facts))})()
+        driver = self.with_parts(compass, absent)
+        driver.log = log = KeptLog()  # type: ignore[assignment]
         connected = driver.connect()
         compass.refuse()
         self.pass_time(0.3)
@@ -314,7 +287,7 @@ class JoinedTests(BodyContract, SynchronousTestCase):
         self.assertEqual(driver.state, "ready")
         self.successResultOf(driver.disconnect())
         self.successResultOf(driver.disconnect())
-        self.assertEqual(lines, ["vacuum: its part compass is given up: there is no such part"])
+        self.assertEqual(log.lines, ["vacuum: its part compass is given up: there is no such part"])
         self.assertEqual((compass.opened, absent.opened, absent.closed), (1, 1, 1))
 
     def test_leaves_its_parts_with_its_robot(self) -> None:

@@ -10,20 +10,16 @@ from dataclasses import dataclass, field
 from random import Random
 from typing import Any
 
-from twisted.internet.task import Clock
-from twisted.trial.unittest import SynchronousTestCase
-
-from drivers.driver import Driver, Permit
+from drivers.driver import Driver
 from drivers.link import MemoryConnector
-from drivers.registry import driver_for
 from sim.robots.emulator.aibo_dog import AiboEmulator
 from sim.robots.emulator.bittle import Bittle
 from sim.robots.emulator.body import MemoryBody
 from sim.robots.emulator.create2 import Create2
 from sim.robots.emulator.rosbridge import RosbridgeRobot
-from swarmnode.driver.witness import Ear
+from swarmnode.driver.ground import Ear
+from tests.drivers.contract import RobotCase
 
-STEP = 0.005
 FROZEN_S = 2.0
 
 
@@ -34,43 +30,33 @@ class WatchedBody(MemoryBody):
     told: list[tuple[float, float, float]] = field(default_factory=list)
 
     def drive(self, vx: float, vy: float, wz: float) -> None:
-        """Move, and keep it."""
         self.told.append((vx, vy, wz))
         super().drive(vx, vy, wz)
 
 
-class LateTests(SynchronousTestCase):
+class LateTests(RobotCase):
     """Each driver whose robot does not look at deadlines itself, frozen for a while after a command."""
 
-    def setUp(self) -> None:
-        """A body, and a clock that can jump."""
-        self.clock = Clock()
-        self.body = WatchedBody()
+    def build(self) -> None:
+        """A body that keeps what it was told."""
+        self.body = self.watched = WatchedBody()
 
-    def pass_time(self, seconds: float) -> None:
-        """Turn the clock as it turns when nothing is late."""
-        for _ in range(round(seconds / STEP)):
-            self.clock.advance(STEP)
+    def tearDown(self) -> None:
+        """The robots go on."""
 
     def enabled(self, kind: str, connector: Any, settle: float = 1.0, **options: object) -> Driver:
-        """A driver whose robot may move."""
-        driver = driver_for(kind, options, "robot", self.clock, connector)
-        connected = driver.connect()
-        self.pass_time(settle)
-        self.successResultOf(connected)
-        enabled = driver.enable()
-        self.pass_time(settle)
-        self.assertIs(self.successResultOf(enabled), True)
+        self.kind, self.connector = kind, connector
+        driver: Driver = self.ready(settle, **options)
         return driver
 
     def freeze(self, driver: Driver, permitted: float, before: float = 0.0) -> None:
         """Permit a motion, let time jump beyond its deadline, and see that the robot is told to halt and no more."""
-        driver.act({"base.vx": 0.1}, Permit(1, self.clock.seconds() + permitted))
+        driver.act({"base.vx": 0.1}, self.permit(seconds=permitted))
         self.pass_time(before)
-        self.body.told.clear()
+        self.watched.told.clear()
         self.clock.advance(FROZEN_S)
         self.pass_time(2.5)
-        self.assertEqual([one for one in self.body.told if any(one)], [])
+        self.assertEqual([one for one in self.watched.told if any(one)], [])
         self.assertEqual(self.body.motion, (0.0, 0.0, 0.0))
 
     def test_aibo(self) -> None:
@@ -79,7 +65,9 @@ class LateTests(SynchronousTestCase):
             self.setUp()
             dog = AiboEmulator(self.clock, self.body, Random(1))
             dog.start()
-            self.freeze(self.enabled("aibo", dog.connector(), host="dog", camera=False), 0.7, 0.4 + 2 * phase * STEP)
+            self.freeze(
+                self.enabled("aibo", dog.connector(), host="dog", camera=False), 0.7, 0.4 + 2 * phase * self.STEP_S
+            )
 
     def test_rosbridge(self) -> None:
         """The velocity that is published ten times a second is not published after its deadline."""
@@ -133,5 +121,5 @@ class LateTests(SynchronousTestCase):
                 robot = Bittle(self.body, self.clock, Random(1), board=board)
                 connector = MemoryConnector(self.clock, robot.accept_http)
                 driver = self.enabled("bittle", connector, 1.5, host="10.0.0.5", board=board)
-                self.pass_time(phase * STEP)
+                self.pass_time(phase * self.STEP_S)
                 self.freeze(driver, 0.5)

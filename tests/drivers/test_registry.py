@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import subprocess
 import sys
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 from twisted.internet.task import Clock
 from twisted.trial.unittest import SynchronousTestCase
@@ -14,16 +16,70 @@ import drivers
 from drivers.errors import UsageError
 from drivers.registry import built_in_kinds, describe, driver_for, kinds
 
+NEEDED: dict[str, dict[str, object]] = {
+    "aibo": {"host": "dog1"},
+    "bittle": {"port": "/dev/ttyUSB0"},
+    "camera": {"source": "video.avi"},
+    "compass": {"host": "board"},
+    "create2": {"port": "/dev/ttyUSB0"},
+}
+"""The options that a kind, or its test, cannot do without."""
+NO_NUMBERS = (True, math.nan)
+WRONG: list[tuple[str, str, object]] = [
+    *((kind, "colour", "red") for kind in built_in_kinds()),
+    *(("aibo", "host", value) for value in (7, "")),
+    *(("aibo", "camera_fps", value) for value in (31, *NO_NUMBERS)),
+    *(("aibo", "speed", value) for value in ([1.0], [0.0, 1.0, 1.0, 1.0], "fast")),
+    *(("aibo", "ports", value) for value in (7, {"walk": 0}, {"warp": 1})),
+    *(("aibo", "camera", "no"), ("aibo", "camera_transport", "pigeon"), ("aibo", "camera_width", 416)),
+    *(("bittle", key, 7) for key in ("port", "host")),
+    *(("bittle", "host", "10.0.0.1"), ("bittle", "baud", 9600), ("bittle", "http_port", 0), ("bittle", "board", "esp")),
+    *(("bittle", "gaits", value) for value in ({}, {"w f": [0.1, 0]}, {"wkF": [0.1]}, {"wkF": [math.nan, 0]})),
+    *(("bittle", "gaits", {"vtL": [0, 1]}), ("bittle", "ultrasonic", [16])),
+    *(("camera", "source", value) for value in (-1, "", True, "a\nb")),
+    *(("camera", "width", 8), ("camera", "width", 20.5), ("camera", "fps", 0), ("camera", "fps", "10")),
+    *(("camera", "fps", math.nan), ("camera", "lens", True), ("camera", "quality", 96), ("camera", "ahead", 6)),
+    *(("compass", "host", ""), ("compass", "device", 7), ("compass", "port", 0), ("compass", "port", True)),
+    *(("compass", "baud", 300), ("compass", "baud", "4800"), ("compass", "mounted_deg", 361), ("compass", "rate", 0)),
+    *(("compass", "mounted_deg", math.nan), ("compass", "variation_deg", True)),
+    *(("create2", "port", 7), ("create2", "port", ""), ("create2", "baud", 9600), ("create2", "baud", "fast")),
+    *(("create2", "mode", "passive"), ("create2", "mode", ["safe"]), ("create2", "max_speed", 0.6)),
+    *(("create2", "max_speed", True), ("create2", "max_turn", math.nan)),
+    *(("phone", "width", 8), ("phone", "height", 641), ("phone", "width", 20.0), ("phone", "orientation", 1)),
+    *(("rosbridge", "host", ""), ("rosbridge", "port", 0), ("rosbridge", "port", True), ("rosbridge", "path", "x")),
+    *(("rosbridge", "path", "/a b"), ("rosbridge", "ros", 3), ("rosbridge", "velocity_topic", "")),
+    *(("rosbridge", "velocity_type", "x"), ("rosbridge", "odometry_topic", "odom"), ("rosbridge", "camera_fps", 31)),
+    *(("rosbridge", "max_vx", math.nan), ("rosbridge", "max_vx", 0), ("rosbridge", "max_wz", "2")),
+    *(("rosbridge", "battery_full", True), ("rosbridge", "battery_full", 10), ("rosbridge", "scan_turn", 1e3)),
+    *(("rosbridge", "services", value) for value in ({"a b": "/x"}, {"a": "x"}, 1)),
+    *(("sim", "robot", 7), ("sim", "robot", ""), ("sim", "host", ""), ("sim", "port", "7400"), ("sim", "port", 0)),
+    *(("sim", "camera_fps", value) for value in (31, *NO_NUMBERS)),
+    ("sim", "camera", "no"),
+]
+"""Kind, option and a value that it does not allow."""
+INCOMPLETE: list[tuple[str, dict[str, object], str]] = [
+    ("aibo", {}, "host"),
+    ("aibo", {"host": "dog1.local", "camera_transport": "udp"}, "numeric"),
+    ("bittle", {}, "port"),
+    ("bittle", {"host": "10.0.0.1"}, "board"),
+    ("compass", {}, "either"),
+    ("compass", {"host": "a", "device": "b"}, "either"),
+    ("create2", {}, "/dev/ttyUSB0"),
+    ("rosbridge", {"odometry_topic": "", "scan_topic": ""}, "odometry_topic"),
+]
+"""Options that do not go together, and a word of the error."""
+
 
 class RegistryTests(SynchronousTestCase):
     """Kind to driver."""
 
     def test_makes_a_driver(self) -> None:
-        """The driver of kind sim is made idle, described, and named after the device where the options do not say."""
-        driver = driver_for("sim", {"port": 7400}, "dog2", Clock())
-        self.assertEqual(driver.state, "idle")
-        self.assertEqual(driver.description, describe("sim", {"port": 7400}))
-        self.assertEqual(driver.description.kind, "aibo-ers7")
+        """A driver of each kind is made idle, and is what its description says."""
+        connector: Any = object()
+        for kind in built_in_kinds():
+            options = NEEDED.get(kind, {})
+            driver = driver_for(kind, options, "dog2", Clock(), connector)
+            self.assertEqual((driver.state, driver.description), ("idle", describe(kind, options, "dog2")), kind)
 
     def test_every_kind_is_complete(self) -> None:
         """Each package of a driver is found, is described in one line, and has both functions of the registry."""
@@ -42,21 +98,12 @@ class RegistryTests(SynchronousTestCase):
 
     def test_names_the_wrong_option(self) -> None:
         """Each wrong option is refused in one line that names its key and what to write."""
-        for key, value in (
-            ("robot", 7),
-            ("robot", ""),
-            ("host", ""),
-            ("port", "7400"),
-            ("port", 0),
-            ("camera_fps", 31),
-            ("camera_fps", True),
-            ("camera_fps", float("nan")),
-            ("camera", "no"),
-            ("colour", "red"),
-        ):
-            line = str(self.assertRaises(UsageError, describe, "sim", {key: value}))
+        for kind, key, value in WRONG:
+            line = str(self.assertRaises(UsageError, describe, kind, {**NEEDED.get(kind, {}), key: value}))
             self.assertIn(key, line)
             self.assertNotIn("\n", line)
+        for kind, options, words in INCOMPLETE:
+            self.assertIn(words, str(self.assertRaises(UsageError, describe, kind, options)))
 
     def test_leaves_the_camera_out_of_the_description(self) -> None:
         """A dog with its camera off does not offer one."""

@@ -51,7 +51,6 @@ def spoilt(message: Any, path: tuple[Any, ...], value: Any) -> Any:
 
 
 def paths(message: Any, start: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    """Every place of a message."""
     steps = message.items() if isinstance(message, dict) else enumerate(message) if isinstance(message, list) else ()
     return [path for key, value in steps for path in ((*start, key), *paths(value, (*start, key)))]
 

@@ -6,86 +6,44 @@ import math
 from random import Random
 from typing import Any
 
-from twisted.internet.task import Clock
-from twisted.trial.unittest import SynchronousTestCase
-
-from drivers.errors import LinkLost, NoReply, RobotError, Unsupported, UsageError
+from drivers.conformance import Conformance
+from drivers.errors import LinkLost, NoReply, RobotError, Unsupported
 from drivers.link import Link, MemoryConnector
-from drivers.registry import describe, driver_for
+from drivers.registry import describe
 from drivers.rosbridge.driver import CALL_S, SOURCE_S, RosbridgeDriver
 from drivers.rosbridge.link import SILENCE_S
-from sim.robots.emulator.body import MemoryBody
 from sim.robots.emulator.rosbridge import RosbridgeRobot
-from tests.drivers.contract import BodyContract
+from tests.drivers.contract import KeptLog, RobotCase
 
-STEP = 0.005
 JPEG = b"\xff\xd8\xff\xc0\x00\x0b\x08\x00\x60\x00\x80\x01\x11\x00\x00\xff\xd9"
 """128 x 96, as far as its head goes."""
 IMAGE = "/camera/image_raw/compressed"
 
 
-class Told:
-    """A log that keeps the warnings."""
-
-    def __init__(self, warnings: list[str]) -> None:
-        self.warnings = warnings
-
-    def warn(self, _format: str, text: str, **_rest: object) -> None:
-        self.warnings.append(text)
-
-
-class RosbridgeDriverTests(BodyContract, SynchronousTestCase):
+class RosbridgeDriverTests(Conformance, RobotCase):
     """A ROS robot keeps the contract, and what is its own."""
 
-    def setUp(self) -> None:
-        """A robot on a clock that is turned by hand."""
-        self.clock = Clock()
-        self.body = MemoryBody(jpeg=JPEG, values={"power.level": 0.8, "range.near": 0.5, "range.left": math.nan})
-        # The floor is no obstacle.
-        self.body.values["range.chest"] = 0.2
+    kind = "rosbridge"
+
+    def build(self) -> None:
+        """A robot; the floor is no obstacle."""
+        self.body.jpeg = JPEG
+        self.body.values = {"power.level": 0.8, "range.near": 0.5, "range.left": math.nan, "range.chest": 0.2}
         self.robot = RosbridgeRobot(self.clock, self.body, Random(1))
         self.robot.start()
         self.connector = MemoryConnector(self.clock, self.robot.accept)
-        self.drivers: list[RosbridgeDriver] = []
-
-    def tearDown(self) -> None:
-        """Nothing is left on the clock once all have gone."""
-        for driver in self.drivers:
-            driver.disconnect()
-        self.robot.stop()
-        self.pass_time(0.02)
-        self.assertEqual(self.clock.getDelayedCalls(), [])
-
-    def make_driver(self, **options: object) -> RosbridgeDriver:
-        """A driver of the robot."""
-        driver = RosbridgeDriver(options, self.connector, self.clock, "turtle")
-        self.drivers.append(driver)
-        return driver
-
-    def connected(self, **options: object) -> RosbridgeDriver:
-        """A driver that is connected and enabled."""
-        driver = self.make_driver(**options)
-        driver.connect()
-        self.pass_time(0.4)
-        driver.enable()
-        self.pass_time(0.4)
-        return driver
 
     def values(self, driver: RosbridgeDriver) -> dict[str, Any]:
-        """What it sees."""
-        seen = driver.observe()
-        assert seen is not None
-        return dict(seen.values)
+        return dict(self.newest(driver).values)
 
     def heard(self, op: str) -> list[dict[str, Any]]:
-        """What the robot was told."""
         return [said for said in self.robot.heard if said["op"] == op]
 
     def test_drives_with_the_type_that_the_robot_listens_to(self) -> None:
         """Both Twist and TwistStamped robots move, of ROS 1 and 2, with nothing set: the robot is asked."""
         for kind in ("geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped", "geometry_msgs/Twist"):
             self.robot.velocity_type = kind
-            driver = self.connected()
+            driver = self.ready()
             driver.act({"base.vx": 0.2, "base.wz": -0.5}, self.permit())
             self.pass_time(0.1)
             self.assertEqual(self.body.motion, (0.2, 0.0, -0.5), kind)
@@ -145,7 +103,7 @@ class RosbridgeDriverTests(BodyContract, SynchronousTestCase):
         """A type that is set wrongly does not move the robot, and the warning names the option."""
         warnings: list[str] = []
         driver = self.make_driver(velocity_type="twist_stamped")
-        driver._warn = warnings.append  # type: ignore[assignment,method-assign]
+        driver._warn = warnings.append
         driver.connect()
         self.pass_time(0.3)
         self.assertIn('velocity_type = "twist"', warnings[0])
@@ -153,7 +111,7 @@ class RosbridgeDriverTests(BodyContract, SynchronousTestCase):
 
     def test_says_the_velocity_again_and_zero_at_the_end(self) -> None:
         """While it is in force it is published ten times a second; at the deadline zero is, once, and then nothing."""
-        driver = self.connected()
+        driver = self.ready()
         self.robot.heard.clear()
         driver.act({"base.vx": 0.1}, self.permit(seconds=1.0))
         self.pass_time(1.5)
@@ -165,7 +123,7 @@ class RosbridgeDriverTests(BodyContract, SynchronousTestCase):
 
     def test_stops_at_its_base_when_the_link_is_lost(self) -> None:
         """With nobody left to say zero, the base stops by itself; the new link begins with zero."""
-        driver = self.connected()
+        driver = self.ready()
         driver.act({"base.vx": 0.2}, self.permit(seconds=5.0))
         self.pass_time(0.2)
         self.connector.is_open = False
@@ -181,11 +139,11 @@ class RosbridgeDriverTests(BodyContract, SynchronousTestCase):
 
     def test_sees_what_its_topics_say(self) -> None:
         """Place, speed, sectors of the scan, battery, attitude and picture are observed in SI."""
-        driver = self.connected(imu_topic="/imu", image_topic=IMAGE)
+        driver = self.ready(imu_topic="/imu", image_topic=IMAGE)
         driver.act({"base.vx": 0.1, "base.wz": 0.5}, self.permit(seconds=1.0))
         self.pass_time(0.5)
-        seen, values = driver.observe(), self.values(driver)
-        assert seen is not None and seen.frame is not None
+        seen, values = self.newest(driver), self.values(driver)
+        assert seen.frame is not None
         self.assertEqual((values["base.vx"], values["base.wz"], values["base.moving"]), (0.1, 0.5, True))
         self.assertLess(abs(values["odom.yaw"] - self.body.yaw), 0.05)
         self.assertEqual(values["range.front"], 0.5)
@@ -198,7 +156,7 @@ class RosbridgeDriverTests(BodyContract, SynchronousTestCase):
 
     def test_asks_for_as_many_pictures_as_are_wanted(self) -> None:
         """More or fewer pictures are subscribed to anew, none is unsubscribed; without a topic there is no camera."""
-        driver = self.connected(image_topic=IMAGE, camera_fps=5)
+        driver = self.ready(image_topic=IMAGE, camera_fps=5)
         driver.set_camera_fps(0)
         self.pass_time(0.1)
         before = driver.diagnostics()["pictures"]
@@ -207,13 +165,13 @@ class RosbridgeDriverTests(BodyContract, SynchronousTestCase):
         driver.set_camera_fps(5)
         self.pass_time(2.0)
         self.assertIn(driver.diagnostics()["pictures"] - before, range(8, 11))
-        blind = self.connected()
+        blind = self.ready()
         blind.set_camera_fps(5)
         self.assertEqual((blind.camera_fps, "camera" in blind.description.capabilities), (0.0, False))
 
     def test_leaves_out_what_a_silent_topic_said(self) -> None:
         """A scanner that falls silent ages visibly; after two seconds its distances are no longer shown as new."""
-        driver = self.connected()
+        driver = self.ready()
         for client in self.robot._clients:
             client._topics.pop("/scan")
         self.pass_time(SOURCE_S - 0.5)
@@ -226,7 +184,7 @@ class RosbridgeDriverTests(BodyContract, SynchronousTestCase):
     def test_switches_motors_that_there_are(self) -> None:
         """With a motor service, enable and disable are the robot's own word; one that is missing answers nothing."""
         self.robot.has_motor_power = False
-        driver = self.connected(motor_service="/motor_power")
+        driver = self.ready(motor_service="/motor_power")
         self.assertTrue(self.robot.has_motor_power)
         driver.disable()
         self.pass_time(0.2)
@@ -241,7 +199,7 @@ class RosbridgeDriverTests(BodyContract, SynchronousTestCase):
 
     def test_has_the_skills_that_are_set(self) -> None:
         """A skill calls its service and fires with its answer; unknown, failing, lost and late ones fail by name."""
-        driver = self.connected(services={"dock": "/dock", "sing": "/sing"})
+        driver = self.ready(services={"dock": "/dock", "sing": "/sing"})
         self.assertEqual(driver.description.skills, ("dock", "sing"))
         docked, sung = driver.invoke("dock"), driver.invoke("sing")
         self.pass_time(0.1)
@@ -260,16 +218,15 @@ class RosbridgeDriverTests(BodyContract, SynchronousTestCase):
 
     def test_counts_what_rosbridge_complains_about(self) -> None:
         """An error that rosbridge states is counted and warned of once; other topics and late answers are nothing."""
-        warnings: list[str] = []
-        driver = self.connected()
-        driver.log = Told(warnings)  # type: ignore[assignment]
+        driver = self.ready()
+        driver.log = log = KeptLog()
         for _ in range(2):
             driver.bridge_said(b'{"op":"status","level":"error","msg":"no such type"}')
             driver.bridge_said(b'{"op":"status","level":"info","msg":"hello"}')
             driver.bridge_said(b'{"op":"publish","topic":"/rosout","msg":{}}')
             driver.bridge_said(b'{"op":"service_response","id":"call:99","values":{}}')
         self.assertEqual((driver.diagnostics()["refused"], driver.diagnostics()["bad_frames"]), (2, 0))
-        self.assertEqual(warnings, ["rosbridge says: no such type"])
+        self.assertEqual(log.lines, ["robot: rosbridge says: no such type"])
 
     def test_calls_what_speaks_no_rosbridge_ever_more_slowly(self) -> None:
         """Another server at that port is left alone ever longer, to five seconds; connect goes on waiting."""
@@ -302,7 +259,7 @@ class RosbridgeDriverTests(BodyContract, SynchronousTestCase):
 
     def test_lives_with_a_foul_wire(self) -> None:
         """Garbage, losses, delay and cuts anywhere cost frames and links, and never the driver."""
-        driver = self.connected(image_topic=IMAGE)
+        driver = self.ready(image_topic=IMAGE)
         self.robot.faults.garbage, self.robot.faults.drop = 0.1, 0.05
         self.robot.faults.split, self.robot.faults.delay = True, 0.02
         self.pass_time(20.0)
@@ -316,7 +273,7 @@ class RosbridgeDriverTests(BodyContract, SynchronousTestCase):
 
     def test_notices_a_link_that_is_half_open(self) -> None:
         """A robot that says nothing more over an open link is stale at once, and called again after three seconds."""
-        driver = self.connected()
+        driver = self.ready()
         self.robot.faults.half_open = True
         self.pass_time(0.7)
         self.assertEqual(driver.state, "stale")
@@ -326,33 +283,8 @@ class RosbridgeDriverTests(BodyContract, SynchronousTestCase):
         self.pass_time(9.0)
         self.assertEqual(driver.state, "ready")
 
-    def test_survives_a_reboot(self) -> None:
-        """A robot that reboots comes back at rest, and its clock may begin again."""
-        driver = self.connected()
-        driver.act({"base.vx": 0.2}, self.permit(seconds=5.0))
-        self.pass_time(0.5)
-        self.robot.reboot()
-        self.pass_time(1.0)
-        seen = driver.observe()
-        assert seen is not None
-        self.assertEqual((driver.state, self.true_speed()), ("ready", 0.0))
-        self.assertLess(seen.t_robot, 1.5)
-
-    def test_is_made_by_the_registry(self) -> None:
-        """The kind is known, described without a link, and its wrong options are refused in one line with a remedy."""
-        self.assertIsInstance(driver_for("rosbridge", {}, "turtle", self.clock, self.connector), RosbridgeDriver)
+    def test_is_described_by_its_options(self) -> None:
+        """A robot that goes sideways has a limit for it, and sensors are those of its topics."""
         holonomic = describe("rosbridge", {"max_vy": 0.3, "model": "Omni", "imu_topic": "/imu"})
         self.assertEqual(holonomic.limits["base.vy"], (-0.3, 0.3))
         self.assertIn("imu", holonomic.capabilities)
-        wrong: tuple[tuple[str, object], ...] = (
-            *(("colour", 1), ("host", ""), ("port", 0), ("port", True), ("path", "x"), ("path", "/a b"), ("ros", 3)),
-            *(("velocity_topic", ""), ("velocity_type", "x"), ("odometry_topic", "odom"), ("camera_fps", 31)),
-            *(("max_vx", math.nan), ("max_vx", 0), ("max_wz", "2"), ("battery_full", True), ("battery_full", 10)),
-            *(("services", {"a b": "/x"}), ("services", {"a": "x"}), ("services", 1), ("scan_turn", 1e3)),
-        )
-        for key, value in wrong:
-            line = str(self.assertRaises(UsageError, describe, "rosbridge", {key: value}))
-            self.assertIn(key, line)
-            self.assertNotIn("\n", line)
-        none = {"odometry_topic": "", "scan_topic": ""}
-        self.assertIn("odometry_topic", str(self.assertRaises(UsageError, describe, "rosbridge", none)))

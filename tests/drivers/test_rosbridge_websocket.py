@@ -4,16 +4,9 @@ from __future__ import annotations
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from drivers.rosbridge.websocket import MAX_MESSAGE, WebSocket
+from drivers.rosbridge.websocket import WebSocket
 from formats.head import MAX_HEAD
-from tests.formats.rfc6455 import BINARY, CLOSE, PING, PONG, TEXT, answer_to, framed
-
-
-def client() -> WebSocket:
-    """One that has been greeted."""
-    one = WebSocket("server.example.com", "/chat")
-    one.received(answer_to(one.opening()))
-    return one
+from tests.formats.rfc6455 import answer_to
 
 
 class GreetingTests(SynchronousTestCase):
@@ -46,22 +39,3 @@ class GreetingTests(SynchronousTestCase):
             one = WebSocket()
             self.assertTrue(one.received(said)[1].startswith(b"HTTP/1.1 400"))
             self.assertTrue(one.fault)
-
-
-class MessageTests(SynchronousTestCase):
-    def test_hears_text_and_pictures(self) -> None:
-        """Messages of both kinds are heard, those of the largest pictures too; a ping is answered."""
-        one = client()
-        said = [b"{}", bytes(MAX_MESSAGE)]
-        messages, reply = one.received(
-            framed(TEXT, said[0], None) + framed(BINARY, said[1], None) + framed(PING, b"", None)
-        )
-        self.assertEqual((messages, reply[0] & 0x0F, one.frames), (said, PONG, 3))
-
-    def test_ends(self) -> None:
-        """A close is answered by a close; a message that is too long ends the connection."""
-        one = client()
-        self.assertEqual(one.received(framed(CLOSE, b"\x03\xe8bye", None))[1][0] & 0x0F, CLOSE)
-        other = client()
-        other.received(b"\x82\x7f" + (MAX_MESSAGE + 1).to_bytes(8, "big") + bytes(MAX_MESSAGE + 1))
-        self.assertIn("more than", other.fault)

@@ -29,7 +29,6 @@ class Device(StringTransport):
         self.dataBuffer += data
 
     def flush(self) -> None:
-        """Let everything leave."""
         super().write(self.dataBuffer)
         self.dataBuffer = b""
         if self.is_leaving:
@@ -72,19 +71,15 @@ class SerialTests(SynchronousTestCase):
         return self.devices[-1]
 
     def link_up(self, link: Link) -> None:
-        """A link opens."""
         self.links.append(link)
 
     def link_down(self) -> None:
-        """A link is lost."""
         self.downs += 1
 
     def received(self, data: bytes) -> None:
-        """Bytes come."""
         self.heard.append(data)
 
     def line(self) -> SerialLine:
-        """A line to a device."""
         line = SerialConnector(self.clock, self.opened).call("/dev/robot", 115200, self)
         assert isinstance(line, SerialLine)
         return line
@@ -161,11 +156,12 @@ class SerialTests(SynchronousTestCase):
         self.assertEqual(self.clock.getDelayedCalls(), [])
 
     def test_hangs_up_on_a_device_that_takes_nothing(self) -> None:
-        """A device that never takes the last bytes is closed after a second all the same."""
+        """A device that never takes the last bytes is closed after a second, also where it is hung up on twice."""
         line = self.line()
         self.clock.advance(0.0)
         self.links[0].send(b"stop")
         gone = line.hang_up()
+        line.hang_up()
         self.clock.advance(FLUSH_S)
         self.successResultOf(gone)
         self.assertEqual(self.clock.getDelayedCalls(), [])

@@ -31,7 +31,7 @@ from drivers.sim.codec import (
 )
 
 DOG = {"name": "dog1", "x": 1.0, "y": 2.0, "heading": 0.5, "moving": False, "stripes": 1}
-SNAPSHOT = {"t": 1.0, "walls": (3.0, 2.4), "dogs": (DOG,), "target": None, "collisions": 0}
+SNAPSHOT = {"t": 1.0, "walls": [3.0, 2.4], "dogs": [DOG], "target": None, "collisions": 0}
 MESSAGES: list[Message] = [
     Hello(1, "dog1", 15.0),
     Overlook(1, 10.0),
@@ -40,7 +40,7 @@ MESSAGES: list[Message] = [
     Halt(),
     Alive(),
     Order(3, "move_dog", ("dog1", 1.0, 2.0, 0.0)),
-    Sensors(1.5, {"range.near": 0.3, "base.moving": True}, {"imu.ax": (0.1, 0.2, 0.3, 0.4)}),
+    Sensors(1.5, {"range.near": 0.3, "base.moving": True}, {"imu.ax": (0.1, 0.2, 0.3, 0.4)}, 0),
     Picture(9, 1.5, 208, 160, b"\xff\xd8jpeg"),
     Truth(SNAPSHOT),
     Done(3, ""),
@@ -119,7 +119,6 @@ class FrameReaderTests(SynchronousTestCase):
     """A stream of bytes to messages."""
 
     def setUp(self) -> None:
-        """All messages in one stream."""
         self.stream = b"".join(encoded(message) for message in MESSAGES)
         self.reader = FrameReader()
 

@@ -6,9 +6,11 @@ import json
 import math
 from random import Random
 
+from twisted.internet.defer import Deferred
 from twisted.internet.task import Clock
 from twisted.trial.unittest import SynchronousTestCase
 
+from drivers.conformance import Conformance
 from drivers.driver import Permit
 from drivers.errors import LinkLost, NoReply, NotEnabled, Unsupported, UsageError
 from drivers.link import Link, MemoryConnector, Receiver
@@ -17,7 +19,7 @@ from drivers.sim.driver import SimDriver
 from drivers.sim.operator import YardOperator
 from sim.robots.scene import loaded
 from sim.robots.yard import Yard
-from tests.drivers.contract import DriverContract
+from tests.drivers.contract import RobotCase
 
 
 def pump(clock: Clock, seconds: float) -> None:
@@ -25,55 +27,25 @@ def pump(clock: Clock, seconds: float) -> None:
     clock.pump([0.004] * round(seconds / 0.004))
 
 
-class SimDriverTests(DriverContract, SynchronousTestCase):
+class SimDriverTests(Conformance, RobotCase):
     """A dog of the yard keeps the contract, and what is its own."""
 
-    def setUp(self) -> None:
-        """A yard on a clock that is turned by hand."""
-        self.clock = Clock()
-        self.yard = Yard(self.clock, Random(1), loaded("three-dogs"))
+    STEP_S = 0.004
+    kind = "sim"
+    options = {"robot": "dog1", "camera": False}
+
+    def build(self) -> None:
+        self.yard = self.robot = Yard(self.clock, Random(1), loaded("three-dogs"))
         self.yard.start()
         self.connector = self.yard.connector()
-        self.drivers: list[SimDriver] = []
-
-    def tearDown(self) -> None:
-        """Nothing is left on the clock once all have gone."""
-        for driver in self.drivers:
-            driver.disconnect()
-        self.yard.stop()
-        pump(self.clock, 0.02)
-        self.assertEqual(self.clock.getDelayedCalls(), [])
-
-    def make_driver(self, **options: object) -> SimDriver:
-        """A driver of dog1."""
-        driver = SimDriver({"robot": "dog1", "camera": False, **options}, self.connector, self.clock)
-        self.drivers.append(driver)
-        return driver
-
-    def pass_time(self, seconds: float) -> None:
-        """Turn the clock."""
-        pump(self.clock, seconds)
-
-    def now(self) -> float:
-        """The turned clock."""
-        return self.clock.seconds()
 
     def true_speed(self) -> float:
-        """What the physics says."""
         motion = self.yard.world.dogs["dog1"].motion
         return math.hypot(motion.vx, motion.vy)
 
-    def cut_link(self) -> None:
-        """Break the memory link."""
-        self.connector.cut()
-
     def test_shows_every_key_with_four_samples(self) -> None:
         """An observation has the keys of an ERS-7, and the rangers and accelerometers four samples each."""
-        driver = self.make_driver()
-        driver.connect()
-        self.pass_time(0.2)
-        seen = driver.observe()
-        assert seen is not None
+        seen = self.newest(self.connected())
         self.assertEqual(
             set(seen.values),
             {"base.vx", "base.vy", "base.wz", "base.moving", "odom.x", "odom.y", "odom.yaw", "range.near", "range.far"}
@@ -95,10 +67,10 @@ class SimDriverTests(DriverContract, SynchronousTestCase):
         self.pass_time(2.0)
         self.assertEqual(driver.diagnostics()["pictures"], 30)
         self.assertEqual(seen - {0}, set(range(1, 31)))
-        newest = driver.observe()
-        assert newest is not None and newest.frame is not None
-        self.assertTrue(newest.frame.data.startswith(b"\xff\xd8") and newest.frame.data.endswith(b"\xff\xd9"))
-        self.assertEqual((newest.frame.width, newest.frame.height), (208, 160))
+        frame = self.newest(driver).frame
+        assert frame is not None
+        self.assertTrue(frame.data.startswith(b"\xff\xd8") and frame.data.endswith(b"\xff\xd9"))
+        self.assertEqual((frame.width, frame.height), (208, 160))
 
     def test_is_told_that_there_is_no_such_robot(self) -> None:
         """Connecting to a robot that the yard lacks fails at once, with the names of those that it has."""
@@ -121,17 +93,6 @@ class SimDriverTests(DriverContract, SynchronousTestCase):
         self.pass_time(0.5)
         self.successResultOf(connected)
 
-    def test_finds_a_yard_that_starts_later(self) -> None:
-        """Connect waits, with back-off, for a yard that is not there yet."""
-        self.connector.is_open = False
-        driver = self.make_driver()
-        connected = driver.connect()
-        self.pass_time(5.0)
-        self.assertNoResult(connected)
-        self.connector.is_open = True
-        self.pass_time(2.2)
-        self.successResultOf(connected)
-
     def test_is_stale_when_the_yard_falls_silent(self) -> None:
         """A yard that sends nothing though its link is open makes the driver stale, and act refuses."""
         driver = self.ready()
@@ -141,22 +102,6 @@ class SimDriverTests(DriverContract, SynchronousTestCase):
         self.pass_time(SimDriver.STALE_S + 0.1)
         self.assertEqual(driver.state, "stale")
         self.assertRaises(NotEnabled, driver.act, {"base.vx": 0.1}, self.permit())
-
-    def test_gives_up_on_the_way(self) -> None:
-        """Disconnecting before the first observation fails the Deferred of connect."""
-        driver = self.make_driver()
-        connected = driver.connect()
-        driver.disconnect()
-        self.failureResultOf(connected, LinkLost)
-
-    def test_refuses_a_second_connect_and_an_early_enable(self) -> None:
-        """Asking out of order is answered with what to do."""
-        driver = self.make_driver()
-        self.failureResultOf(driver.enable(), LinkLost)
-        connected = driver.connect()
-        self.failureResultOf(driver.connect(), UsageError)
-        self.pass_time(0.1)
-        self.successResultOf(connected)
 
     def test_replays_from_a_seed(self) -> None:
         """The same seed and the same commands give the same observations and pictures, bit by bit."""
@@ -187,11 +132,9 @@ class MuteRobot:
         self.tell()
 
     def tell(self) -> None:
-        """Say what is felt, motors off."""
-        self.link.send(encoded(Sensors(1.0, {"estop.engaged": True}, {})))
+        self.link.send(encoded(Sensors(1.0, {"estop.engaged": True}, {}, 0)))
 
     def received(self, data: bytes) -> None:
-        """Hear, and do nothing."""
         self.heard += data
 
     def link_down(self) -> None:
@@ -211,7 +154,6 @@ class SimDriverAloneTests(SynchronousTestCase):
         pump(self.clock, 0.02)
 
     def accept(self, link: Link) -> Receiver:
-        """Take the driver's call."""
         self.robots.append(MuteRobot(link))
         return self.robots[-1]
 
@@ -224,6 +166,16 @@ class SimDriverAloneTests(SynchronousTestCase):
         self.failureResultOf(enabled, NoReply)
         self.assertIn(encoded(Motors(True)), self.robots[0].heard)
 
+    def test_answers_every_switch(self) -> None:
+        """A switch that is asked for while another one fails is answered as the last one is."""
+        again: list[Deferred[bool]] = []
+        self.driver.enable().addErrback(lambda _: again.append(self.driver.enable()))
+        last = self.driver.disable()
+        pump(self.clock, 1.1)
+        for switched in (*again, last):
+            self.failureResultOf(switched, NoReply)
+        self.assertEqual(len(again), 1)
+
     def test_lives_on_after_bad_bytes(self) -> None:
         """Rubbish and messages that only clients send are counted and dropped."""
         self.robots[0].link.send(b"rubbish" + encoded(Motors(True)))
@@ -234,7 +186,7 @@ class SimDriverAloneTests(SynchronousTestCase):
 
     def test_ends_the_motion_on_its_own_side_too(self) -> None:
         """At the deadline the driver itself sends a halt, once."""
-        self.robots[0].link.send(encoded(Sensors(1.0, {"estop.engaged": False}, {})))
+        self.robots[0].link.send(encoded(Sensors(1.0, {"estop.engaged": False}, {}, 0)))
         pump(self.clock, 0.02)
         self.driver.act({"base.vx": 0.1}, Permit(1, self.clock.seconds() + 0.1))
         before = self.robots[0].heard

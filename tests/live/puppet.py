@@ -49,13 +49,11 @@ def pid_of(driver: BaseDriver) -> int:
 
 
 def say(*words: object) -> None:
-    """One line."""
     sys.stdout.write(" ".join(map(str, words)) + "\n")
     sys.stdout.flush()
 
 
 async def run(kind: str, options: dict[str, Any]) -> None:
-    """Connect, enable, and listen."""
     driver = driver_for(kind, options, "puppet", REACTOR)
     assert isinstance(driver, BaseDriver)
     REACTOR.addSystemEventTrigger("before", "shutdown", driver.disconnect)

@@ -5,9 +5,7 @@ from __future__ import annotations
 import random
 
 from twisted.internet import reactor
-from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
-from twisted.internet.task import deferLater
 from twisted.trial.unittest import TestCase
 
 from drivers.aibo.driver import AiboDriver
@@ -17,6 +15,7 @@ from sim.demo.port import free
 from sim.robots.emulator.aibo import AiboServer
 from sim.robots.emulator.aibo_dog import EMULATED, AiboEmulator
 from sim.robots.emulator.body import MemoryBody
+from tests.live.waiting import wait
 from tests.webnode.picture import jpeg
 
 
@@ -30,11 +29,8 @@ class AiboSocketTests(TestCase):
 
     timeout = 30
 
-    def test_drives_and_films(self) -> Deferred[None]:
+    async def test_drives_and_films(self) -> None:
         """Over either transport a dog connects, films, walks, stops, survives a reboot, and leaves its ports free."""
-        return Deferred.fromCoroutine(self._drive_and_film())
-
-    async def _drive_and_film(self) -> None:
         for transport in ("tcp", "udp"):
             await self._drive(transport)
 
@@ -52,17 +48,17 @@ class AiboSocketTests(TestCase):
         await driver.connect()
         self.assertTrue(await driver.enable())
         driver.act({"base.vx": 0.1}, Permit(1, clock.seconds() + 0.5))
-        await deferLater(clock, 0.2, lambda: None)
+        await wait(0.2)
         self.assertGreater(body.motion[0], 0.05)
-        await deferLater(clock, 1.0, lambda: None)
+        await wait(1.0)
         self.assertEqual(body.motion, (0.0, 0.0, 0.0))
         self.assertGreater(driver.diagnostics()["pictures"], 20, transport)
         self.assertEqual(driver.diagnostics()["bad_frames"], 0)
         dog.reboot()
-        await deferLater(clock, 2.5, lambda: None)
+        await wait(2.5)
         self.assertEqual((driver.state, driver.diagnostics()["reconnects"]), ("ready", 1))
         await driver.disconnect()
-        await deferLater(clock, 0.2, lambda: None)
+        await wait(0.2)
         self.assertTrue(dog.is_engaged)
         self.assertEqual(dog.clients, {})
         await server.stop()

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Generator
 from importlib.util import find_spec
 from typing import Any
 
 from twisted.internet import reactor as running
-from twisted.internet.defer import Deferred, inlineCallbacks
-from twisted.internet.task import Clock, deferLater
+from twisted.internet.task import Clock
 from twisted.trial.unittest import TestCase
 
 from drivers.camera.driver import CameraDriver, film_of
@@ -17,6 +15,7 @@ from drivers.camera.option import checked
 from drivers.camera.shots import Shot
 from drivers.camera.thread import ThreadFilm
 from drivers.errors import LinkLost
+from tests.live.waiting import until, wait
 
 reactor: Any = running
 
@@ -49,34 +48,24 @@ class LiveCameraTests(TestCase):
 
     timeout = 30
 
-    @inlineCallbacks
-    def until(self, is_so: Any) -> Generator[Deferred[Any], Any, None]:
-        """Fires when it is so, or fails the test."""
-        for _ in range(500):
-            if is_so():
-                return
-            yield deferLater(reactor, 0.02)
-        self.fail("it did not come to that")
-
-    @inlineCallbacks
-    def test_camera_never_holds_the_reactor_up(self) -> Generator[Deferred[Any], Any, None]:
+    async def test_camera_never_holds_the_reactor_up(self) -> None:
         """A camera that blocks does so in its own thread; one that is lost comes back; the end frees it."""
         lens = SlowLens()
         film = ThreadFilm(lens, reactor.callFromThread)
         driver = CameraDriver(checked({"fps": 30}), film, reactor, "cam")
         connected = driver.connect()
-        yield deferLater(reactor, 0.1)
+        await wait(0.1)
         self.assertNoResult(connected)
         lens.gate.set()
-        yield connected
-        yield self.until(lambda: driver.diagnostics()["reconnects"] == 1)
+        await connected
+        await until(lambda: driver.diagnostics()["reconnects"] == 1)
         self.assertEqual((lens.threads, lens.opened), ({"camera"}, 2))
         driver.set_camera_fps(0)
-        yield deferLater(reactor, 0.1)
+        await wait(0.1)
         before = lens.taken
-        yield deferLater(reactor, 0.2)
+        await wait(0.2)
         self.assertEqual((lens.taken, driver.state), (before, "ready"))
-        yield driver.disconnect()
+        await driver.disconnect()
         self.assertNotIn("camera", [thread.name for thread in threading.enumerate()])
         self.assertEqual(lens.closed, 2)
 

@@ -11,7 +11,6 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
@@ -19,9 +18,6 @@ from random import Random
 from typing import Any
 
 from twisted.internet import reactor
-from twisted.internet.defer import Deferred
-from twisted.internet.interfaces import IReactorTime
-from twisted.internet.task import deferLater
 from twisted.trial.unittest import SkipTest, TestCase
 
 from drivers.deadman.keeper import Keeper
@@ -35,14 +31,15 @@ from sim.robots.emulator.body import MemoryBody
 from sim.robots.emulator.create2 import Create2
 from sim.robots.emulator.pty import PtyPort
 from sim.robots.emulator.rosbridge import RosbridgeRobot
+from tests.drivers.contract import KeptLog
 from tests.live.test_aibo_socket import free_ports
+from tests.live.waiting import CLOCK, until, wait
 
 if not Path("/proc/self/stat").exists():
     raise SkipTest("looks at processes in /proc")
 HAS_SERIAL = find_spec("serial") is not None
 
 ROOT = Path(__file__).resolve().parents[2]
-CLOCK = IReactorTime(reactor)
 REACTOR: Any = reactor
 LATE_S = 0.15
 """So long after its deadline, or after its node was killed, a robot stands."""
@@ -55,33 +52,21 @@ class TimedBody(MemoryBody):
     told: list[tuple[float, tuple[float, float, float]]] = field(default_factory=list)
 
     def drive(self, vx: float, vy: float, wz: float) -> None:
-        """Move, and keep it."""
         super().drive(vx, vy, wz)
         self.told.append((now(), self.motion))
 
     def halt(self) -> None:
-        """Stand still, and keep it."""
         super().halt()
         self.told.append((now(), self.motion))
 
     @property
     def is_moving(self) -> bool:
-        """Whether it moves now."""
         return any(self.motion)
 
     def rested_at(self) -> float:
         """When it came to rest for the last time."""
         moving = [place for place, (_, motion) in enumerate(self.told) if any(motion)]
         return self.told[moving[-1] + 1][0]
-
-
-async def until(is_so: Callable[[], bool], seconds: float = 10.0) -> None:
-    """Wait until it is so."""
-    end = CLOCK.seconds() + seconds
-    while not is_so():
-        if CLOCK.seconds() > end:
-            raise AssertionError(f"not within {seconds} s")
-        await deferLater(CLOCK, 0.005)
 
 
 def is_alive(pid: int) -> bool:
@@ -91,6 +76,12 @@ def is_alive(pid: int) -> bool:
     except OSError:
         return False
     return state != "Z"
+
+
+def ignores_signals(pid: int) -> bool:
+    """Whether a process has come so far that it ignores SIGTERM."""
+    status = Path(f"/proc/{pid}/status").read_text()
+    return bool(int(status.partition("SigIgn:")[2].split()[0], 16) >> (signal.SIGTERM - 1) & 1)
 
 
 class Puppeteer:
@@ -117,7 +108,6 @@ class Puppeteer:
         return found[count - 1]
 
     def tell(self, line: str) -> None:
-        """Say something to it."""
         assert self.process.stdin is not None
         self.process.stdin.write(line.encode() + b"\n")
         self.process.stdin.flush()
@@ -130,7 +120,6 @@ class Puppeteer:
         return int(pid), float(halts)
 
     def end(self) -> None:
-        """Leave nothing behind."""
         if self.process.poll() is None:
             self.process.kill()
         self.process.wait()
@@ -146,13 +135,11 @@ class DeadManCase(TestCase):
     def setUp(self) -> None:
         self.body = TimedBody()
         self.puppeteers: list[Puppeteer] = []
+        self.addCleanup(self.leave)
 
-    async def tear_down(self) -> None:
+    async def leave(self) -> None:
         for one in self.puppeteers:
             one.end()
-
-    def tearDown(self) -> Any:
-        return Deferred.fromCoroutine(self.tear_down())
 
     async def driven(self, kind: str, **options: object) -> Puppeteer:
         """One that drives the robot, connected and enabled."""
@@ -172,13 +159,13 @@ class DeadManCase(TestCase):
         """Freeze it while the robot moves; it stands in time, and moves again only by a new permit."""
         deadline = await self.walking(puppeteer, permitted)
         puppeteer.process.send_signal(signal.SIGSTOP)
-        await deferLater(CLOCK, deadline - now() + 0.5)
+        await wait(deadline - now() + 0.5)
         self.assertFalse(self.body.is_moving)
         rested = self.body.rested_at()
         self.assertGreater(rested, deadline)
         self.assertLess(rested, deadline + LATE_S)
         puppeteer.process.send_signal(signal.SIGCONT)
-        await deferLater(CLOCK, 1.0)
+        await wait(1.0)
         self.assertEqual(self.body.rested_at(), rested)
         self.assertGreaterEqual((await puppeteer.switch())[1], 1)
         await self.walking(puppeteer, 0.3, 2)
@@ -206,15 +193,12 @@ class Wire:
         self.near.setblocking(False)
 
     def fileno(self) -> int:
-        """The descriptor."""
         return self.near.fileno()
 
     def send(self, data: bytes) -> None:
-        """Send it."""
         self.near.send(data)
 
     def close(self) -> None:
-        """Close both ends."""
         self.near.close()
         self.far.close()
 
@@ -234,72 +218,55 @@ class KeeperTests(TestCase):
     def setUp(self) -> None:
         self.wire = Wire()
         self.keeper = Keeper("robot", reactor)
+        self.addCleanup(self.leave)
 
-    async def tear_down(self) -> None:
+    async def leave(self) -> None:
         await self.keeper.close()
         self.wire.close()
 
-    def tearDown(self) -> Any:
-        return Deferred.fromCoroutine(self.tear_down())
-
-    def test_halts_and_counts(self) -> Deferred[None]:
+    async def test_halts_and_counts(self) -> None:
         """It says the halt three times when the time is over, and the keeper counts one."""
-        return Deferred.fromCoroutine(self._halt())
-
-    async def _halt(self) -> None:
         self.keeper.guard(LastWord(b"halt", self.wire))
         self.keeper.until(0.2)
-        await deferLater(CLOCK, 0.15)
+        await wait(0.15)
         self.assertEqual(self.wire.heard(), b"")
-        await deferLater(CLOCK, 0.6)
+        await wait(0.6)
         self.assertEqual(self.wire.heard(), b"halt" * 3)
         self.assertEqual(self.keeper.halts, 1)
 
-    def test_stays_armed_until_the_halt_has_left(self) -> Deferred[None]:
+    async def test_stays_armed_until_the_halt_has_left(self) -> None:
         """Rest disarms it, but not while the link still has the halt to send."""
-        return Deferred.fromCoroutine(self._rest())
-
-    async def _rest(self) -> None:
         self.keeper.guard(LastWord(b"halt", self.wire))
         self.keeper.until(0.2)
         self.keeper.rest()
-        await deferLater(CLOCK, 0.4)
+        await wait(0.4)
         self.assertEqual(self.wire.heard(), b"")
         self.wire.is_busy = True
         self.keeper.until(0.2)
         self.keeper.rest()
-        await deferLater(CLOCK, 0.5)
+        await wait(0.5)
         self.assertEqual(self.wire.heard(), b"halt" * 3)
         self.wire.is_busy = False
 
-    def test_lets_go_of_the_link(self) -> Deferred[None]:
+    async def test_lets_go_of_the_link(self) -> None:
         """A link that the driver has left, and closed, is closed at the robot's end as well."""
-        return Deferred.fromCoroutine(self._leave())
-
-    async def _leave(self) -> None:
         self.keeper.guard(LastWord(b"halt", self.wire))
-        await deferLater(CLOCK, 0.1)
+        await wait(0.1)
         self.wire.near.close()
         self.assertEqual(self.wire.heard(), b"")
         self.keeper.leave()
         await until(lambda: self.wire.heard() is None, 1.0)
 
-    def test_leaves_no_timer_once_closed(self) -> Deferred[None]:
+    async def test_leaves_no_timer_once_closed(self) -> None:
         """A link that is lost after the keeper was closed starts nothing: the reactor would find it unclean."""
-        return Deferred.fromCoroutine(self._close())
-
-    async def _close(self) -> None:
         self.keeper.guard(LastWord(b"halt", self.wire))
         self.keeper.until(1.0)
         await self.keeper.close()
         self.keeper.rest()
         self.keeper.leave()
 
-    def test_finishes_a_halt_that_left_in_part(self) -> Deferred[None]:
+    async def test_finishes_a_halt_that_left_in_part(self) -> None:
         """A halt of which the link took a part is finished before it is said anew."""
-        return Deferred.fromCoroutine(self._part())
-
-    async def _part(self) -> None:
         self.wire.near.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4608)
         halt = bytes(range(250)) * 40
         self.keeper.guard(LastWord(halt, self.wire))
@@ -307,16 +274,13 @@ class KeeperTests(TestCase):
         await until(lambda: self.keeper.halts == 1)
         said = self.wire.heard() or b""
         self.assertLess(len(said), len(halt))
-        await deferLater(CLOCK, 0.15)
+        await wait(0.15)
         said += self.wire.heard() or b""
         self.assertEqual(said[: len(halt)], halt)
         self.assertEqual(said[len(halt) :], halt[: len(said) - len(halt)])
 
-    def test_replaces_one_that_does_not_listen(self) -> Deferred[None]:
+    async def test_replaces_one_that_does_not_listen(self) -> None:
         """A process that is stopped fills its socket; it is killed and replaced, and the keeper never waits for it."""
-        return Deferred.fromCoroutine(self._replace())
-
-    async def _replace(self) -> None:
         self.keeper.guard(LastWord(b"halt", self.wire))
         first = self.keeper.pid
         assert first is not None
@@ -330,39 +294,32 @@ class KeeperTests(TestCase):
         self.keeper.until(0.1)
         await until(lambda: self.wire.heard() == b"halt", 1.0)
 
-    def test_names_what_cannot_be_started(self) -> Deferred[None]:
+    async def test_names_what_cannot_be_started(self) -> None:
         """Where none can be started, or all end at once, this is said once, and it is tried again until one does."""
-        return Deferred.fromCoroutine(self._name())
-
-    async def _name(self) -> None:
         for program, words in (
             ("/nowhere/python", "no dead man's switch yet"),
             ("/bin/false", "another one is started"),
         ):
             self.keeper = Keeper("robot", reactor)
-            said: list[str] = []
-            self.keeper.log = Told(said)  # type: ignore[assignment]
+            self.keeper.log = log = KeptLog()  # type: ignore[assignment]
             good, sys.executable = sys.executable, program
             try:
                 self.keeper.guard(LastWord(b"halt", self.wire))
                 self.keeper.until(5.0)
-                await deferLater(CLOCK, 0.5)
+                await wait(0.5)
             finally:
                 sys.executable = good
-            self.assertEqual(len(said), 1)
-            self.assertIn(words, said[0])
-            await deferLater(CLOCK, 1.0)
+            self.assertEqual(len(log.lines), 1)
+            self.assertIn(words, log.lines[0])
+            await wait(1.0)
             self.keeper.until(0.1)
             await until(lambda: self.wire.heard() == b"halt", 1.0)
             await self.keeper.close()
-            await deferLater(CLOCK, 0.05)
+            await wait(0.05)
             self.wire.heard()
 
-    def test_ends_at_any_moment(self) -> Deferred[None]:
+    async def test_ends_at_any_moment(self) -> None:
         """Closed before it was started, just after, or while one is replaced, nothing is left, twice or not."""
-        return Deferred.fromCoroutine(self._end())
-
-    async def _end(self) -> None:
         for stage in range(4):
             keeper = Keeper("robot", reactor)
             if stage:
@@ -380,20 +337,6 @@ class KeeperTests(TestCase):
             self.assertEqual(self.wire.heard(), b"")
 
 
-class Told:
-    """A log that keeps its warnings."""
-
-    def __init__(self, said: list[str]) -> None:
-        self._said = said
-
-    def warn(self, form: str, **values: object) -> None:
-        """Keep it."""
-        self._said.append(form.format(**values))
-
-    def info(self, form: str, **values: object) -> None:
-        """Leave it out."""
-
-
 class AiboDeadManTests(DeadManCase):
     """An AIBO, which by itself would walk on for three seconds."""
 
@@ -407,32 +350,24 @@ class AiboDeadManTests(DeadManCase):
         named = {service: number for service, number in ports.items() if service != "gains"}
         self.options: dict[str, object] = {"host": "127.0.0.1", "ports": named, "camera": False}
 
-    async def tear_down(self) -> None:
-        await super().tear_down()
+    async def leave(self) -> None:
+        await super().leave()
         await until(lambda: not self.dog.clients)
         await self.server.stop()
 
-    def test_frozen(self) -> Deferred[None]:
+    async def test_frozen(self) -> None:
         """Its program is stopped (SIGSTOP): it stands soon after the deadline, and goes on only by a new permit."""
-        return Deferred.fromCoroutine(self._frozen())
-
-    async def _frozen(self) -> None:
         await self.freeze(await self.driven("aibo", **self.options))
 
-    def test_killed(self) -> Deferred[None]:
+    async def test_killed(self) -> None:
         """Its program is killed: it stands at once, and nothing is left of the switch."""
-        return Deferred.fromCoroutine(self._killed())
-
-    async def _killed(self) -> None:
         await self.kill(await self.driven("aibo", **self.options))
 
-    def test_interrupted(self) -> Deferred[None]:
+    async def test_interrupted(self) -> None:
         """Ctrl-C and SIGTERM do not end the switch before its program; then both end, and the dog stands."""
-        return Deferred.fromCoroutine(self._interrupted())
-
-    async def _interrupted(self) -> None:
         puppeteer = await self.driven("aibo", **self.options)
         pid, _ = await puppeteer.switch()
+        await until(lambda: ignores_signals(pid))
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             os.kill(pid, number)
         await self.walking(puppeteer, 5.0)
@@ -442,33 +377,27 @@ class AiboDeadManTests(DeadManCase):
         self.assertFalse(self.body.is_moving)
         self.assertFalse(Path(f"/proc/{pid}").exists())
 
-    def test_replaced(self) -> Deferred[None]:
+    async def test_replaced(self) -> None:
         """A switch that is killed is replaced while the dog walks, and the new one does what the old one would."""
-        return Deferred.fromCoroutine(self._replaced())
-
-    async def _replaced(self) -> None:
         puppeteer = await self.driven("aibo", **self.options)
         first, _ = await puppeteer.switch()
         deadline = await self.walking(puppeteer, 2.0)
         os.kill(first, signal.SIGKILL)
-        await deferLater(CLOCK, 0.5)
+        await wait(0.5)
         second, _ = await puppeteer.switch()
         self.assertNotIn(second, (0, first))
         self.assertFalse(Path(f"/proc/{first}").exists())
         puppeteer.process.send_signal(signal.SIGSTOP)
-        await deferLater(CLOCK, deadline - now() + 0.3)
+        await wait(deadline - now() + 0.3)
         self.assertFalse(self.body.is_moving)
         self.assertLess(self.body.rested_at(), deadline + LATE_S)
         puppeteer.process.send_signal(signal.SIGCONT)
 
-    def test_lost_link(self) -> Deferred[None]:
+    async def test_lost_link(self) -> None:
         """The switch lets go of a link that is lost, or the dog would take no new one; and guards the new one."""
-        return Deferred.fromCoroutine(self._lost_link())
-
-    async def _lost_link(self) -> None:
         puppeteer = await self.driven("aibo", **self.options)
         self.dog.reboot()
-        await deferLater(CLOCK, 2.5)
+        await wait(2.5)
         await self.freeze(puppeteer)
 
 
@@ -483,23 +412,17 @@ class Create2DeadManTests(DeadManCase):
         self.robot = Create2(self.body, CLOCK, Random(1))
         self.port = PtyPort(reactor, self.robot.accept)
 
-    async def tear_down(self) -> None:
-        await super().tear_down()
+    async def leave(self) -> None:
+        await super().leave()
         self.port.close()
         self.robot.stop()
 
-    def test_frozen(self) -> Deferred[None]:
+    async def test_frozen(self) -> None:
         """Its program is stopped: it stands soon after the deadline."""
-        return Deferred.fromCoroutine(self._frozen())
-
-    async def _frozen(self) -> None:
         await self.freeze(await self.driven("create2", port=self.port.path))
 
-    def test_killed(self) -> Deferred[None]:
+    async def test_killed(self) -> None:
         """Its program is killed: it stands at once, and the port is free for the next."""
-        return Deferred.fromCoroutine(self._killed())
-
-    async def _killed(self) -> None:
         await self.kill(await self.driven("create2", port=self.port.path))
         await self.driven("create2", port=self.port.path)
 
@@ -507,11 +430,8 @@ class Create2DeadManTests(DeadManCase):
 class BittleDeadManTests(DeadManCase):
     """A Bittle, which by itself would walk on for ever."""
 
-    def test_frozen_on_a_cable(self) -> Deferred[None]:
+    async def test_frozen_on_a_cable(self) -> None:
         """Its program is stopped: it stands soon after the deadline."""
-        return Deferred.fromCoroutine(self._frozen_on_a_cable())
-
-    async def _frozen_on_a_cable(self) -> None:
         if not HAS_SERIAL:
             raise SkipTest("needs the extra serial")
         robot = Bittle(self.body, CLOCK, Random(1))
@@ -519,15 +439,12 @@ class BittleDeadManTests(DeadManCase):
         try:
             await self.freeze(await self.driven("bittle", port=port.path))
         finally:
-            await self.tear_down()
+            await self.leave()
             port.close()
             robot.stop()
 
-    def test_frozen_over_wifi(self) -> Deferred[None]:
+    async def test_frozen_over_wifi(self) -> None:
         """Over HTTP the switch asks by a connection of its own, whichever board there is."""
-        return Deferred.fromCoroutine(self._frozen_over_wifi())
-
-    async def _frozen_over_wifi(self) -> None:
         for board in ("biboard", "nyboard"):
             robot = Bittle(self.body, CLOCK, Random(1), board=board)
             listening = REACTOR.listenTCP(0, TcpLinkFactory(robot.accept_http), interface="127.0.0.1")
@@ -535,34 +452,31 @@ class BittleDeadManTests(DeadManCase):
                 port = listening.getHost().port
                 await self.freeze(await self.driven("bittle", host="127.0.0.1", http_port=port, board=board), 1.0)
             finally:
-                await self.tear_down()
+                await self.leave()
                 await listening.stopListening()
                 robot.stop()
-                await deferLater(CLOCK, 0.1)
+                await wait(0.1)
 
 
 class Restless(RosbridgeRobot):
     """One whose base has no time-out, as few have."""
 
     def _on_no_command(self) -> None:
-        self._stop = None
+        """Go on."""
 
 
 class RosbridgeDeadManTests(DeadManCase):
     """A ROS robot whose base has no time-out."""
 
-    def test_frozen(self) -> Deferred[None]:
+    async def test_frozen(self) -> None:
         """Its program is stopped: it stands soon after the deadline."""
-        return Deferred.fromCoroutine(self._frozen())
-
-    async def _frozen(self) -> None:
         robot = Restless(CLOCK, self.body, Random(1))
         robot.start()
         listening = REACTOR.listenTCP(0, TcpLinkFactory(robot.accept), interface="127.0.0.1")
         try:
             await self.freeze(await self.driven("rosbridge", host="127.0.0.1", port=listening.getHost().port))
         finally:
-            await self.tear_down()
+            await self.leave()
             await listening.stopListening()
             robot.stop()
-            await deferLater(CLOCK, 0.1)
+            await wait(0.1)

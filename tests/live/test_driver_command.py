@@ -16,15 +16,14 @@ from pathlib import Path
 from typing import Any
 
 from twisted.internet import reactor
-from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
-from twisted.internet.task import deferLater
 from twisted.trial.unittest import TestCase
 
 from sim.robots.emulator.aibo import AiboServer
 from sim.robots.emulator.aibo_dog import AiboEmulator
 from sim.robots.emulator.body import MemoryBody
 from tests.live.test_aibo_socket import free_ports
+from tests.live.waiting import wait
 from tests.webnode.picture import jpeg
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -63,27 +62,19 @@ class DriverCommandTests(TestCase):
         """The exit code of a child, once it has ended."""
         until = IReactorTime(reactor).seconds() + seconds
         while child.poll() is None and IReactorTime(reactor).seconds() < until:
-            await self.wait(0.02)
+            await wait(0.02)
         self.assertIsNotNone(child.poll(), "it does not end")
         return int(child.returncode)
 
     async def set_off(self, keyboard: int) -> None:
-        """Hold "w" until the dog walks."""
         until = IReactorTime(reactor).seconds() + 10.0
         while self.body.motion[0] < 0.03 and IReactorTime(reactor).seconds() < until:
             os.write(keyboard, b"w")
-            await self.wait(0.1)
+            await wait(0.1)
         self.assertGreater(self.body.motion[0], 0.03)
 
-    async def wait(self, seconds: float) -> None:
-        """Let the dog live."""
-        await deferLater(IReactorTime(reactor), seconds, lambda: None)
-
-    def test_probe_and_monitor(self) -> Deferred[None]:
+    async def test_probe_and_monitor(self) -> None:
         """Probe says what came over TCP, monitor saves the dog's picture; a port where nothing listens is named."""
-        return Deferred.fromCoroutine(self._probe_and_monitor())
-
-    async def _probe_and_monitor(self) -> None:
         out = Path(self.folder.name) / "out"
         with out.open("wb") as file:
             self.assertEqual(await self.ended(self.started("probe", "--seconds", "1", stdout=file)), 0)
@@ -98,16 +89,13 @@ class DriverCommandTests(TestCase):
             self.assertEqual(await self.ended(self.started("probe", stdout=file)), 1)
         self.assertIn("! 127.0.0.1:1: it is there, but nothing listens at this port", out.read_text())
 
-    def test_interrupted(self) -> Deferred[None]:
+    async def test_interrupted(self) -> None:
         """Ctrl-C ends monitor and drive in order: without a traceback, the dog at rest, its motors off."""
-        return Deferred.fromCoroutine(self._interrupted())
-
-    async def _interrupted(self) -> None:
         out = Path(self.folder.name) / "out"
         with out.open("wb") as file:
             child = self.started("monitor", stdout=file, stderr=file)
             while b"ready" not in out.read_bytes():
-                await self.wait(0.05)
+                await wait(0.05)
             child.send_signal(signal.SIGINT)
             self.assertEqual(await self.ended(child), 0)
         self.assertNotIn("Traceback", out.read_text())
@@ -121,11 +109,8 @@ class DriverCommandTests(TestCase):
         self.assertEqual((self.body.motion, self.dog.is_engaged), ((0.0, 0.0, 0.0), True))
         self.assertNotIn("Traceback", os.read(ours, 65536).decode())
 
-    def test_drive(self) -> Deferred[None]:
+    async def test_drive(self) -> None:
         """Keys in a terminal move the dog; let go, it stands; x ends, and the terminal is as it was before."""
-        return Deferred.fromCoroutine(self._drive())
-
-    async def _drive(self) -> None:
         ours, theirs = pty.openpty()
         self.addCleanup(os.close, ours)
         self.addCleanup(os.close, theirs)
@@ -136,10 +121,10 @@ class DriverCommandTests(TestCase):
         moved = []
         for _ in range(8):
             os.write(ours, b"w")
-            await self.wait(0.1)
+            await wait(0.1)
             moved.append(self.body.motion[0])
         self.assertGreater(sum(vx > 0.03 for vx in moved), 4)
-        await self.wait(0.8)
+        await wait(0.8)
         self.assertEqual(self.body.motion, (0.0, 0.0, 0.0))
         os.write(ours, b"wx")
         self.assertEqual(await self.ended(child), 0)

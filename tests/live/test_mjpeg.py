@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import http.server
 import threading
-from collections.abc import Generator
 from importlib.util import find_spec
 from typing import Any
 
 from twisted.internet import reactor as running
-from twisted.internet.defer import Deferred, inlineCallbacks
-from twisted.internet.task import deferLater
 from twisted.internet.threads import deferToThread
 from twisted.trial.unittest import TestCase
 
@@ -20,6 +17,7 @@ from drivers.registry import driver_for
 from sim.robots.emulator.body import MemoryBody
 from sim.robots.emulator.camera import MjpegCamera
 from tests.drivers.test_camera_driver import jpeg
+from tests.live.waiting import until, wait
 
 reactor: Any = running
 
@@ -30,7 +28,6 @@ class LiveMjpegTests(TestCase):
     timeout = 60
 
     def setUp(self) -> None:
-        """A camera on a free port."""
         self.body = MemoryBody(jpeg=jpeg(1))
         self.camera = MjpegCamera(reactor, self.body, 30.0)
         self.camera.start()
@@ -39,42 +36,18 @@ class LiveMjpegTests(TestCase):
 
         self.addCleanup(self.close)
 
-    @inlineCallbacks
-    def close(self) -> Generator[Deferred[Any], Any, None]:
+    async def close(self) -> None:
         """The camera is off, and its port closed."""
         self.camera.stop()
-        yield self.port.stopListening()
-        yield deferLater(reactor, 0.05)
+        await self.port.stopListening()
+        await wait(0.05)
 
     def driver(self, port: int, **options: object) -> Driver:
         """A driver of the camera at ``port``."""
         url = f"http://127.0.0.1:{port}/stream"
         return driver_for("camera", {"url": url, "width": 128, "height": 96, "fps": 30, **options}, "cam", reactor)
 
-    @inlineCallbacks
-    def until(self, is_so: Any) -> Generator[Deferred[Any], Any, None]:
-        """Fires when it is so, or fails the test."""
-        for _ in range(800):
-            if is_so():
-                return
-            yield deferLater(reactor, 0.02)
-        self.fail("it did not come to that")
-
-    @inlineCallbacks
-    def test_comes_back_over_real_sockets(self) -> Generator[Deferred[Any], Any, None]:
-        """Pictures flow, a broken connection is opened again, and the end leaves no connection behind."""
-        driver = self.driver(self.number)
-        yield driver.connect()
-        yield self.until(lambda: driver.diagnostics()["pictures"] > 10)
-        self.camera.clients[0].link.close()
-        yield self.until(lambda: driver.state == "stale")
-        yield self.until(lambda: driver.state == "ready")
-        self.assertEqual(driver.diagnostics()["reconnects"], 1)
-        yield driver.disconnect()
-        yield self.until(lambda: not self.camera.clients)
-
-    @inlineCallbacks
-    def test_watches_a_server_of_others(self) -> Generator[Deferred[Any], Any, None]:
+    async def test_watches_a_server_of_others(self) -> None:
         """A stream that Python's own HTTP server writes, in HTTP/1.0 and without lengths, is watched."""
 
         class Page(http.server.BaseHTTPRequestHandler):
@@ -94,18 +67,17 @@ class LiveMjpegTests(TestCase):
         thread.start()
         driver = self.driver(server.server_port)
         try:
-            yield driver.connect()
-            yield self.until(lambda: driver.diagnostics()["refused"] >= 1)
+            await driver.connect()
+            await until(lambda: driver.diagnostics()["refused"] >= 1)
             seen = driver.diagnostics()
             self.assertEqual(seen["pictures"] + seen["dropped"], 20)
         finally:
-            yield driver.disconnect()
-            yield deferToThread(server.shutdown)
+            await driver.disconnect()
+            await deferToThread(server.shutdown)
             server.server_close()
             thread.join(5.0)
 
-    @inlineCallbacks
-    def test_other_clients_watch_the_emulator(self) -> Generator[Deferred[Any], Any, None]:
+    async def test_other_clients_watch_the_emulator(self) -> None:
         """OpenCV's own client reads the emulated camera like any other, in chunks and without."""
         import cv2
         import numpy
@@ -122,7 +94,7 @@ class LiveMjpegTests(TestCase):
 
         for is_chunked in (False, True):
             self.camera.is_chunked = is_chunked
-            shapes = yield deferToThread(watch)
+            shapes = await deferToThread(watch)
             self.assertEqual(shapes, [(96, 128, 3)] * 5)
 
     if find_spec("cv2") is None:

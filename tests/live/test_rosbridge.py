@@ -5,14 +5,11 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from collections.abc import Generator
 from importlib.util import find_spec
 from random import Random
 from typing import Any
 
 from twisted.internet import reactor as running
-from twisted.internet.defer import Deferred, inlineCallbacks
-from twisted.internet.task import deferLater
 from twisted.internet.threads import deferToThread
 from twisted.trial.unittest import TestCase
 
@@ -21,6 +18,7 @@ from drivers.link import TcpConnector, TcpLinkFactory
 from drivers.rosbridge.driver import RosbridgeDriver
 from sim.robots.emulator.body import MemoryBody
 from sim.robots.emulator.rosbridge import RosbridgeRobot
+from tests.live.waiting import until
 
 reactor: Any = running
 MISSING = "NOTHING IS HELD AGAINST THE ROSBRIDGE OF OTHERS: install the extra ros"
@@ -67,52 +65,36 @@ class LiveRosbridgeTests(TestCase):
         self.addCleanup(port.stopListening)
         self.addCleanup(self.robot.stop)
 
-    def until(self, is_so: Any, seconds: float = 10.0) -> Deferred[None]:
-        """Fires when it is so, or fails the test."""
-
-        @inlineCallbacks
-        def wait() -> Generator[Deferred[Any], Any, None]:
-            for _ in range(round(seconds / 0.02)):
-                if is_so():
-                    return
-                yield deferLater(reactor, 0.02)
-            self.fail("it did not come to that")
-
-        return wait()
-
-    @inlineCallbacks
-    def test_drives_over_tcp(self) -> Generator[Deferred[Any], Any, None]:
+    async def test_drives_over_tcp(self) -> None:
         """Connected over TCP the robot drives, stops at the deadline, and after a reboot the link is opened again."""
         driver = RosbridgeDriver({"port": self.port}, TcpConnector(reactor), reactor)
-        yield driver.connect()
+        await driver.connect()
         self.addCleanup(driver.disconnect)
-        yield driver.enable()
+        await driver.enable()
         driver.act({"base.vx": 0.2}, Permit(1, reactor.seconds() + 0.4))
-        yield self.until(lambda: self.body.motion[0] == 0.2)
-        yield self.until(lambda: self.body.motion[0] == 0.0)
+        await until(lambda: self.body.motion[0] == 0.2)
+        await until(lambda: self.body.motion[0] == 0.0)
         self.robot.reboot()
-        yield self.until(lambda: driver.state == "stale")
-        yield self.until(lambda: driver.state == "ready")
+        await until(lambda: driver.state == "stale")
+        await until(lambda: driver.state == "ready")
         self.assertEqual(driver.diagnostics()["reconnects"], 1.0)
         self.assertEqual(driver.diagnostics()["bad_frames"], 0)
 
-    @inlineCallbacks
-    def test_other_client_takes_it_for_a_robot(self) -> Generator[Deferred[Any], Any, None]:
+    async def test_other_client_takes_it_for_a_robot(self) -> None:
         """Another client, roslibpy, subscribes, publishes, calls, and is told of a service that is not there."""
 
         def run() -> subprocess.CompletedProcess[str]:
             command = [sys.executable, "-c", OTHERS, str(self.port)]
             return subprocess.run(command, capture_output=True, text=True, timeout=40, check=False)
 
-        done = yield deferToThread(run)
+        done = await deferToThread(run)
         self.assertEqual(done.returncode, 0, done.stderr[-2000:])
         said = json.loads(done.stdout.splitlines()[-1])
         self.assertEqual((said["kind"], said["speed"]), ("geometry_msgs/msg/Twist", 0.125))
         self.assertIn("does not exist", said["missing"])
         self.assertEqual(self.robot.ignored, 0)
 
-    @inlineCallbacks
-    def test_other_server_takes_it_for_a_client(self) -> Generator[Deferred[Any], Any, None]:
+    async def test_other_server_takes_it_for_a_client(self) -> None:
         """Another WebSocket server, autobahn's, hears the driver and is heard: small, middling and large."""
         from autobahn.twisted.websocket import WebSocketServerFactory, WebSocketServerProtocol
 
@@ -152,15 +134,15 @@ class LiveRosbridgeTests(TestCase):
         port = reactor.listenTCP(0, factory, interface="127.0.0.1")
         self.addCleanup(port.stopListening)
         driver = RosbridgeDriver({"port": port.getHost().port}, TcpConnector(reactor), reactor)
-        yield driver.connect()
-        yield driver.enable()
+        await driver.connect()
+        await driver.enable()
         driver.act({"base.vx": 0.2}, Permit(1, reactor.seconds() + 5.0))
-        yield self.until(lambda: any(one["op"] == "publish" and one["msg"]["twist"]["linear"]["x"] for one in heard))
-        yield self.until(lambda: {"op": "pong", "payload": b"are you there"} in heard)
-        yield self.until(lambda: driver.diagnostics()["bytes"] > 300_000)
+        await until(lambda: any(one["op"] == "publish" and one["msg"]["twist"]["linear"]["x"] for one in heard))
+        await until(lambda: {"op": "pong", "payload": b"are you there"} in heard)
+        await until(lambda: driver.diagnostics()["bytes"] > 300_000)
         self.assertEqual((driver.diagnostics()["bad_frames"], driver.diagnostics()["faults"]), (0, 0))
-        yield driver.disconnect()
-        yield self.until(lambda: heard[-1]["op"] == "gone")
+        await driver.disconnect()
+        await until(lambda: heard[-1]["op"] == "gone")
         self.assertEqual(heard[-1]["code"], 1000)
         self.assertEqual(heard[-2]["msg"]["twist"]["linear"]["x"], 0.0)
 

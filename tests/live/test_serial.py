@@ -3,97 +3,25 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from random import Random
-from typing import Any
 
 from twisted.internet import reactor
-from twisted.internet.defer import Deferred
-from twisted.internet.interfaces import IReactorTime
-from twisted.internet.task import deferLater
 from twisted.trial.unittest import SkipTest, TestCase
 
 from drivers.create2.driver import Create2Driver
 from drivers.create2.option import checked
 from drivers.driver import Driver, Permit
-from drivers.link import TcpLinkFactory
 from drivers.registry import driver_for
 from drivers.serial import SerialConnector
-from sim.robots.emulator.bittle import Bittle
 from sim.robots.emulator.body import MemoryBody
 from sim.robots.emulator.create2 import Create2
 from sim.robots.emulator.pty import PtyPort
+from tests.live.waiting import CLOCK, until, wait
 
 try:
     import serial  # noqa: F401
 except ImportError as missing:
     raise SkipTest("needs the extra serial") from missing
-
-CLOCK = IReactorTime(reactor)
-
-
-async def until(is_so: Callable[[], bool], seconds: float = 20.0) -> None:
-    """Wait until it is so."""
-    end = CLOCK.seconds() + seconds
-    while not is_so():
-        if CLOCK.seconds() > end:
-            raise AssertionError(f"not within {seconds} s")
-        await deferLater(CLOCK, 0.01)
-
-
-async def walked(driver: Driver, body: MemoryBody) -> None:
-    """Connect, walk for half a second, see it end, and let the driver go."""
-    await driver.connect()
-    await driver.enable()
-    driver.act({"base.vx": 0.15}, Permit(1, CLOCK.seconds() + 0.5))
-    await until(lambda: body.motion[0] == 0.15, 0.45)
-    await until(lambda: body.motion[0] == 0.0, 1.5)
-    await driver.disconnect()
-
-
-class BittleTests(TestCase):
-    """A Bittle at the end of a pseudo-terminal, and behind a web server."""
-
-    timeout = 30
-
-    def test_walks_over_a_real_port(self) -> Deferred[None]:
-        """Over a real serial device the dog connects, stands, walks, stops at its deadline, and lies down."""
-        return Deferred.fromCoroutine(self._walk())
-
-    async def _walk(self) -> None:
-        body = MemoryBody()
-        robot = Bittle(body, CLOCK, Random(1))
-        port = PtyPort(reactor, robot.accept)
-        try:
-            await walked(driver_for("bittle", {"port": port.path}, "dog", CLOCK), body)
-            await until(lambda: robot.is_limp)
-        finally:
-            port.close()
-            robot.stop()
-
-    def test_walks_over_a_real_network(self) -> Deferred[None]:
-        """Over HTTP on loopback the dog of either board does the same."""
-        return Deferred.fromCoroutine(self._walk_by_http())
-
-    async def _walk_by_http(self) -> None:
-        for board in ("biboard", "nyboard"):
-            body = MemoryBody()
-            robot = Bittle(body, CLOCK, Random(1), board=board)
-            listening = listen(TcpLinkFactory(robot.accept_http))
-            options = {"host": "127.0.0.1", "http_port": listening.getHost().port, "board": board}
-            try:
-                await walked(driver_for("bittle", options, "dog", CLOCK), body)
-                await until(lambda robot=robot: robot.is_limp)  # type: ignore[misc]
-                await deferLater(CLOCK, 0.3)
-            finally:
-                await listening.stopListening()
-                robot.stop()
-
-
-def listen(factory: TcpLinkFactory) -> Any:
-    """A free port of loopback."""
-    running: Any = reactor
-    return running.listenTCP(0, factory, interface="127.0.0.1")
 
 
 class Create2PtyTests(TestCase):
@@ -107,44 +35,22 @@ class Create2PtyTests(TestCase):
         self.path = self.mktemp()
         self.port = PtyPort(reactor, self.robot.accept, self.path)
         self.drivers: list[Driver] = []
+        self.addCleanup(self.leave)
 
-    async def _tear_down(self) -> None:
+    async def leave(self) -> None:
         for driver in self.drivers:
             await driver.disconnect()
         self.port.close()
         self.robot.stop()
 
-    def tearDown(self) -> Any:
-        return Deferred.fromCoroutine(self._tear_down())
-
     def driver(self) -> Create2Driver:
-        """A driver of that port."""
         driver = driver_for("create2", {"port": self.path}, "vacuum", CLOCK)
         self.drivers.append(driver)
         assert isinstance(driver, Create2Driver)
         return driver
 
-    def test_drives_over_a_real_port(self) -> Deferred[None]:
-        """Over a real serial device it connects, is enabled, drives, stops at its deadline, and is left off."""
-        return Deferred.fromCoroutine(self._drive())
-
-    async def _drive(self) -> None:
-        driver = self.driver()
-        await driver.connect()
-        await driver.enable()
-        driver.act({"base.vx": 0.1}, Permit(1, CLOCK.seconds() + 0.5))
-        await until(lambda: self.body.motion[0] == 0.1, 0.4)
-        await until(lambda: self.body.motion[0] == 0.0, 1.0)
-        numbers = driver.diagnostics()
-        self.assertEqual(numbers["bad_frames"], 0)
-        await driver.disconnect()
-        await until(lambda: self.robot.mode == 0)
-
-    def test_outlives_a_pulled_cable(self) -> Deferred[None]:
+    async def test_outlives_a_pulled_cable(self) -> None:
         """The cable is pulled and plugged in again: stale, no such device, then ready with the motors on."""
-        return Deferred.fromCoroutine(self._pull())
-
-    async def _pull(self) -> None:
         driver = self.driver()
         await driver.connect()
         await driver.enable()
@@ -153,14 +59,11 @@ class Create2PtyTests(TestCase):
         await until(lambda: "no such device" in driver.problem)
         self.port = PtyPort(reactor, self.robot.accept, self.path)
         await until(lambda: driver.state == "ready" and self.robot.mode == 2)
-        await deferLater(CLOCK, 0.05)
+        await wait(0.05)
         driver.act({"base.vx": 0.1}, Permit(1, CLOCK.seconds() + 0.3))
 
-    def test_names_a_busy_port(self) -> Deferred[None]:
+    async def test_names_a_busy_port(self) -> None:
         """A second driver of the same port is told that it is busy, and gets it when the first has gone."""
-        return Deferred.fromCoroutine(self._share())
-
-    async def _share(self) -> None:
         first, second = self.driver(), self.driver()
         await first.connect()
         connected = second.connect()
@@ -169,11 +72,8 @@ class Create2PtyTests(TestCase):
         await connected
         self.assertEqual(second.problem, "")
 
-    def test_names_what_is_no_port(self) -> Deferred[None]:
+    async def test_names_what_is_no_port(self) -> None:
         """A file that is no serial device, and one that may not be opened, are named."""
-        return Deferred.fromCoroutine(self._misname())
-
-    async def _misname(self) -> None:
         plain = self.mktemp()
         with open(plain, "wb"):
             pass

@@ -9,9 +9,7 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 
 from twisted.internet import reactor
-from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
-from twisted.internet.task import deferLater
 from twisted.trial.unittest import SynchronousTestCase, TestCase
 
 import sim
@@ -20,6 +18,7 @@ from drivers.errors import UsageError
 from drivers.link import TcpConnector
 from drivers.registry import driver_for
 from drivers.sim.operator import YardOperator
+from tests.live.waiting import wait
 
 ROOT = Path(sim.__file__).parents[1]
 
@@ -50,11 +49,8 @@ class YardSocketTests(TestCase):
 
     timeout = 20
 
-    def test_drives_a_dog(self) -> Deferred[None]:
+    async def test_drives_a_dog(self) -> None:
         """Over TCP a dog connects, sees, walks and stops; the operator watches and moves it; both leave cleanly."""
-        return Deferred.fromCoroutine(self._drive_a_dog())
-
-    async def _drive_a_dog(self) -> None:
         clock = IReactorTime(reactor)
         async with running_yard() as (_, port):
             driver = driver_for("sim", {"port": port, "camera_fps": 30}, "dog1", clock)
@@ -63,7 +59,7 @@ class YardSocketTests(TestCase):
             before = await operator.connect()
             await driver.enable()
             driver.act({"base.vx": 0.16}, Permit(1, clock.seconds() + 0.5))
-            await deferLater(clock, 1.0, lambda: None)
+            await wait(1.0)
             after = operator.snapshot
             assert after is not None
             moved = after["dogs"][0]["x"] - before["dogs"][0]["x"]
@@ -78,23 +74,20 @@ class YardSocketTests(TestCase):
             await driver.disconnect()
             await operator.disconnect()
 
-    def test_opens_a_lost_link_again(self) -> Deferred[None]:
+    async def test_opens_a_lost_link_again(self) -> None:
         """A yard that is killed makes the driver stale at once; a new one at the same port finds it back by itself."""
-        return Deferred.fromCoroutine(self._open_again())
-
-    async def _open_again(self) -> None:
         clock = IReactorTime(reactor)
         async with running_yard() as (process, port):
             driver = driver_for("sim", {"port": port, "camera": False}, "dog2", clock)
             await driver.connect()
             process.kill()
             process.wait()
-            await deferLater(clock, 0.2, lambda: None)
+            await wait(0.2)
             self.assertEqual(driver.state, "stale")
         again = spawned("--port", str(port))
         try:
             for _ in range(80):
-                await deferLater(clock, 0.1, lambda: None)
+                await wait(0.1)
                 if driver.state == "ready":
                     break
             self.assertEqual(driver.state, "ready")

@@ -5,14 +5,19 @@ from __future__ import annotations
 import math
 import random
 import struct
+from typing import Any
 
+from twisted.internet.defer import Deferred
+from twisted.internet.error import CannotListenError
 from twisted.internet.task import Clock
 from twisted.trial.unittest import SynchronousTestCase
 
-from drivers.aibo.codec import T2, GainReader, command
+from drivers.aibo.codec import T2, command
 from drivers.link import Link
+from sim.robots.emulator.aibo import RETRY_S, AiboServer
 from sim.robots.emulator.aibo_dog import AiboEmulator
 from sim.robots.emulator.body import MemoryBody
+from tests.drivers.contract import KeptLink
 
 MAIN, STATE, WALK, HEAD, ESTOP, CAMERA, GAINS = 10020, 10031, 10050, 10052, 10053, 10011, 10032
 
@@ -25,15 +30,12 @@ class Client:
         self.link: Link | None = None
 
     def link_up(self, link: Link) -> None:
-        """Take the link."""
         self.link = link
 
     def link_down(self) -> None:
-        """Lose it."""
         self.link = None
 
     def received(self, data: bytes) -> None:
-        """Keep bytes."""
         self.heard += data
 
 
@@ -46,9 +48,8 @@ class AiboEmulatorTests(SynchronousTestCase):
         self.body = MemoryBody()
         self.dog = self.made()
 
-    def made(self, dialect: str = "T4", is_raw: bool = False) -> AiboEmulator:
-        """A dog of one's own."""
-        dog = AiboEmulator(self.clock, self.body, random.Random(1), dialect, is_raw=is_raw)
+    def made(self, dialect: str = "T4") -> AiboEmulator:
+        dog = AiboEmulator(self.clock, self.body, random.Random(1), dialect)
         dog.start()
         self.addCleanup(dog.stop)
         self.connector = dog.connector()
@@ -63,7 +64,6 @@ class AiboEmulatorTests(SynchronousTestCase):
         return client
 
     def pass_time(self, seconds: float) -> None:
-        """Turn the clock."""
         self.clock.pump([0.002] * round(seconds / 0.002))
 
     def say(self, client: Client, data: bytes) -> bytes:
@@ -175,7 +175,7 @@ class AiboEmulatorTests(SynchronousTestCase):
             self.pass_time(3.2)
             self.assertEqual(len(state.heard) % size, 0)
             self.assertAlmostEqual(len(state.heard) / size, 100, delta=1.5, places=None)
-            self.assertEqual(len(list(GainReader().read(gains.heard))), len(state.heard) // size)
+            self.assertEqual(len(gains.heard), 224 * (len(state.heard) // size))
 
     def test_holds_its_head(self) -> None:
         """Head commands move the neck to their share of its range, and are clipped."""
@@ -223,3 +223,74 @@ class AiboEmulatorTests(SynchronousTestCase):
         self.pass_time(0.2)
         self.assertIsNotNone(main.link)
         self.assertIsNone(walk.link)
+
+
+class Ports(Clock):
+    """A reactor whose sockets close with its next turn, as real ones do: until then their numbers are taken."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.taken: dict[int, Any] = {}
+
+    def listenUDP(self, *_: object) -> Any:  # noqa: N802 (Twisted's)
+        """Return a port without a number of its own."""
+        return _Port(self, 0)
+
+    def listenTCP(self, port: int, factory: Any, interface: str) -> Any:  # noqa: N802 (Twisted's)
+        """Take a number, or raise as Twisted does."""
+        if port in self.taken:
+            raise CannotListenError(interface, port, OSError("in use"))
+        self.taken[port] = factory
+        return _Port(self, port)
+
+
+class _Port:
+    def __init__(self, reactor: Ports, number: int) -> None:
+        self._reactor = reactor
+        self._number = number
+
+    def stopListening(self) -> Deferred[None]:  # noqa: N802 (Twisted's)
+        """Free the number with the reactor's next turn."""
+        closed: Deferred[None] = Deferred()
+        self._reactor.callLater(0.0, self._reactor.taken.pop, self._number, None)
+        self._reactor.callLater(0.0, closed.callback, None)
+        return closed
+
+
+class AiboServerTests(SynchronousTestCase):
+    """Which ports of an emulated dog listen."""
+
+    def setUp(self) -> None:
+        self.reactor = Ports()
+        self.dog = AiboEmulator(self.reactor, MemoryBody(), random.Random(1))
+        self.server = AiboServer(self.reactor, self.dog)
+        self.server.start()
+
+    def tearDown(self) -> None:
+        """Every port is free at the end, and nothing is left on the clock."""
+        stopped = self.server.stop()
+        self.reactor.advance(0.0)
+        self.successResultOf(stopped)
+        self.assertEqual((self.reactor.taken, self.reactor.getDelayedCalls()), ({}, []))
+
+    def test_opens_a_port_again_once_its_socket_is_closed(self) -> None:
+        """A client that leaves before the port it took is closed raises nothing, there or in the next client's link."""
+        gone = self.dog.accept(ESTOP, KeptLink())
+        gone.link_down()
+        main = self.dog.accept(MAIN, KeptLink())
+        self.reactor.advance(0.0)
+        self.assertEqual(set(self.reactor.taken), {ESTOP})
+        main.link_down()
+        self.assertEqual(set(self.reactor.taken), {ESTOP, MAIN})
+
+    def test_tries_a_port_again_that_another_program_took(self) -> None:
+        """A number that another program took while its port was closed is opened once it is free; nothing is raised."""
+        client = self.dog.accept(ESTOP, KeptLink())
+        self.reactor.advance(0.0)
+        self.reactor.taken[ESTOP] = "another"
+        client.link_down()
+        self.reactor.advance(RETRY_S)
+        self.assertEqual(self.reactor.taken[ESTOP], "another")
+        del self.reactor.taken[ESTOP]
+        self.reactor.advance(RETRY_S)
+        self.assertIn(ESTOP, self.reactor.taken)

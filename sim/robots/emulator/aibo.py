@@ -7,6 +7,7 @@ from functools import partial
 from typing import Any
 
 from twisted.internet.defer import Deferred, gatherResults, maybeDeferred
+from twisted.internet.error import CannotListenError
 from twisted.internet.protocol import DatagramProtocol
 
 from drivers.aibo.option import checked
@@ -14,6 +15,9 @@ from drivers.link import TcpLinkFactory
 from sim.robots.emulator.aibo_dog import AiboEmulator
 from sim.robots.emulator.body import Body
 from sim.robots.emulator.wire import Table, Wire
+
+RETRY_S = 0.1
+"""A port that cannot be opened again, as another program has its number for a moment, is tried again after so long."""
 
 
 class AiboServer:
@@ -25,36 +29,61 @@ class AiboServer:
         self._dog = dog
         self._interface = interface
         self._open: dict[int, Any] = {}
-        self._closing: list[Deferred[Any]] = []
+        self._closing: dict[int, Deferred[Any]] = {}
+        self._retry: Any = None
         self._udp: Any = None
         dog.on_ports.add(self._sync)
 
     def start(self) -> None:
         """Switch the dog on and open what it serves from the start; raises ``CannotListenError`` for a taken port."""
         self._udp = self._reactor.listenUDP(self._dog.ports["camera"], _Camera(self._dog), self._interface, 65536)
-        self._sync()
+        for number in self._dog.ports.values():
+            if self._dog.listens(number):
+                self._listen(number)
         self._dog.start()
 
     def stop(self) -> Deferred[None]:
         """Switch it off; fires when every port is free."""
         ports, self._udp = [*self._open.values(), self._udp], None
         self._dog.stop()
-        closing = [maybeDeferred(port.stopListening) for port in ports]
         self._open.clear()
-        return gatherResults([*closing, *self._closing]).addCallback(lambda _: None)
+        if self._retry is not None:
+            self._retry.cancel()
+            self._retry = None
+        closing = [maybeDeferred(port.stopListening) for port in ports]
+        return gatherResults([*closing, *self._closing.values()]).addCallback(lambda _: None)
+
+    def _listen(self, number: int) -> None:
+        factory = TcpLinkFactory(partial(self._dog.accept, number))
+        self._open[number] = self._reactor.listenTCP(number, factory, interface=self._interface)
 
     def _sync(self) -> None:
-        """Listen where the dog listens now, and nowhere else: a port with a client takes no second one."""
+        """Listen where the dog listens now, and nowhere else: a port with a client takes no second one.
+
+        The dog calls this while a link is made or lost, so nothing is raised: a port whose socket is not closed yet,
+        or whose number another program has, is opened later.
+        """
         if self._udp is None:
             return
         for number in self._dog.ports.values():
             listens = self._dog.listens(number)
-            if listens and number not in self._open:
-                factory = TcpLinkFactory(partial(self._dog.accept, number))
-                self._open[number] = self._reactor.listenTCP(number, factory, interface=self._interface)
-            elif not listens and number in self._open:
-                closed = maybeDeferred(self._open.pop(number).stopListening)
-                self._closing = [*(one for one in self._closing if not one.called), closed]
+            if not listens and number in self._open:
+                closed = self._closing[number] = maybeDeferred(self._open.pop(number).stopListening)
+                closed.addCallback(self._on_closed, number)
+            elif listens and number not in self._open and number not in self._closing:
+                try:
+                    self._listen(number)
+                except CannotListenError:
+                    if self._retry is None:
+                        self._retry = self._reactor.callLater(RETRY_S, self._on_retry)
+
+    def _on_closed(self, _result: object, number: int) -> None:
+        del self._closing[number]
+        self._sync()
+
+    def _on_retry(self) -> None:
+        self._retry = None
+        self._sync()
 
 
 class _Camera(DatagramProtocol):

@@ -14,13 +14,15 @@ from typing import Any
 from twisted.internet.interfaces import IReactorTime
 
 from drivers.aibo import picture, sense
-from drivers.aibo.codec import T2, T4, CommandReader, Gains, LineReader, encoded, encoded_gains
+from drivers.aibo.codec import T2, T4, CommandReader, LineReader, encoded, encoded_gains
 from drivers.aibo.option import ASIDE, BACKWARD, FORWARD, PORTS, TURN
 from drivers.link import Link, MemoryConnector, Receiver
+from drivers.timer import Timer
 from middleware.entangled.listeners import Listeners
 from middleware.faults.stream import StreamFaults
 from sim.robots.emulator.aibo_menu import AiboMenu
 from sim.robots.emulator.body import Body
+from sim.robots.emulator.outlet import Outlet
 
 FRAME_S = 0.032
 CAMERA_S = 1.0 / 30.0
@@ -45,7 +47,6 @@ class AiboEmulator:
         rng: random.Random,
         dialect: str = T4,
         ports: dict[str, int] | None = None,
-        is_raw: bool = False,
     ) -> None:
         self.faults = StreamFaults()
         self.ports = {**EMULATED, **(ports or {})}
@@ -61,13 +62,12 @@ class AiboEmulator:
         self._body = body
         self._rng = rng
         self._dialect = dialect
-        self._is_raw = is_raw
         self._walk = {"f": 0.0, "s": 0.0, "r": 0.0}
         self._booted_at = clock.seconds()
         self._frame = self._picture = 0
         self._peer: Callable[[bytes], None] | None = None
-        self._timers: dict[str, Any] = {}
-        self._dead_man: Any = None
+        self._timers = {"state": Timer(clock), "camera": Timer(clock)}
+        self._dead_man = Timer(clock)
 
     def start(self) -> None:
         """Switch the dog on."""
@@ -76,10 +76,8 @@ class AiboEmulator:
 
     def stop(self) -> None:
         """Switch the dog off: every link breaks."""
-        for timer in (*self._timers.values(), self._dead_man):
-            if timer is not None and timer.active():
-                timer.cancel()
-        self._timers.clear()
+        for timer in self._timers.values():
+            timer.cancel()
         self._rest()
         self._peer = None
         for client in list(self.clients.values()):
@@ -110,7 +108,7 @@ class AiboEmulator:
     def accept(self, port: int, link: Link) -> Receiver:
         """Take a link to ``port``; one that does not listen closes it at once."""
         service = self._service(port)
-        client = _Client(self, service or "", link)
+        client = _Client(self, service or "", Outlet(self._clock, self._rng, self.faults, link), link)
         if service is None:
             link.close()
             return client
@@ -176,19 +174,14 @@ class AiboEmulator:
             self._walk[letter] = value if math.isfinite(value) else 0.0
         f, s, r = self._walk.values()
         self._body.drive(f * (FORWARD if f > 0 else BACKWARD), s * ASIDE, r * TURN)
-        self._stop_dead_man()
+        self._dead_man.cancel()
         if any(self._walk.values()):
-            self._dead_man = self._clock.callLater(DEAD_MAN_S, self._rest)
+            self._dead_man.set(DEAD_MAN_S, self._rest)
 
     def _rest(self) -> None:
-        self._stop_dead_man()
+        self._dead_man.cancel()
         self._walk = dict.fromkeys(self._walk, 0.0)
         self._body.halt()
-
-    def _stop_dead_man(self) -> None:
-        if self._dead_man is not None and self._dead_man.active():
-            self._dead_man.cancel()
-        self._dead_man = None
 
     # -- what the dog says ------------------------------------------------------------------------------------------
 
@@ -200,7 +193,7 @@ class AiboEmulator:
                 client, encoded(sense.state(self._body.sense(), self._joints(), self._dialect, self._ms, self._frame))
             )
         if gains is not None and not gains.link.is_busy:
-            self._say(gains, encoded_gains(Gains(self._ms, ((10.0, 4.0, 2.0),) * 18)))
+            self._say(gains, encoded_gains(self._ms, ((10.0, 4.0, 2.0),) * 18))
 
     def _send_picture(self) -> None:
         client = self.clients.get("camera")
@@ -220,15 +213,9 @@ class AiboEmulator:
     def _pictured(self) -> bytes:
         is_halved = self.menu.settings.get("vision.rawcam.y_skip", "2") != "1"
         width, height = (side // 2 if is_halved else side for side in NATIVE)
-        head = picture.header(picture.COLOUR, 0 if self._is_raw else 1, width, height, self._ms, self._picture)
-        if not self._is_raw:
-            jpeg = self._body.picture(is_halved) or DARK
-            return head + picture.block(picture.Block(width, height, "JPEGColor", jpeg))
-        sizes = ((width, height), (width // 2, height // 2), (width // 2, height // 2))
-        return head + b"".join(
-            picture.block(picture.Block(w, h, "RawImage", bytes([picture.BLANK]) * (w * h), channel))
-            for channel, (w, h) in enumerate(sizes)
-        )
+        head = picture.header(picture.COLOUR, 1, width, height, self._ms, self._picture)
+        jpeg = self._body.picture(is_halved) or DARK
+        return head + picture.block(picture.Block(width, height, "JPEGColor", jpeg))
 
     def _joints(self) -> list[float]:
         joints = [0.0] * len(sense.JOINTS)
@@ -238,13 +225,8 @@ class AiboEmulator:
         return joints
 
     def _say(self, client: _Client, data: bytes) -> None:
-        for piece in self.faults.wire(data, self._rng) if data else ():
-            if self.faults.delay:
-                self._clock.callLater(self.faults.delay, client.link.send, piece)
-            else:
-                client.link.send(piece)
-
-    # -- inside -----------------------------------------------------------------------------------------------------
+        if data:
+            client.outlet.send(data)
 
     @property
     def _ms(self) -> int:
@@ -284,9 +266,6 @@ class AiboEmulator:
             self.on_ports()
 
     def _every(self, seconds: float, act: Callable[[], None], name: str) -> None:
-        timer = self._timers.get(name)
-        if timer is not None and timer.active():
-            timer.cancel()
         # Counted from the beginning, so that late turns of the clock do not add up.
         due = self._clock.seconds() + seconds
 
@@ -294,17 +273,18 @@ class AiboEmulator:
             nonlocal due
             now = self._clock.seconds()
             due = max(due + seconds, now)
-            self._timers[name] = self._clock.callLater(due - now, turn)
+            self._timers[name].set(due - now, turn)
             act()
 
-        self._timers[name] = self._clock.callLater(seconds, turn)
+        self._timers[name].set(seconds, turn)
 
 
 class _Client:
     """Who holds a port."""
 
-    def __init__(self, dog: AiboEmulator, service: str, link: Link) -> None:
+    def __init__(self, dog: AiboEmulator, service: str, outlet: Outlet, link: Link) -> None:
         self.service = service
+        self.outlet = outlet
         self.link = link
         self.lines = LineReader()
         self.commands = CommandReader()

@@ -6,20 +6,7 @@ import shlex
 from collections.abc import Callable
 
 from drivers.aibo.codec import LineReader
-from drivers.aibo.menu import (
-    EMPTY_SLOT,
-    Close,
-    Hello,
-    Item,
-    Load,
-    Message,
-    Pop,
-    Push,
-    Refresh,
-    Stack,
-    Status,
-    encoded,
-)
+from drivers.aibo.menu import EMPTY_SLOT, Close, Hello, Item, Load, Message, Refresh, Stack, Status, Word, encoded
 
 CLASSES = {
     "estop": ("", ""),
@@ -110,7 +97,7 @@ class AiboMenu:
                     transport = self.settings.get("vision.rawcam.transport", "udp").lower()
                     arguments = f'"raw" "{self._ports[service]}" "{transport}"' if service == "camera" else ""
                     loads = [Load(java, instance, self._ports[service], arguments)]
-                return [Push(), *loads, Pop(), self._menu(), self._menu()]
+                return [Word("push"), *loads, Word("pop"), self._menu(), self._menu()]
             if name == "#" + title and service in self.running:
                 self.running.discard(service)
                 self._on_server(service, False)

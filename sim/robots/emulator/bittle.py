@@ -17,6 +17,7 @@ from drivers.bittle.gait import GAITS, Velocity
 from drivers.bittle.option import BEHAVIOURS, POSTURES, checked
 from drivers.link import Link
 from drivers.reading import Value
+from drivers.timer import Timer
 from middleware.faults.stream import StreamFaults
 from sim.robots.emulator.body import Body
 from sim.robots.emulator.outlet import Outlet
@@ -50,12 +51,11 @@ class Bittle:
         body: Body,
         clock: IReactorTime,
         rng: random.Random,
-        faults: StreamFaults | None = None,
         board: str = "biboard",
         resets: bool = False,
         gaits: Mapping[str, Velocity] = GAITS,
     ) -> None:
-        self.faults = StreamFaults() if faults is None else faults
+        self.faults = StreamFaults()
         self.board = board
         self.heard: list[bytes] = []
         self.joints = [0] * 16
@@ -70,9 +70,7 @@ class Bittle:
         self._gaits = gaits
         self._outlet = Outlet(clock, rng, self.faults)
         self._rest = bytearray()
-        self._unfinished: Any = None
-        self._boot: Any = None
-        self._busy: Any = None
+        self._unfinished, self._boot, self._busy = Timer(clock), Timer(clock), Timer(clock)
         self._queue: deque[tuple[bytes, Callable[[str], None]]] = deque()
 
     def accept(self, link: Link) -> Bittle:
@@ -88,15 +86,15 @@ class Bittle:
 
     def received(self, data: bytes) -> None:
         """Hear what comes over the cable."""
-        if self._boot is not None:
+        if self._boot.is_set:
             return
         self._rest += data
-        self._cancel("_unfinished")
+        self._unfinished.cancel()
         while self._rest:
             end = END_BYTES if 65 <= self._rest[0] <= 90 else END_TEXT
             at = self._rest.find(end)
             if at < 0:
-                self._unfinished = self.clock.callLater(UNFINISHED_S, self._on_unfinished)
+                self._unfinished.set(UNFINISHED_S, self._on_unfinished)
                 return
             command = bytes(self._rest[:at])
             del self._rest[: at + 1]
@@ -111,39 +109,29 @@ class Bittle:
         self.stop()
         self._rest.clear()
         self._queue.clear()
-        self._boot = self.clock.callLater(BOOT_S, self._on_booted)
+        self._boot.set(BOOT_S, self._on_booted)
 
     def stop(self) -> None:
         """End; nothing is left on the clock."""
         self._body.halt()
         self.is_limp = True
-        for name in ("_unfinished", "_boot", "_busy"):
-            self._cancel(name)
+        for timer in (self._unfinished, self._boot, self._busy):
+            timer.cancel()
 
     def execute(self, command: bytes, say: Callable[[str], None]) -> None:
         """Do a command, after those before it; ``say`` gets each line of the answer."""
-        if self._boot is not None:
+        if self._boot.is_set:
             return
         self._queue.append((command, say))
-        if self._busy is None:
+        if not self._busy.is_set:
             self._next()
 
-    # -- inside -----------------------------------------------------------------------------------------------------
-
-    def _cancel(self, name: str) -> None:
-        timer = getattr(self, name)
-        setattr(self, name, None)
-        if timer is not None and timer.active():
-            timer.cancel()
-
     def _on_unfinished(self) -> None:
-        self._unfinished = None
         command = bytes(self._rest)
         self._rest.clear()
         self.execute(command, self._say)
 
     def _on_booted(self) -> None:
-        self._boot = None
         for line in ("k", "* Start *", "Bittle", f"Software version: {VERSIONS[self.board]}"):
             self._say(line)
 
@@ -151,7 +139,7 @@ class Bittle:
         self._outlet.send(line.encode() + b"\r\n")
 
     def _next(self) -> None:
-        while self._queue and self._busy is None:
+        while self._queue and not self._busy.is_set:
             command, say = self._queue.popleft()
             if command:
                 self.heard.append(command)
@@ -159,12 +147,11 @@ class Bittle:
 
     def _later(self, seconds: float, say: Callable[[str], None], *lines: str) -> None:
         def done() -> None:
-            self._busy = None
             for line in lines:
                 say(line)
             self._next()
 
-        self._busy = self.clock.callLater(seconds, done)
+        self._busy.set(seconds, done)
 
     def _do(self, token: str, argument: bytes, say: Callable[[str], None]) -> None:
         answer: list[str] = []
@@ -330,4 +317,4 @@ def serve(reactor: Any, body: Body, rng: random.Random, options: Table, dialect:
     dog = Bittle(body, reactor, rng, board=board, gaits=dict(chosen.gaits))
     if chosen.port:
         return CableWire(reactor, dog, chosen.port)
-    return TcpWire(reactor, dog, dog.accept_http, chosen.host, chosen.http_port, False)
+    return TcpWire(reactor, dog, dog.accept_http, chosen.host, chosen.http_port)

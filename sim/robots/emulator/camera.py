@@ -11,83 +11,22 @@ from drivers.camera import codec
 from drivers.camera.option import checked, place_of
 from drivers.errors import UsageError
 from drivers.link import Link
-from middleware.faults.stream import StreamFaults
 from sim.robots.emulator.body import Body
-from sim.robots.emulator.broadcast import Broadcast
-from sim.robots.emulator.outlet import Outlet
+from sim.robots.emulator.outlet import Broadcast, Client, Outlet
 from sim.robots.emulator.wire import Table, TcpWire, Wire
 
 MOST_REQUEST = 8192
 """Bytes of a request."""
 
 
-class MjpegCamera(Broadcast["_Client"]):
-    """One camera; ``accept`` takes its clients, any number, on whatever path they ask for.
-
-    ``faults`` spoils what it says.  ``status`` other than ``200 OK`` turns clients away; without ``has_length`` the
-    boundaries alone tell the pictures apart; ``is_chunked`` is the way of an ESP32-CAM.  Pictures for a client that
-    does not take them are dropped, and those of a body without one left out.
-    """
-
-    def __init__(
-        self,
-        clock: IReactorTime,
-        body: Body,
-        fps: float = 15.0,
-        rng: random.Random | None = None,
-        faults: StreamFaults | None = None,
-    ) -> None:
-        super().__init__(clock, body, fps, rng, faults)
-        self.status = "200 OK"
-        self.kind = f"{codec.KIND};boundary={codec.BOUNDARY}"
-        self.has_length = True
-        self.is_chunked = False
-        self.dropped = 0
-
-    def accept(self, link: Link) -> _Client:
-        """Take a client."""
-        client = _Client(self, link, Outlet(self._clock, self._rng, self.faults))
-        self.clients.append(client)
-        return client
-
-    def answer(self, client: _Client, method: str) -> None:
-        """Answer a request; called by the client."""
-        if method != "GET":
-            client.say(codec.answer("text/plain", "405 Method Not Allowed"))
-        elif self.status != "200 OK":
-            client.say(codec.answer("text/plain", self.status))
-        else:
-            client.say(codec.answer(self.kind, is_chunked=self.is_chunked))
-            client.is_watching = True
-
-    def _tell(self) -> None:
-        watching = [client for client in self.clients if client.is_watching]
-        jpeg = self._body.picture() if watching else None
-        if jpeg is None:
-            return
-        data = codec.part(jpeg, self.has_length)
-        data = codec.chunk(data) if self.is_chunked else data
-        for client in watching:
-            if client.link.is_busy:
-                self.dropped += 1
-            else:
-                client.say(data)
-
-
-class _Client:
+class _Client(Client):
     """One connection."""
 
-    def __init__(self, camera: MjpegCamera, link: Link, outlet: Outlet) -> None:
-        self.link = link
+    def __init__(self, device: Broadcast[Client], link: Link, outlet: Outlet) -> None:
+        super().__init__(device, link, outlet)
         self.is_watching = False
-        self._camera = camera
-        self._outlet = outlet
-        self._outlet.link = link
+        self._camera: Any = device
         self._asked: bytes | None = b""
-
-    def say(self, data: bytes) -> None:
-        """Send ``data``, or what is left of it."""
-        self._outlet.send(data)
 
     def received(self, data: bytes) -> None:
         """Hear a request; what comes after the first is ignored."""
@@ -101,10 +40,47 @@ class _Client:
         elif len(self._asked) > MOST_REQUEST:
             self.link.close()
 
-    def link_down(self) -> None:
-        """The client has gone."""
-        self._outlet.link = None
-        self._camera.leave(self)
+
+class MjpegCamera(Broadcast[_Client]):
+    """One camera, on whatever path its clients ask for.
+
+    ``faults`` spoils what it says.  ``status`` other than ``200 OK`` turns clients away; without ``has_length`` the
+    boundaries alone tell the pictures apart; ``is_chunked`` is the way of an ESP32-CAM.  Pictures for a client that
+    does not take them are dropped, and those of a body without one left out.
+    """
+
+    make_client = _Client
+
+    def __init__(self, clock: IReactorTime, body: Body, fps: float = 15.0) -> None:
+        super().__init__(clock, body, fps)
+        self.status = "200 OK"
+        self.kind = f"{codec.KIND};boundary={codec.BOUNDARY}"
+        self.has_length = True
+        self.is_chunked = False
+        self.dropped = 0
+
+    def answer(self, client: _Client, method: str) -> None:
+        """Answer a request; called by the client."""
+        if method != "GET":
+            client.outlet.send(codec.answer("text/plain", "405 Method Not Allowed"))
+        elif self.status != "200 OK":
+            client.outlet.send(codec.answer("text/plain", self.status))
+        else:
+            client.outlet.send(codec.answer(self.kind, is_chunked=self.is_chunked))
+            client.is_watching = True
+
+    def _tell(self) -> None:
+        watching = [client for client in self.clients if client.is_watching]
+        jpeg = self._body.picture() if watching else None
+        if jpeg is None:
+            return
+        data = codec.part(jpeg, self.has_length)
+        data = codec.chunk(data) if self.is_chunked else data
+        for client in watching:
+            if client.link.is_busy:
+                self.dropped += 1
+            else:
+                client.outlet.send(data)
 
 
 def serve(reactor: Any, body: Body, rng: random.Random, options: Table, dialect: str) -> Wire:

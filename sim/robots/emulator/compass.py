@@ -10,42 +10,26 @@ from twisted.internet.interfaces import IReactorTime
 
 from drivers.compass.codec import eastward, sentence
 from drivers.compass.option import checked
-from drivers.link import Link
-from middleware.faults.stream import StreamFaults
 from sim.robots.emulator.body import Body
-from sim.robots.emulator.broadcast import Broadcast
-from sim.robots.emulator.outlet import Outlet
+from sim.robots.emulator.outlet import Broadcast, Client
 from sim.robots.emulator.wire import CableWire, Table, TcpWire, Wire
 
 
-class NmeaCompass(Broadcast["_Client"]):
-    """One compass; ``accept`` takes a cable or a client.  North is along the yard's y axis.
+class NmeaCompass(Broadcast[Client]):
+    """One compass, at a cable or on the network.  North is along the yard's y axis.
 
     ``kinds`` are the sentences that it sends each time.  Its needle is off by ``deviation``, and the place's magnetic
     north by ``variation``, degrees to the east; ``HDG`` tells both, ``HDM`` the needle without its deviation.  A body
     without ``compass.heading`` has an empty field.  ``faults`` spoils what it says.
     """
 
-    def __init__(
-        self,
-        clock: IReactorTime,
-        body: Body,
-        rate: float = 10.0,
-        rng: random.Random | None = None,
-        faults: StreamFaults | None = None,
-    ) -> None:
-        super().__init__(clock, body, rate, rng, faults)
+    make_client = Client
+
+    def __init__(self, clock: IReactorTime, body: Body, rate: float = 10.0) -> None:
+        super().__init__(clock, body, rate)
         self.kinds: tuple[str, ...] = ("HDG",)
         self.deviation = 0.0
         self.variation = 0.0
-
-    def accept(self, link: Link) -> _Client:
-        """Take a client."""
-        outlet = Outlet(self._clock, self._rng, self.faults)
-        outlet.link = link
-        client = _Client(self, link, outlet)
-        self.clients.append(client)
-        return client
 
     def _tell(self) -> None:
         heading = self._body.sense().get("compass.heading")
@@ -64,27 +48,10 @@ class NmeaCompass(Broadcast["_Client"]):
         return sentence(f"HC{kind}", degrees, kind[2])
 
 
-class _Client:
-    """Who listens."""
-
-    def __init__(self, compass: NmeaCompass, link: Link, outlet: Outlet) -> None:
-        self.link = link
-        self.outlet = outlet
-        self._compass = compass
-
-    def received(self, data: bytes) -> None:
-        """Hear nothing: a compass takes no commands."""
-
-    def link_down(self) -> None:
-        """The client has gone."""
-        self.outlet.link = None
-        self._compass.leave(self)
-
-
 def serve(reactor: Any, body: Body, rng: random.Random, options: Table, dialect: str) -> Wire:
     """Return the wire of a compass: a pseudo-terminal, or TCP."""
     chosen = checked(options)
     compass = NmeaCompass(reactor, body)
     if chosen.device:
-        return CableWire(reactor, compass, chosen.device, True)
+        return CableWire(reactor, compass, chosen.device)
     return TcpWire(reactor, compass, compass.accept, chosen.host, chosen.port)

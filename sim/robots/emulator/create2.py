@@ -10,16 +10,16 @@ from typing import Any
 from twisted.internet.interfaces import IReactorTime
 
 from drivers.create2 import codec
+from drivers.create2.odometry import MM_PER_COUNT, WHEEL_BASE
 from drivers.create2.option import checked
 from drivers.link import Link
 from drivers.reading import Value
+from drivers.timer import Timer
 from middleware.faults.stream import StreamFaults
 from sim.robots.emulator.body import Body
 from sim.robots.emulator.outlet import Outlet
 from sim.robots.emulator.wire import CableWire, Table, Wire
 
-MM_PER_COUNT = math.pi * 72.0 / 508.8
-WHEEL_BASE = 235.0
 CAPACITY = 2696
 BOOT_S = 1.0
 BOOT_TEXT = b"bl-start\r\nSTR730\r\nbootloader id: #x47175347 6C7C0BFF\r\nr3_robot/tags/release-3.5.4\r\n"
@@ -35,13 +35,12 @@ class Create2:
     ``faults`` spoils what it says; ``reboot`` is a power cut; ``left`` and ``right`` are its wheel counters, in counts.
     """
 
-    def __init__(self, body: Body, clock: IReactorTime, rng: random.Random, faults: StreamFaults | None = None) -> None:
-        self.faults = StreamFaults() if faults is None else faults
+    def __init__(self, body: Body, clock: IReactorTime, rng: random.Random) -> None:
+        self.faults = StreamFaults()
         self.mode = OFF
         self.left = self.right = 0.0
         self.played: list[int] = []
         self._body = body
-        self._clock = clock
         self._outlet = Outlet(clock, rng, self.faults)
         self._reader = codec.CommandReader()
         self._ids: tuple[int, ...] = ()
@@ -50,8 +49,8 @@ class Create2:
         self._songs: set[int] = set()
         self._wheels = (0, 0)
         self._place = self._pose()
-        self._boot: Any = None
-        self._tick: Any = clock.callLater(codec.FRAME_S, self._on_tick)
+        self._boot, self._tick = Timer(clock), Timer(clock)
+        self._tick.set(codec.FRAME_S, self._on_tick)
 
     def accept(self, link: Link) -> Create2:
         """Plug a cable in."""
@@ -60,7 +59,7 @@ class Create2:
 
     def received(self, data: bytes) -> None:
         """Hear what comes over the cable."""
-        if self._boot is None:
+        if not self._boot.is_set:
             for command in self._reader.read(data):
                 self._on_command(command)
 
@@ -74,22 +73,13 @@ class Create2:
         self.mode, self._ids, self._streams = OFF, (), False
         self.left = self.right = 0.0
         self._reader = codec.CommandReader()
-        if self._boot is not None:
-            self._boot.cancel()
-        self._boot = self._clock.callLater(BOOT_S, self._on_booted)
+        self._boot.set(BOOT_S, self._outlet.send, BOOT_TEXT)
 
     def stop(self) -> None:
         """End; nothing is left on the clock."""
         self._rest()
-        for timer in (self._tick, self._boot):
-            if timer is not None and timer.active():
-                timer.cancel()
-
-    # -- inside -----------------------------------------------------------------------------------------------------
-
-    def _on_booted(self) -> None:
-        self._boot = None
-        self._outlet.send(BOOT_TEXT)
+        self._tick.cancel()
+        self._boot.cancel()
 
     def _on_command(self, command: codec.Command) -> None:
         if command.opcode == codec.RESET:
@@ -166,13 +156,13 @@ class Create2:
         self._outlet.send(b"".join(codec.packed(one, packets) for one in known))
 
     def _on_tick(self) -> None:
-        self._tick = self._clock.callLater(codec.FRAME_S, self._on_tick)
+        self._tick.set(codec.FRAME_S, self._on_tick)
         self._roll()
         sensed = self._body.sense()
         self._guard(sensed)
         if self._is_docking and sensed.get("power.charging", False):
             self._rest()
-        if self._streams and self._boot is None:
+        if self._streams and not self._boot.is_set:
             self._outlet.send(codec.stream_frame(self._ids, self._packets(sensed)))
 
     def _guard(self, sensed: Mapping[str, Value]) -> None:

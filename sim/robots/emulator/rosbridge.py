@@ -16,8 +16,10 @@ from drivers.link import Link, Receiver
 from drivers.reading import Value
 from drivers.rosbridge.option import checked
 from drivers.rosbridge.websocket import WebSocket
+from drivers.timer import Timer
 from middleware.faults.stream import StreamFaults
 from sim.robots.emulator.body import Body
+from sim.robots.emulator.outlet import Outlet
 from sim.robots.emulator.wire import Table, TcpWire, Wire
 
 BASE_STOPS_S = 0.5
@@ -53,13 +55,11 @@ class RosbridgeRobot:
         clock: IReactorTime,
         body: Body,
         rng: Random,
-        faults: StreamFaults | None = None,
         velocity_type: str = "geometry_msgs/msg/Twist",
-        has_rosapi: bool = True,
     ) -> None:
-        self.faults = faults or StreamFaults()
+        self.faults = StreamFaults()
         self.velocity_type = velocity_type
-        self.has_rosapi = has_rosapi
+        self.has_rosapi = True
         self.rosapi_s = 0.0
         self.has_motor_power = True
         self.ignored = 0
@@ -70,19 +70,16 @@ class RosbridgeRobot:
         self._clients: list[_Client] = []
         self._ticks = 0
         self._booted_at = clock.seconds()
-        self._pending: Any = None
-        self._stop: Any = None
+        self._pending, self._stop = Timer(clock), Timer(clock)
 
     def start(self) -> None:
         """Begin to publish."""
-        self._pending = self._clock.callLater(TICK_S, self._on_tick)
+        self._pending.set(TICK_S, self._on_tick)
 
     def stop(self) -> None:
         """End for good."""
         self._hang_up()
-        if self._pending is not None:
-            self._pending.cancel()
-            self._pending = None
+        self._pending.cancel()
 
     def reboot(self) -> None:
         """Lose all connections, the motion, and the clock, which begins again at 0."""
@@ -92,19 +89,11 @@ class RosbridgeRobot:
 
     def accept(self, link: Link) -> Receiver:
         """Take a client; a rosbridge serves many."""
-        client = _Client(self, link)
+        client = _Client(self, Outlet(self._clock, self._rng, self.faults, link))
         self._clients.append(client)
         return client
 
     # -- for its clients --------------------------------------------------------------------------------------------
-
-    def send(self, link: Link, data: bytes) -> None:
-        """Let some bytes leave as the wire has them."""
-        for piece in self.faults.wire(data, self._rng):
-            if self.faults.delay > 0:
-                self._clock.callLater(self.faults.delay, link.send, piece)
-            else:
-                link.send(piece)
 
     def call(self, client: _Client, name: str, arguments: Any, number: object) -> None:
         """Answer a call, as late as this service does."""
@@ -136,15 +125,13 @@ class RosbridgeRobot:
         except (KeyError, TypeError, ValueError, AttributeError):
             self.ignored += 1
             return
-        if self._stop is not None:
-            self._stop.cancel()
-            self._stop = None
+        self._stop.cancel()
         if not self.has_motor_power or not all(map(math.isfinite, (vx, vy, wz))):
             self._body.halt()
             return
         self._body.drive(vx, vy, wz)
         if vx or vy or wz:
-            self._stop = self._clock.callLater(BASE_STOPS_S, self._on_no_command)
+            self._stop.set(BASE_STOPS_S, self._on_no_command)
 
     def service(self, name: str, arguments: Any) -> tuple[bool, Any]:
         """Whether a service answers, and what."""
@@ -162,22 +149,17 @@ class RosbridgeRobot:
             return True, {"success": True, "message": "docked"}
         return False, f"Service {name} does not exist"
 
-    # -- inside -----------------------------------------------------------------------------------------------------
-
     def _hang_up(self) -> None:
-        if self._stop is not None:
-            self._stop.cancel()
-            self._stop = None
+        self._stop.cancel()
         self._body.halt()
         for client in list(self._clients):
-            client.link.close()
+            client.close()
 
     def _on_no_command(self) -> None:
-        self._stop = None
         self._body.halt()
 
     def _on_tick(self) -> None:
-        self._pending = self._clock.callLater(TICK_S, self._on_tick)
+        self._pending.set(TICK_S, self._on_tick)
         self._ticks += 1
         for topic, (_, rate) in TOPICS.items():
             every = round(1 / rate / TICK_S)
@@ -221,8 +203,8 @@ class RosbridgeRobot:
 class _Client:
     """One connection."""
 
-    def __init__(self, robot: RosbridgeRobot, link: Link) -> None:
-        self.link = link
+    def __init__(self, robot: RosbridgeRobot, outlet: Outlet) -> None:
+        self.outlet = outlet
         self._robot = robot
         self._socket = WebSocket()
         self._topics: dict[str, dict[str, tuple[float, float]]] = {}
@@ -239,7 +221,7 @@ class _Client:
 
     def say(self, message: Mapping[str, Any]) -> None:
         """Send one message."""
-        self._robot.send(self.link, self._socket.text(json.dumps(message).encode()))
+        self.outlet.send(self._socket.text(json.dumps(message).encode()))
 
     def received(self, data: bytes) -> None:
         """Take bytes from the client."""
@@ -247,15 +229,21 @@ class _Client:
             return
         messages, reply = self._socket.received(data)
         if reply:
-            self._robot.send(self.link, reply)
+            self.outlet.send(reply)
         for message in messages:
             for answer in self._answers(message):
                 self.say(answer)
         if self._socket.fault:
-            self.link.close()
+            self.close()
+
+    def close(self) -> None:
+        """Hang up."""
+        if self.outlet.link is not None:
+            self.outlet.link.close()
 
     def link_down(self) -> None:
         """Learn that the client is gone."""
+        self.outlet.link = None
         self._robot.forget(self)
 
     def _answers(self, payload: bytes) -> Iterator[dict[str, Any]]:

@@ -6,7 +6,7 @@ import random
 from collections.abc import Mapping
 from typing import Any, Protocol
 
-from twisted.internet.defer import Deferred, maybeDeferred
+from twisted.internet.defer import Deferred, maybeDeferred, succeed
 
 from drivers.link import Accept, TcpLinkFactory
 from middleware.faults.stream import StreamFaults
@@ -39,52 +39,51 @@ class Serve(Protocol):
 
 
 class TcpWire:
-    """An emulator behind one TCP port; ``begin`` and ``end`` switch it on and off."""
+    """An emulator behind one TCP port; it is switched on and off with it."""
 
-    def __init__(
-        self, reactor: Any, emulator: Any, accept: Accept, host: str, port: int, has_switch: bool = True
-    ) -> None:
+    def __init__(self, reactor: Any, emulator: Any, accept: Accept, host: str, port: int) -> None:
         self.faults = emulator.faults
         self._reactor = reactor
         self._emulator = emulator
         self._accept = accept
         self._address = (host, port)
-        self._has_switch = has_switch
         self._port: Any = None
 
     def start(self) -> None:
         """Listen, and switch the emulator on."""
         host, port = self._address
         self._port = self._reactor.listenTCP(port, TcpLinkFactory(self._accept), interface=host)
-        if self._has_switch:
-            self._emulator.start()
+        _switch_on(self._emulator)
 
     def stop(self) -> Deferred[None]:
         """Switch the emulator off; fires when the port is free."""
         self._emulator.stop()
-        return maybeDeferred(self._port.stopListening) if self._port is not None else maybeDeferred(lambda: None)
+        return succeed(None) if self._port is None else maybeDeferred(self._port.stopListening)
 
 
 class CableWire:
     """An emulator at the end of a cable: a pseudo-terminal whose path is the link ``path``."""
 
-    def __init__(self, reactor: Any, emulator: Any, path: str, has_switch: bool = False) -> None:
+    def __init__(self, reactor: Any, emulator: Any, path: str) -> None:
         self.faults = emulator.faults
         self._reactor = reactor
         self._emulator = emulator
         self._path = path
-        self._has_switch = has_switch
         self._port: PtyPort | None = None
 
     def start(self) -> None:
         """Open the pseudo-terminal, and switch the emulator on."""
         self._port = PtyPort(self._reactor, self._emulator.accept, self._path)
-        if self._has_switch:
-            self._emulator.start()
+        _switch_on(self._emulator)
 
     def stop(self) -> Deferred[None]:
         """Switch the emulator off and remove the pseudo-terminal."""
         self._emulator.stop()
         if self._port is not None:
             self._port.close()
-        return maybeDeferred(lambda: None)
+        return succeed(None)
+
+
+def _switch_on(emulator: Any) -> None:
+    """Start what tells something by itself; other emulators live from the beginning."""
+    getattr(emulator, "start", lambda: None)()

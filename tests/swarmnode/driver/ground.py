@@ -28,20 +28,16 @@ class ScriptedTerminal:
         self._keys = keys
 
     def start(self, pressed: Callable[[str], None]) -> None:
-        """Begin with the script."""
         for seconds, key in self._keys:
             self._clock.callLater(seconds, pressed, key)
 
     def line(self, text: str) -> None:
-        """Keep it, with its moment."""
         self.lines.append((self._clock.seconds(), text))
 
     def say(self, text: str) -> None:
-        """Keep it."""
         self.said.append(text)
 
     def close(self) -> None:
-        """Count it."""
         self.closed += 1
 
 
@@ -58,11 +54,9 @@ class MemoryGround:
         self._pass_time = pass_time
 
     def connector(self, is_moving: bool) -> tuple[Any, Callable[[], list[str]]]:
-        """The robot's."""
         return self._connector, lambda: self.problems
 
     def terminal(self) -> ScriptedTerminal:
-        """One that presses ``keys``."""
         self.terminals.append(ScriptedTerminal(self.clock, self.keys))
         return self.terminals[-1]
 

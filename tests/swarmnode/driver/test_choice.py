@@ -15,13 +15,10 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from drivers.errors import UsageError
 from drivers.link import TcpConnector
-from swarmnode.driver.candidate import Candidate, candidates
-from swarmnode.driver.candidate import lines as candidate_lines
-from swarmnode.driver.catalogue import Entry, catalogue
-from swarmnode.driver.catalogue import lines as catalogue_lines
+from swarmnode.driver.catalogue import Candidate, Entry, candidate_lines, candidates, catalogue, catalogue_lines
 from swarmnode.driver.choice import options_of
-from swarmnode.driver.unit import shown
-from swarmnode.driver.witness import Ear, WitnessedConnector
+from swarmnode.driver.ground import Ear, WitnessedConnector
+from swarmnode.driver.sheet import shown
 
 
 class OptionTests(SynchronousTestCase):

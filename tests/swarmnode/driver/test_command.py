@@ -47,7 +47,6 @@ class DriverCommandTests(SynchronousTestCase):
         self.assertEqual(self.clock.getDelayedCalls(), [])
 
     def pass_time(self, seconds: float) -> None:
-        """Move the body, and note how."""
         self.body.pass_time(seconds)
         self.speeds.append((round(self.clock.seconds(), 3), *self.body.motion[::2]))
 
@@ -223,6 +222,5 @@ class DriverCommandTests(SynchronousTestCase):
         driver.disconnect()
 
     def turn(self, seconds: float) -> None:
-        """Turn the clock."""
         for _ in range(round(seconds / 0.005)):
             self.clock.advance(0.005)
