@@ -8,14 +8,12 @@ from random import Random
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from agents.catalogue import DEMO, TASKS
 from agents.context import Context
 from agents.means import WALK, Means
 from agents.search import SearchAndApproach
 from agents.vision import Sighting
 from drivers.bittle.gait import Velocity
 from drivers.reading import Action, Observation, Value
-from middleware.tasks.task import refusals
 from sim.robots.sensor import NOSE
 from tests.agents.roamer import Roamer, described, quantised
 
@@ -48,15 +46,6 @@ class BodyTests(SynchronousTestCase):
         self.assertLessEqual(robot.gap, 0.15)
         self.assertLessEqual(robot.hardest, max(WALK, robot.means.walk) + 0.01)
 
-    def test_each_kind_meets_what_the_demonstration_asks_for(self) -> None:
-        """With a camera each kind may take part in the demonstration; without one none may."""
-        asked = TASKS[DEMO].requirements
-        for kind in KINDS:
-            has = described(kind).capabilities
-            self.assertEqual(refusals(has, asked), [], kind)
-            blind = {name: properties for name, properties in has.items() if name != "camera"}
-            self.assertEqual(refusals(blind, asked), ["has no camera"], kind)
-
     def test_each_kind_finds_and_reaches_the_target(self) -> None:
         """From several places each kind finds the target, tells its distance to 10 %, and stops before it untouched."""
         for kind in KINDS:
@@ -88,11 +77,6 @@ class BodyTests(SynchronousTestCase):
                     robot.world.place_target_at_random()
                     self.assertIsNotNone(robot.find(180.0))
                     self.arrived(robot)
-
-    def test_faster_bodies_are_faster_where_they_see_ahead(self) -> None:
-        """A robot whose ranger sees far walks faster than a dog; one that feels walls with its bumper does not."""
-        walks = {kind: Means(described(kind)).walk for kind in KINDS}
-        self.assertEqual(walks, {"sim": 0.16, "aibo": 0.16, "create2": 0.16, "bittle": 0.15, "rosbridge": 0.22})
 
     def test_robot_that_turns_in_jerks_does_not_swing_for_ever(self) -> None:
         """A body that knows 1.2 rad/s or nothing accepts a coarse aim: it gets there, and hardly swings."""
@@ -176,17 +160,6 @@ class BumpTests(SynchronousTestCase):
             if done["base.vx"] < 0.0:
                 backed.append(now)
         self.assertTrue(backed)
-
-    def test_robot_of_which_nobody_asks_anything_is_not_stuck(self) -> None:
-        """A pause in which nobody acts is not taken for a wall."""
-        behaviour, means = SearchAndApproach({}, Random(1)), Means(described("bittle"))
-        behaviour.embody(means)
-        values = {"odom.x": 1.0, "odom.y": 1.0, "odom.yaw": 0.0}
-        for now in (0.0, 5.0, 10.0):
-            behaviour.look(Observation(now, now, values), now)
-            behaviour.search(now)
-            means.did(means.go(0.1), {"base.vx": 0.1, "base.wz": 0.0})
-        self.assertFalse(behaviour._detour.is_on(10.0))
 
 
 class Told:

@@ -39,13 +39,6 @@ class DetourTests(SynchronousTestCase):
             self.assertLess(abs(math.dist((x, y), (-BACK, 0.0)) - LEG), 0.02)
             self.assertGreater(side * y, 0.2)
 
-    def test_who_only_saw_it_does_not_back_off(self) -> None:
-        """What is not touched yet needs no step back."""
-        detour = Detour(Means())
-        detour.begin((0.0, 0.0, 0.0), 1.0, 0.0, has_touched=False)
-        poses, _ = self.gone(detour)
-        self.assertGreaterEqual(min(x for x, _, _ in poses), 0.0)
-
     def test_leg_ends_before_the_next_thing(self) -> None:
         """With something close ahead the leg is not walked."""
         detour = Detour(Means())

@@ -146,14 +146,6 @@ class DivisionTests(SynchronousTestCase):
         self.assertIn("broken has no opinion (ZeroDivisionError: no luck)", found[0].fault)
         self.assertEqual(len(self.flushLoggedErrors(ZeroDivisionError)), 1)
 
-    def test_what_left_is_not_divided(self) -> None:
-        """A task that has left its group needs nobody any more."""
-        costs: Costs = {"t1": {"a": 1.0}, "t2": {"a": 2.0}}
-        division = self.division(costs)
-        division.leave("t1")
-        decision = decide(members(costs["t2"]), division.share(task("t2"), 50.0, 40.0), 0.1, 8.0, 40.0)
-        self.assertEqual(decision.assigned, "a")
-
     def test_what_is_divided_together(self) -> None:
         """Tasks of one group with one strategy and equal requirements are; a task without a group is by itself."""
         one = task("t1", requirements={"camera": {"width": 1, "colour": "rgb"}, "legs": {}})

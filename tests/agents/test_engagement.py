@@ -244,14 +244,6 @@ class EngagementTests(SynchronousTestCase):
         permit = self.step().permit
         self.assertEqual((permit.token, permit.deadline), (4, self.clock.seconds() + SEARCH_TTL))
 
-    def test_lease_is_not_claimed_by_those_that_stand_by(self) -> None:
-        """An agent that is not the assigned one claims nothing."""
-        self.hear(self.report(2, 0.5))
-        self.see(1.0)
-        self.step()
-        self.assertFalse(self.council.is_wanted)
-        self.assertEqual(self.engagement.me.assigned, self.others[2].node_id.hex())
-
     def test_body_stops_before_the_lease_goes_back(self) -> None:
         """When a better report takes the task away, the body is stopped first and the lease is given back after."""
         self.acting()
@@ -318,26 +310,6 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.step().action, HOLD)
         self.assertEqual(self.events, ["halted", "released"])
 
-    def test_lease_that_comes_too_late_is_given_back(self) -> None:
-        """Who stopped because its lease ran out gives back the next one, where another should act meanwhile."""
-        self.acting()
-        self.clock.advance(1.6)
-        self.step()
-        self.assertEqual(self.engagement.course.state, State.FENCED)
-        self.council.grant(6)
-        self.hear(self.report(2, 0.5))
-        for _ in range(3):
-            self.assertEqual(self.step().action, HOLD)
-        self.assertEqual(self.events, ["halted", "released"])
-        self.assertEqual(self.dog.executed, 1)
-
-    def test_report_within_the_hysteresis_changes_nothing(self) -> None:
-        """A late report that is hardly better leaves the task where it is."""
-        self.acting()
-        self.hear(self.report(2, 0.95))
-        self.assertEqual(self.step().action, GO)
-        self.assertEqual(self.events, [])
-
     def test_member_that_left_is_decided_without(self) -> None:
         """When the assigned agent disappears, the next one claims the lease at its next step."""
         self.hear(self.report(2, 0.5, EXECUTING), self.report(3, 3.0))
@@ -392,13 +364,6 @@ class EngagementTests(SynchronousTestCase):
         self.see(1.9)
         self.assertEqual(self.engagement.me.cost, 1.9)
 
-    def test_lost_sight_is_reported(self) -> None:
-        """Who loses the target takes its report back, and searches."""
-        self.see(1.0)
-        self.see(None)
-        self.assertIsNone(self.engagement.me.cost)
-        self.assertEqual(self.step().action, LOOK)
-
     def test_lost_body_is_reported(self) -> None:
         """An agent whose robot does not answer leaves the task to the others and gives the lease back."""
         self.acting()
@@ -438,12 +403,6 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual([line for line in self.said if line.startswith("goes")], ["goes: dog1, 1.00, best of 2"])
         self.assertEqual(self.events, [])
 
-    def test_highest_token_is_remembered(self) -> None:
-        """After a lease the body's own motions carry its token, so that the driver does not refuse them."""
-        self.acting(9)
-        self.clock.advance(2.0)
-        self.assertEqual(self.step().permit.token, 9)
-
     def test_done_is_recorded_and_the_lease_kept_until_it_is_known(self) -> None:
         """The finished agent stops, records the outcome once, and gives the lease back when the outcome is known."""
         self.dog.steps = 1
@@ -468,14 +427,6 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.said[-1], "cancelled by vaio")
         self.see(0.5)
 
-    def test_own_report_from_the_network_is_not_a_second_member(self) -> None:
-        """The agent's own record that comes back does not count as another's."""
-        own = Member(ME.node_id.hex(), "dog1", WAITING, 9.0)
-        self.hear(own)
-        self.see(1.0)
-        self.step()
-        self.assertEqual(self.engagement.me.why, "dog1, 1.00, best of 1")
-
     def test_unchanged_reports_are_told_once(self) -> None:
         """Deciding the same again tells nobody anything."""
         self.hear(self.report(2, 0.5))
@@ -487,18 +438,6 @@ class EngagementTests(SynchronousTestCase):
             self.step()
         self.assertEqual(len(self.told), before)
 
-    def test_same_token_resumes_and_a_new_one_is_told(self) -> None:
-        """After the lease was lost and won anew the behaviour goes on, and knows that others may have acted."""
-        self.acting(5)
-        self.clock.advance(2.0)
-        self.step()
-        self.assertEqual(self.engagement.course.state, State.FENCED)
-        self.step()
-        self.council.grant(7)
-        self.step()
-        self.step()
-        self.assertEqual([(c.token, c.is_resumed) for c in self.dog.contexts], [(5, False), (7, False), (7, True)])
-
     def test_task_changes_hands_at_safe_points_only(self) -> None:
         """A better report waits until the body may be stopped; a lost body, a cancellation and a pause do not."""
         self.acting()
@@ -507,14 +446,6 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.step().action, GO)
         self.dog.is_safe = True
         self.assertEqual(self.step().action, HOLD)
-        self.assertEqual(self.events, ["halted", "released"])
-
-    def test_unsafe_body_that_is_lost_gives_way(self) -> None:
-        """Who lost its robot gives the task back whether or not the point is safe."""
-        self.acting()
-        self.dog.is_safe = False
-        self.engagement.lose_body()
-        self.step()
         self.assertEqual(self.events, ["halted", "released"])
 
     def test_pause_and_resume(self) -> None:
@@ -533,15 +464,6 @@ class EngagementTests(SynchronousTestCase):
         self.council.grant(6)
         self.assertEqual(self.step().action, GO)
         self.assertEqual(self.said[-3:], ["resumed by vaio", "reports 0.90 m", "goes: dog1, 0.90, best of 2"])
-
-    def test_put_aside_for_another_task(self) -> None:
-        """Without its body the agent claims nothing, says so, and keeps nobody waiting."""
-        self.acting()
-        self.engagement.put_aside("busy with T", self.clock.seconds())
-        self.assertEqual(self.events, ["halted", "released"])
-        self.assertIsNone(self.engagement.step(self.clock.seconds()))
-        me = self.engagement.me
-        self.assertEqual((me.status, me.state, me.why, me.available), (ASSIGNED, "IDLE", "busy with T", False))
 
     def test_lease_is_kept_while_the_outcome_is_on_its_way(self) -> None:
         """A pause or another task that comes between the deed and its record does not give the lease to another."""
@@ -668,16 +590,6 @@ class EngagementTests(SynchronousTestCase):
         self.hear(Member(ME.node_id.hex(), "dog1", WAITING, 9.0, epoch=4, serial=3))
         self.see(1.0)
         self.assertGreater((self.told[-1].epoch, self.told[-1].serial), (4, 3))
-
-    def test_decisions_name_their_round(self) -> None:
-        """A member that leaves after a decision opens a round, which the report of the new decision names."""
-        self.hear(self.report(2, 0.5, EXECUTING), self.report(3, 3.0))
-        self.see(1.0)
-        self.step()
-        before = self.engagement.me.epoch
-        self.hear(self.report(3, 3.0))
-        self.step()
-        self.assertEqual(self.engagement.me.epoch, before + 1)
 
     def test_heirs_hear_of_a_leave_from_the_one_that_leaves(self) -> None:
         """Who leaves the task names those that stand by, the next one first, and never itself."""

@@ -19,7 +19,6 @@ from twisted.logger import Logger
 from middleware.consensus.bidding.announcement import announcement_of
 from middleware.consensus.bidding.auction import MAX_WAITING, Auction, auction_of
 from middleware.consensus.bidding.bid import Bid, bid_of, is_cost
-from middleware.consensus.bidding.bidding import Bidding
 from middleware.consensus.bidding.errand import MAX_BIDS, Cry, Errand, Notice, Offer
 from middleware.consensus.bidding.parties import OWN, Parties
 from middleware.consensus.bidding.party import OnSummary, Party
@@ -36,6 +35,47 @@ ERRAND_S = 0.4
 """Seconds for an errand: three tries on a path of 100 ms.  More of them finds slow peers, less goes round dead ones."""
 OFFER, ANNOUNCE, CRY = "bid.offer", "bid.announce", "bid.cry"
 FALLBACK = "nearest"
+
+
+class Bidding:
+    """One agent's place in ``auction``; ``on_summary`` is told of the reports that the council announces."""
+
+    def __init__(self, auction: Auction, on_summary: OnSummary, dissemination: Dissemination) -> None:
+        self.auction = auction
+        self.on_summary = on_summary
+        self._dissemination = dissemination
+        self._last: Report | None = None
+        self._has_bid = False
+
+    @property
+    def is_standing(self) -> bool:
+        """Whether there is a bid that was not taken back."""
+        return self._last is not None
+
+    def report(self, report: Report) -> None:
+        """Bid, or bid anew; an equal bid is not sent again.  Raises ``ValueError`` for a cost that is none."""
+        if not self._has_bid or report != self._last:
+            self._next(report)
+
+    def withdraw(self) -> None:
+        """Take the bid back; before the first one: abstain, so that nobody waits for this agent."""
+        if not self._has_bid or self._last is not None:
+            self._next(None)
+
+    def expect(self, bidders: float) -> None:
+        """Where this node is of the council: close the bidding as soon as that many have bid or abstained.
+
+        Infinity: when the waiting period is over.
+        """
+        self._dissemination.expect(self.auction, bidders)
+
+    def leave(self) -> None:
+        """Hear no more of it; the node goes on carrying the bids of others."""
+        self._dissemination.leave(self)
+
+    def _next(self, report: Report | None) -> None:
+        self._dissemination.publish(self.auction, report)
+        self._has_bid, self._last = True, report
 
 
 class Wire(Protocol):
@@ -87,7 +127,7 @@ class Dissemination:
     def enter(self, auction: Auction, on_summary: OnSummary) -> Bidding:
         """Take part in ``auction``; ``on_summary`` is told what is announced, at once where something was."""
         party = self._party(auction, OWN)
-        bidding = Bidding(auction, on_summary, self._publish, self._expect, self._leave)
+        bidding = Bidding(auction, on_summary, self)
         self._biddings.setdefault(auction.digest, []).append(bidding)
         self._parties.own(auction.digest, True)
         if party.told:
@@ -200,7 +240,8 @@ class Dissemination:
         if party.is_outlived and party.own is not None:
             self._bid(party, party.own.report)
 
-    def _publish(self, auction: Auction, report: Report | None) -> None:
+    def publish(self, auction: Auction, report: Report | None) -> None:
+        """Make this node's bid in ``auction``, or take it back.  Raises ``ValueError`` for a cost that is none."""
         if report is not None:
             if not is_cost(report.cost):
                 raise ValueError(f"{report.cost!r} is no cost: it must be finite and not negative")
@@ -214,12 +255,14 @@ class Dissemination:
         bid = Bid(self._identity.public, report, party.next_revision).signed(self._identity, party.auction)
         party.bid(bid, self._scale.counted(self._around.team_size()), self._clock.seconds())
 
-    def _expect(self, auction: Auction, bidders: float) -> None:
+    def expect(self, auction: Auction, bidders: float) -> None:
+        """Close the bidding as soon as that many have bid or abstained."""
         party = self._party(auction, OWN)
         party.expect(bidders)
         self._pump(party)
 
-    def _leave(self, bidding: Bidding) -> None:
+    def leave(self, bidding: Bidding) -> None:
+        """Tell ``bidding`` nothing any more."""
         digest = bidding.auction.digest
         here = [each for each in self._biddings.pop(digest, []) if each is not bidding]
         if here:

@@ -51,24 +51,6 @@ class BenchConsensusTests(SynchronousTestCase):
             self.assertEqual(sorted(map(len, found.owners.values())), [1] * 12)
             self.assertGreater(found.messages, 1.0)
 
-    def test_talk_is_greedy(self) -> None:
-        """What the bidders end with is the greedy assignment, with the messages that it took them."""
-        mission = Mission(12, 12, 1)
-        talk = talked(mission)
-        found, greedy = outcome("cbba", mission, talk), outcome("cbba", mission)
-        self.assertEqual(found.owners, greedy.owners)
-        self.assertEqual((found.messages, greedy.messages), (talk.messages, 2.0))
-
-    def test_meetings(self) -> None:
-        """Meetings begin where the talk ended, never cost more than that, and their messages are counted on top."""
-        mission = Mission(12, 12, 2)
-        talk = talked(mission)
-        before, after = outcome("cbba", mission, talk), outcome("cbba, then meetings", mission, talk)
-        costs = [sum(mission.costs[a][t] for t, a in found.owners.items()) for found in (before, after)]
-        self.assertLess(costs[1], costs[0])
-        self.assertGreater(after.messages, before.messages)
-        self.assertEqual(after.rounds - before.rounds, after.messages - before.messages)
-
     def test_asked_again(self) -> None:
         """Where few bids leave tasks to nobody, all bid for those, until each has an owner; all of it is counted."""
         mission = Mission(110, 110, 1)

@@ -249,16 +249,3 @@ class GuardTests(SynchronousTestCase):
         error = self.assertRaises(UnknownStrategy, guarded, "farthest")
         self.assertIn("nearest", str(error))
         self.assertRaises(UnknownStrategy, guarded, "this:s")
-
-    def test_fallback_of_choice(self) -> None:
-        """Another strategy than the nearest can be what decides then, and is named."""
-
-        class Farthest(Nearest):
-            name = "farthest"
-
-            def find(self, contacts: Sequence[Report]) -> Consensus:
-                return replace(super().find(contacts), assigned_agent="a", standby=())
-
-        found = Guard(Raising(), Farthest()).find(TEAM)
-        self.assertEqual((found.assigned_agent, found.strategy), ("a", "farthest"))
-        self.flushLoggedErrors()

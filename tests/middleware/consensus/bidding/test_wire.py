@@ -13,8 +13,7 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.consensus.bidding.announcement import announcement_of
 from middleware.consensus.bidding.auction import Auction, auction_of
-from middleware.consensus.bidding.bid import Bid, bid_of, report_of
-from middleware.consensus.strategy import Report
+from middleware.consensus.bidding.bid import bid_of, report_of
 from tests.middleware.consensus.bidding.ground import AGENTS, AUCTION, CONTACTS, COUNCIL, announced, bid
 
 leaves = st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats() | st.text() | st.binary()
@@ -97,12 +96,6 @@ class BidTests(SynchronousTestCase):
         self.assertIsNone(report_of({"cost": 1.0, "friend": "b"}, "a"))
         self.assertIsNone(report_of({"cost": 1.0, "agent": "b"}, "a"))
 
-    def test_agent_follows_from_the_key(self) -> None:
-        """Nobody bids for another: the agent is not in the message."""
-        there = bid_of(sent(bid(3, 2.5).packed()))
-        assert there is not None and there.report is not None
-        self.assertEqual(there.report.agent, AGENTS[3].node_id.hex())
-
 
 class AnnouncementTests(SynchronousTestCase):
     def test_comes_as_it_went(self) -> None:
@@ -138,14 +131,3 @@ class AnnouncementTests(SynchronousTestCase):
         """The higher number holds; of equal ones that of the earlier member."""
         first, second, third = announced(1, 0), announced(1, 2), announced(2, 2)
         self.assertEqual(sorted([first, third, second], key=lambda a: a.precedence), [second, first, third])
-
-
-class ReportTests(SynchronousTestCase):
-    def test_every_field_comes_through(self) -> None:
-        """A bid with all that a report may say is genuine on the other side."""
-        agent = AGENTS[3]
-        one = Bid(agent.public, Report(agent.node_id.hex(), 7)).signed(agent, AUCTION)
-        there = bid_of(sent(one.packed()))
-        assert there is not None
-        self.assertEqual(there.report, one.report)
-        self.assertTrue(there.is_genuine(AUCTION))
