@@ -70,7 +70,6 @@ PURE = (
     "middleware.consensus.bidding.direct",
     "middleware.consensus.bidding.errand",
     "middleware.consensus.bidding.flood",
-    "middleware.consensus.bidding.parties",
     "middleware.consensus.bidding.party",
     "middleware.consensus.bidding.rule",
     "middleware.consensus.bidding.scale",

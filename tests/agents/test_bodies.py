@@ -14,10 +14,8 @@ from agents.search import SearchAndApproach
 from agents.vision import Sighting
 from drivers.bittle.gait import Velocity
 from drivers.reading import Action, Observation, Value
-from sim.robots.sensor import NOSE
 from tests.agents.roamer import Roamer, described, quantised
 
-KINDS = ("sim", "aibo", "create2", "bittle", "rosbridge")
 LAG = {"bittle": 0.3}
 ARCS = {"f": Velocity(0.08, 0.0), "b": Velocity(-0.05, 0.0), "l": Velocity(0.06, 0.4), "r": Velocity(0.06, -0.4)}
 JERKS = {"f": Velocity(0.15, 0.0), "b": Velocity(-0.1, 0.0), "l": Velocity(0.0, 1.2), "r": Velocity(0.0, -1.2)}
@@ -45,25 +43,6 @@ class BodyTests(SynchronousTestCase):
         self.assertTrue(robot.reach(limit), "never done")
         self.assertLessEqual(robot.gap, 0.15)
         self.assertLessEqual(robot.hardest, max(WALK, robot.means.walk) + 0.01)
-
-    def test_each_kind_finds_and_reaches_the_target(self) -> None:
-        """From several places each kind finds the target, tells its distance to 10 %, and stops before it untouched."""
-        for kind in KINDS:
-            for seed in (1, 2, 3, 4):
-                with self.subTest(kind=kind, seed=seed):
-                    robot = roamer(kind, seed)
-                    cost = robot.find(60.0)
-                    assert cost is not None
-                    target = robot.world.target
-                    assert target is not None
-                    lens = (
-                        robot.dog.x + NOSE * math.cos(robot.dog.heading),
-                        robot.dog.y + NOSE * math.sin(robot.dog.heading),
-                    )
-                    self.assertLess(abs(cost / math.dist(lens, (target.x, target.y)) - 1.0), 0.10)
-                    self.arrived(robot)
-                    self.assertEqual(robot.world.collisions, 0)
-                    self.assertGreater(robot.gap, 0.05)
 
     def test_robots_that_feel_their_way_find_it_too(self) -> None:
         """Who ranges nothing walks about for a minute, bumps no harder than it walks, and still gets there."""
@@ -171,13 +150,13 @@ class Told:
         self.behaviour.embody(self.means)
         self.now = 0.0
 
-    def see(self, distance: float, bearing: float = 0.0, is_filling: bool = False, **values: Value) -> None:
+    def see(self, distance: float, bearing: float = 0.0, **values: Value) -> None:
         """Look once; ``bump_left`` stands for ``bump.left``."""
         self.now += 0.05
         told: dict[str, Value] = {"odom.x": 0.0, "odom.y": 0.0, "odom.yaw": 0.0}
         told |= {key.replace("_", "."): value for key, value in values.items()}
         self.behaviour.look(Observation(self.now, self.now, told), self.now)
-        self.behaviour._saw(self.now, self.behaviour._pose, Sighting(bearing, distance, not is_filling, is_filling))
+        self.behaviour._saw(self.now, self.behaviour._pose, Sighting(bearing, distance, True))
 
     def execute(self) -> Action | None:
         """What it does next."""
@@ -210,21 +189,6 @@ class NearTests(SynchronousTestCase):
             assert action is not None
             self.assertGreater(sign * action["base.vx"], 0.0, distance)
             self.assertEqual(action["base.wz"] > 0.0, sign > 0.0)
-
-    def test_picture_that_is_filled_does_not_push_the_target_away(self) -> None:
-        """A picture that is all target says less than what was seen before and the way walked since."""
-        told = Told("create2")
-        told.see(0.40)
-        told.see(0.38, is_filling=True, odom_x=0.15)
-        self.assertAlmostEqual(told.behaviour._gap, 0.40 - 0.15 - 0.08)
-
-    def test_ranger_of_unknown_place_is_not_believed_to_be_nearer_than_the_eye(self) -> None:
-        """A scanner that sits behind the camera ranges too far: the nearer of picture and scanner counts."""
-        told = Told("rosbridge")
-        told.see(0.40, range_front=0.40)
-        self.assertAlmostEqual(told.behaviour._gap, 0.32)
-        told.see(0.40, range_front=0.28)
-        self.assertAlmostEqual(told.behaviour._gap, 0.28)
 
 
 class WayTests(SynchronousTestCase):

@@ -64,20 +64,6 @@ class ReadingTests(SynchronousTestCase):
         self.assertEqual(decision.why, "dog-b, 2.00, best of 3; agreed on blue")
         self.assertEqual(by("weighted_vote", replace(one, weight=9.0), two, three).assigned, "a")
 
-    def test_open_vote_names_nobody(self) -> None:
-        """While no option has more than half of all weight nobody goes, and the reason tells the count."""
-        decision = by("weighted_vote", replace(member("a", 1.0), choice="red", electorate=3.0))
-        self.assertEqual((decision.assigned, decision.why), (None, "red: 1; more than half of 3 decides"))
-
-    def test_mean_is_found(self) -> None:
-        """The mean of the places that are reported is agreed on, and other places are another basis and digest."""
-        near, far = replace(member("a", 1.0), value=(0.0, 2.0)), replace(member("b", 2.0), value=(4.0, 0.0))
-        decision = by("rendezvous", near, far)
-        self.assertEqual(decision.consensus and decision.consensus.value, (2.0, 1.0))
-        other = by("rendezvous", near, replace(far, value=(4.0, 1.0)))
-        self.assertNotEqual(decision.basis, other.basis)
-        self.assertNotEqual(decision.digest, other.digest)
-
 
 class DecisionTests(SynchronousTestCase):
     def test_nearest_of_all_is_assigned(self) -> None:

@@ -11,7 +11,7 @@ from twisted.trial.unittest import SynchronousTestCase
 from agents.behaviour import STAND
 from agents.context import Context
 from agents.engagement import SEARCH_TTL, Deed, Engagement
-from agents.state import Event, State
+from agents.state import Event
 from drivers.driver import Permit
 from drivers.reading import Action, Observation
 from middleware.consensus.bidding.panel import Panel
@@ -271,17 +271,6 @@ class EngagementTests(SynchronousTestCase):
         self.step()
         self.assertEqual(self.council.places, [2, 1])
 
-    def test_who_claims_lets_a_better_one_act(self) -> None:
-        """A better report that comes before the lease was granted ends the claim; there was no body to stop."""
-        self.hear(self.report(2, 2.0))
-        self.see(1.0)
-        self.step()
-        self.assertEqual((self.council.is_wanted, self.engagement.course.state), (True, State.CLAIMING))
-        self.hear(self.report(2, 0.5))
-        self.assertEqual(self.step().action, HOLD)
-        self.assertEqual((self.council.is_wanted, self.council.places), (False, [0, 2]))
-        self.assertEqual(self.events, [])
-
     def test_who_is_not_let_insists(self) -> None:
         """Who is to act, and has no lease, says so again each second; nobody can take it for one that gave up."""
         self.hear(self.report(2, 2.0))
@@ -337,16 +326,6 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.step(), Deed(GO, Permit(9, self.council.deadline)))
         self.assertEqual(self.events, ["halted", "moved to 3"])
 
-    def test_council_that_does_not_come_back(self) -> None:
-        """Without its lease after one ttl it is fenced like anybody whose lease ran out."""
-        self.acting()
-        self.engagement.hand_council([CONTACT] * 3)
-        self.assertIsNone(self.engagement.step(self.clock.seconds()))
-        self.clock.advance(TASK.lease_ttl)
-        self.step()
-        self.assertEqual(self.events, ["halted", "moved to 3", "halted"])
-        self.assertNotEqual(self.told[-1].status, EXECUTING)
-
     def test_moved_target_is_reported_again(self) -> None:
         """A distance that grew is reported anew by everybody; one that shrank only by those that do not walk."""
         self.see(1.0)
@@ -363,15 +342,6 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.engagement.me.cost, 0.6)
         self.see(1.9)
         self.assertEqual(self.engagement.me.cost, 1.9)
-
-    def test_lost_body_is_reported(self) -> None:
-        """An agent whose robot does not answer leaves the task to the others and gives the lease back."""
-        self.acting()
-        self.engagement.lose_body()
-        self.clock.advance(2.1)
-        self.step()
-        self.assertEqual(self.engagement.me.assigned, self.others[2].node_id.hex())
-        self.assertEqual(self.events, ["halted", "released"])
 
     def test_lost_body_may_still_move(self) -> None:
         """With the lease of a robot that does not hear that it is to stop goes back for how long it still moves."""
@@ -392,17 +362,6 @@ class EngagementTests(SynchronousTestCase):
             self.see(cost)
             self.assertEqual((self.told[-1].cost, self.told[-1].available), (cost, True), str(cost))
 
-    def test_renewed_lease_goes_on_and_does_not_start_over(self) -> None:
-        """While the token stays the same the execution goes on: nothing is said twice, nothing begins again."""
-        self.acting()
-        for _ in range(40):
-            self.clock.advance(0.05)
-            self.council.grant(5)
-            self.assertEqual(self.step().action, GO)
-        self.assertEqual(self.dog.executed, 41)
-        self.assertEqual([line for line in self.said if line.startswith("goes")], ["goes: dog1, 1.00, best of 2"])
-        self.assertEqual(self.events, [])
-
     def test_done_is_recorded_and_the_lease_kept_until_it_is_known(self) -> None:
         """The finished agent stops, records the outcome once, and gives the lease back when the outcome is known."""
         self.dog.steps = 1
@@ -416,27 +375,6 @@ class EngagementTests(SynchronousTestCase):
         self.end(COMPLETED, "dog1")
         self.engagement.abandon(self.clock.seconds())
         self.assertEqual(self.events[-1], "released")
-
-    def test_outcome_of_another_ends_it_at_once(self) -> None:
-        """A task that was cancelled or done by another is over: the body stops and no step follows."""
-        self.acting()
-        self.end(CANCELLED, "vaio")
-        self.assertTrue(self.engagement.is_over)
-        self.assertEqual(self.events, ["halted"])
-        self.assertIsNone(self.engagement.step(self.clock.seconds()))
-        self.assertEqual(self.said[-1], "cancelled by vaio")
-        self.see(0.5)
-
-    def test_unchanged_reports_are_told_once(self) -> None:
-        """Deciding the same again tells nobody anything."""
-        self.hear(self.report(2, 0.5))
-        self.see(1.0)
-        self.step()
-        before = len(self.told)
-        for _ in range(20):
-            self.clock.advance(0.05)
-            self.step()
-        self.assertEqual(len(self.told), before)
 
     def test_task_changes_hands_at_safe_points_only(self) -> None:
         """A better report waits until the body may be stopped; a lost body, a cancellation and a pause do not."""
@@ -624,15 +562,3 @@ class EngagementTests(SynchronousTestCase):
         self.clock.advance(5.0)
         self.step()
         self.assertEqual(len(accounts), 2)
-
-    def test_epoch_follows_the_token(self) -> None:
-        """The epoch is the token under which somebody acts; when that agent is gone, the next one."""
-        accounts = self.ports.accounts
-        self.see(2.0)
-        self.hear(replace(self.report(2, 1.0, EXECUTING), token=3))
-        self.step()
-        self.hear()
-        self.step()
-        self.council.grant(4)
-        self.step()
-        self.assertEqual([(v.epoch, v.token) for v in accounts], [(3, 0), (4, 0), (4, 4)])

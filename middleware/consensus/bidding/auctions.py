@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Callable, Iterable
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -20,7 +21,6 @@ from middleware.consensus.bidding.announcement import announcement_of
 from middleware.consensus.bidding.auction import MAX_WAITING, Auction, auction_of
 from middleware.consensus.bidding.bid import Bid, bid_of, is_cost
 from middleware.consensus.bidding.errand import MAX_BIDS, Cry, Errand, Notice, Offer
-from middleware.consensus.bidding.parties import OWN, Parties
 from middleware.consensus.bidding.party import OnSummary, Party
 from middleware.consensus.bidding.rule import Rule
 from middleware.consensus.bidding.scale import Scale
@@ -102,6 +102,63 @@ class Surroundings:
     team_size: Callable[[], int]
     strategy_for: Callable[[str], ConsensusAlgorithm]
     may_bid: Callable[[bytes, bytes], bool] = lambda key, public: True
+
+
+MAX_PARTIES = 256
+LIFE_S = 300.0
+"""Seconds after which a party in which nothing happens is forgotten, unless it is this node's own."""
+OWN = b""
+
+
+@dataclass
+class _Held:
+    party: Party
+    opener: bytes
+    touched_at: float
+
+
+class Parties:
+    """Parties by the digest of their auction; those that this node entered itself are never driven out."""
+
+    def __init__(self) -> None:
+        self._held: dict[bytes, _Held] = {}
+
+    def __len__(self) -> int:
+        return len(self._held)
+
+    def __iter__(self) -> Iterator[Party]:
+        return iter([held.party for held in self._held.values()])
+
+    def get(self, digest: bytes) -> Party | None:
+        """The party in the auction with this digest."""
+        held = self._held.get(digest)
+        return held.party if held is not None else None
+
+    def touch(self, digest: bytes, now: float) -> None:
+        """Take note that something happened in a party."""
+        held = self._held.get(digest)
+        if held is not None:
+            held.touched_at = now
+
+    def add(self, party: Party, opener: bytes, now: float) -> list[Party]:
+        """Keep ``party``, which ``opener`` (a node id, or ``OWN``) asked for; those that had to go for it."""
+        idle = [d for d, held in self._held.items() if held.opener != OWN and held.touched_at < now - LIFE_S]
+        gone = [self._held.pop(digest).party for digest in idle]
+        while len(self._held) >= MAX_PARTIES:
+            counts = Counter(held.opener for held in self._held.values() if held.opener != OWN)
+            if not counts:
+                break
+            busiest = counts.most_common(1)[0][0]
+            digest = next(digest for digest, held in self._held.items() if held.opener == busiest)
+            gone.append(self._held.pop(digest).party)
+        self._held[party.auction.digest] = _Held(party, opener, now)
+        return gone
+
+    def own(self, digest: bytes, is_own: bool, opener: bytes = b"left") -> None:
+        """Let a party be this node's own, or no longer."""
+        held = self._held.get(digest)
+        if held is not None:
+            held.opener = OWN if is_own else opener
 
 
 class Dissemination:

@@ -118,45 +118,33 @@ class DecoderTests(SynchronousTestCase):
 
     def test_crafted_reports(self) -> None:
         """A report with a wrong type is none; one whose cost is no distance has nothing to report."""
-        for name, value in [
-            ("name", 5),
-            ("status", 5),
-            ("assigned", None),
-            ("digest", 5),
-            ("token", -1),
-            ("why", 5),
-            ("token", 1.0),
-            ("token", 2**60),
-            ("epoch", -1),
-            ("serial", 0.5),
-            ("state", None),
-            ("available", 1),
-            ("load", -1),
-            ("age", -1.0),
-            ("valid_for", float("nan")),
-            ("progress", "half"),
-            ("angle", float("inf")),
-            ("post", [1.0]),
-            ("uuid", 5),
-            ("battery", 1.5),
-            ("battery", None),
-            ("battery", float("nan")),
-            ("value", 5),
-            ("value", "ab"),
-            ("value", ["a"]),
-            ("value", [float("inf")]),
-            ("value", [1e12]),
-            ("value", [0.0] * 9),
-            ("choice", 5),
-            ("choice", "x" * 65),
-            ("choice", "red\x1b[2J"),
-            ("weight", -1.0),
-            ("weight", 1e12),
-            ("weight", True),
-            ("electorate", float("nan")),
-            ("electorate", "all"),
-        ]:
-            self.assertIsNone(member_of(record(MEMBER, changed(REPORT.packed(), **{name: value}))), (name, value))
+        bad: dict[str, list[object]] = {
+            "name": [5],
+            "status": [5],
+            "assigned": [None],
+            "digest": [5],
+            "token": [-1, 1.0, 2**60],
+            "why": [5],
+            "epoch": [-1],
+            "serial": [0.5],
+            "state": [None],
+            "available": [1],
+            "load": [-1],
+            "age": [-1.0],
+            "valid_for": [float("nan")],
+            "progress": ["half"],
+            "angle": [float("inf")],
+            "post": [[1.0]],
+            "uuid": [5],
+            "battery": [1.5, None, float("nan")],
+            "value": [5, "ab", ["a"], [float("inf")], [1e12], [0.0] * 9],
+            "choice": [5, "x" * 65, "red\x1b[2J"],
+            "weight": [-1.0, 1e12, True],
+            "electorate": [float("nan"), "all"],
+        }
+        for name, values in bad.items():
+            for value in values:
+                self.assertIsNone(member_of(record(MEMBER, changed(REPORT.packed(), **{name: value}))), (name, value))
         for cost in ("near", -1.0, float("nan"), float("inf"), True, [1]):
             report = member_of(record(MEMBER, changed(REPORT.packed(), cost=cost)))
             self.assertEqual(report, replace(REPORT, cost=None), cost)
@@ -181,23 +169,17 @@ class DecoderTests(SynchronousTestCase):
 
     def test_crafted_results(self) -> None:
         """A result with a wrong type, number or outcome is none."""
-        for name, value in [
-            ("outcome", "WON"),
-            ("outcome", []),
-            ("by", 5),
-            ("why", 5),
-            ("took", "5"),
-            ("took", float("nan")),
-            ("token", float("inf")),
-            ("token", "5"),
-            ("token", -1),
-            ("bids", 5),
-            ("bids", [5]),
-            ("bids", [["a"]]),
-            ("bids", [["a", "b"]]),
-            ("bids", [[5, 1.0]]),
-        ]:
-            self.assertIsNone(result_of(record(RESULT, changed(DONE.packed(), **{name: value}))), (name, value))
+        bad: dict[str, list[object]] = {
+            "outcome": ["WON", []],
+            "by": [5],
+            "why": [5],
+            "took": ["5", float("nan")],
+            "token": [float("inf"), "5", -1],
+            "bids": [5, [5], [["a"]], [["a", "b"]], [[5, 1.0]]],
+        }
+        for name, values in bad.items():
+            for value in values:
+                self.assertIsNone(result_of(record(RESULT, changed(DONE.packed(), **{name: value}))), (name, value))
         for value in (None, b"", {}, {"outcome": COMPLETED}, DEPTH):
             self.assertIsNone(result_of(record(RESULT, value)), value)
 

@@ -9,10 +9,9 @@ from typing import Any
 from middleware.consensus.bidding import party
 from middleware.consensus.bidding.announcement import Announcement, Entry
 from middleware.consensus.bidding.auction import Auction
-from middleware.consensus.bidding.auctions import Bidding
+from middleware.consensus.bidding.auctions import MAX_PARTIES, Bidding
 from middleware.consensus.bidding.bid import Bid
 from middleware.consensus.bidding.errand import MAX_BIDS
-from middleware.consensus.bidding.parties import MAX_PARTIES
 from middleware.consensus.bidding.scale import TREE
 from middleware.consensus.strategy import Report
 from middleware.entangled.errors import Refused

@@ -8,10 +8,10 @@ import random
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.consensus.bidding.auction import Auction
+from middleware.consensus.bidding.auctions import LIFE_S, MAX_PARTIES, OWN, Parties
 from middleware.consensus.bidding.audience import MAX_LISTENERS, PAUSES, Audience
 from middleware.consensus.bidding.check import MAX_RELAYED
 from middleware.consensus.bidding.errand import Cry, Errand, Notice, Offer
-from middleware.consensus.bidding.parties import LIFE_S, MAX_PARTIES, OWN, Parties
 from middleware.consensus.bidding.party import Party
 from middleware.consensus.bidding.scale import DIRECT, LEAST_TREE, MOST_DIRECT, NEAR, TREE, Scale, team_size
 from middleware.consensus.bidding.tree import MAX_CHILDREN, hops, shared_bits
@@ -280,15 +280,6 @@ class BranchTests(SynchronousTestCase):
                 straight += offer.is_straight
                 self.party.answered(offer, step * 0.1)
         self.assertEqual(straight, MAX_RELAYED)
-
-    def test_so_many_children(self) -> None:
-        """A branch that carries the bids of as many as it may has no room for another one, but for those it has."""
-        children = [Contact(number.to_bytes(32), Address("10.0.0.1", 1)) for number in range(MAX_CHILDREN)]
-        for child in children:
-            self.assertTrue(self.party.has_room(child))
-            self.party.offered([], child, 0.0, False, 0.0)
-        self.assertFalse(self.party.has_room(CONTACTS[6]))
-        self.assertTrue(self.party.has_room(children[0]))
 
     def test_the_council_hears_everybody(self) -> None:
         """A member of the council has room for whoever comes: there is nobody else to go to."""
