@@ -20,10 +20,8 @@ ROOT = Path(__file__).resolve().parent.parent
 # Plain objects: bytes and ``now`` in, decisions out.
 PURE = (
     "agents.behaviour",
-    "agents.circling",
     "agents.conference",
     "agents.decision",
-    "agents.detour",
     "agents.division",
     "agents.docket",
     "agents.execution",
@@ -67,7 +65,6 @@ PURE = (
     "middleware.consensus.bidding.audience",
     "middleware.consensus.bidding.bid",
     "middleware.consensus.bidding.check",
-    "middleware.consensus.bidding.direct",
     "middleware.consensus.bidding.errand",
     "middleware.consensus.bidding.flood",
     "middleware.consensus.bidding.party",

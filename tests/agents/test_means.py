@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from agents.means import COARSEST, FACING, STAND, STOP_AT, Means, is_bumped, is_lit
+from agents.means import COARSEST, FACING, STAND, STOP_AT, Means
 from drivers.reading import Description
 from tests.agents.roamer import described
 
@@ -104,15 +104,3 @@ class LearningTests(SynchronousTestCase):
         self.assertAlmostEqual(means.go(-0.04)["base.vx"], -0.06)
         means.did({"base.vx": 0.06, "base.wz": 0.0}, {"base.vx": 0.15, "base.wz": 0.0})
         self.assertTrue(before < means.stop_at < before + 0.05)
-
-
-class FeelingTests(SynchronousTestCase):
-    def test_bump_is_any_bumper(self) -> None:
-        """Each bumper counts; what is not pressed, or is another thing, does not."""
-        self.assertTrue(is_bumped({"bump.left": False, "bump.right": True}))
-        self.assertFalse(is_bumped({"bump.left": False, "lightbump.left.hit": True, "button.clean": True}))
-
-    def test_light_bumpers_ahead_count(self) -> None:
-        """Those at the very sides see what the robot passes by."""
-        self.assertTrue(is_lit({"lightbump.center_left.hit": True}))
-        self.assertFalse(is_lit({"lightbump.left.hit": True, "lightbump.center_right.hit": False}))

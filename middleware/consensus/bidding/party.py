@@ -13,8 +13,7 @@ from middleware.consensus.bidding.announcement import Announcement
 from middleware.consensus.bidding.auction import Auction
 from middleware.consensus.bidding.audience import Audience
 from middleware.consensus.bidding.bid import Bid
-from middleware.consensus.bidding.check import Check
-from middleware.consensus.bidding.direct import Direct
+from middleware.consensus.bidding.check import Check, Direct
 from middleware.consensus.bidding.errand import Errand, Notice, Offer
 from middleware.consensus.bidding.flood import Flood
 from middleware.consensus.bidding.rule import Rule

@@ -119,14 +119,6 @@ class GuardTests(SynchronousTestCase):
         guard.find(TEAM)
         self.assertTrue(self.flushLoggedErrors())
 
-    def test_good_one(self) -> None:
-        """A good strategy is not changed by its guard, and nothing is logged."""
-        guard = Guard(Nearest(), twice=True)
-        self.assertEqual(guard.find(TEAM), Nearest().find(TEAM))
-        self.assertEqual((guard.name, guard.version), ("nearest", "2"))
-        self.assertTrue(guard.improves(TEAM[0], TEAM[1], 0.1))
-        self.assertEqual(guard.merge(TEAM[:2], TEAM[2:]), Nearest().merge(TEAM, ()))
-
     def test_raising(self) -> None:
         """One that raises has no opinion; its exception is named, and the trace is logged once for the same."""
         guard = Guard(Raising())

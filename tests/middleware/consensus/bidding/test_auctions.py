@@ -164,15 +164,6 @@ class DisseminationTests(AuctionCase):
         with self.assertRaises(ValueError):
             bidding.report(Report(fleet.nodes[1].uuid, 1.0))
 
-    def test_leaving(self) -> None:
-        """Who left hears no more."""
-        fleet = self.prepared(4)
-        biddings = self.enter(fleet, 3.0, 1.0, 2.0)
-        biddings[0].leave()
-        fleet.run(2.0)
-        self.assertEqual(self.views[0], [])
-        self.assertNotEqual(self.views[1], [])
-
     def test_listener_that_raises(self) -> None:
         """What somebody does with an announcement harms nobody else."""
         fleet = self.prepared(4)

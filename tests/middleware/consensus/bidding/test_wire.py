@@ -25,14 +25,20 @@ def sent(content: Any) -> Any:
     return msgpack.unpackb(msgpack.packb(content))
 
 
-class AuctionTests(SynchronousTestCase):
+class WireTests(SynchronousTestCase):
     def test_comes_as_it_went(self) -> None:
-        """An auction is the same on the other side, with the same digest."""
-        there = auction_of(sent(AUCTION.packed()))
-        self.assertEqual(there, AUCTION)
-        assert there is not None
-        self.assertEqual(there.digest, AUCTION.digest)
+        """An auction, a bid, its withdrawal and an announcement are the same on the other side, and genuine."""
+        auction = auction_of(sent(AUCTION.packed()))
+        self.assertEqual((auction, auction and auction.digest), (AUCTION, AUCTION.digest))
+        for one in (bid(3, 2.5), bid(3, 0), bid(3, None, 4)):
+            there = bid_of(sent(one.packed()))
+            self.assertEqual((there, there and there.is_genuine(AUCTION)), (one, True))
+        said = announced(3, 1, bid(4, 1.5), bid(5, 2.5, 2))
+        heard = announcement_of(sent(said.packed()))
+        self.assertEqual((heard, heard and heard.is_genuine(AUCTION)), (said, True))
 
+
+class AuctionTests(SynchronousTestCase):
     def test_council_is_part_of_it(self) -> None:
         """Another council, epoch, strategy or waiting period makes another auction, so nobody can slip one in."""
         others = [
@@ -67,14 +73,6 @@ class AuctionTests(SynchronousTestCase):
 
 
 class BidTests(SynchronousTestCase):
-    def test_comes_as_it_went(self) -> None:
-        """A bid and its withdrawal are the same on the other side, and genuine."""
-        for one in (bid(3, 2.5), bid(3, 0), bid(3, None, 4)):
-            there = bid_of(sent(one.packed()))
-            self.assertEqual(there, one)
-            assert there is not None
-            self.assertTrue(there.is_genuine(AUCTION))
-
     def test_forged_ones(self) -> None:
         """Another cost, revision, key or auction than the one signed is not genuine."""
         one = bid(3, 2.5)
@@ -98,14 +96,6 @@ class BidTests(SynchronousTestCase):
 
 
 class AnnouncementTests(SynchronousTestCase):
-    def test_comes_as_it_went(self) -> None:
-        """An announcement is the same on the other side, and genuine."""
-        one = announced(3, 1, bid(4, 1.5), bid(5, 2.5, 2))
-        there = announcement_of(sent(one.packed()))
-        self.assertEqual(there, one)
-        assert there is not None
-        self.assertTrue(there.is_genuine(AUCTION))
-
     def test_only_of_the_council(self) -> None:
         """What a node outside of the pinned council signs, under whatever place it claims, is not genuine."""
         stranger = AGENTS[7]
