@@ -100,27 +100,3 @@ class BidderTests(SynchronousTestCase):
             for bidder in bidders.values():
                 bids = [w.bid for t in bidder.bundle if (w := bidder.winner(t)) is not None]
                 self.assertEqual(bids, sorted(bids, reverse=True))
-
-    def test_born_again(self) -> None:
-        """Who lost its memory within an epoch is told what it said, and says otherwise with a higher number."""
-        old, other = (
-            Bidder("a", ["s", "t"], flat({"s": 1.0, "t": 2.0})),
-            Bidder("b", ["s", "t"], flat({"s": 9.0, "t": 9.0})),
-        )
-        talk = Talk(1, [("a", "b")], {"a": old, "b": other})
-        talk.run()
-        again = Bidder("a", ["s", "t"], flat({"s": 2.0, "t": 1.0}), neighbours=["b"])
-        talk.bidders["a"] = again
-        other.hear("a", again.drain()["b"])
-        talk.way.append(("b", "a", tuple(other._known["s"].values())))
-        talk.run()
-        self.assertEqual(talk.owners(), {"t": ["a"], "s": ["b"]})
-
-    def test_nonsense(self) -> None:
-        """Bids that are no numbers, endless or below zero, and tasks that nobody gave out, are not heard."""
-        bidder = Bidder("b", ["t"], flat({"t": 1.0}))
-        bad = [Statement("t", "a", 1, bid) for bid in (float("nan"), float("inf"), -1.0, 1e300)]
-        self.assertEqual(bidder.hear("a", [*bad, Statement("zzz", "a", 1, 5.0)]), [])
-        winner = bidder.winner("t")
-        assert winner is not None
-        self.assertEqual(winner.agent, "b")

@@ -1,4 +1,4 @@
-"""Tests of tasks, reports and results as records, and of who can do what."""
+"""Tests of tasks, reports, results and orders as records, and of who can do what."""
 
 from __future__ import annotations
 
@@ -14,11 +14,13 @@ from middleware.entangled.contact import Contact
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.network import Address
 from middleware.entangled.record import Record, hashed_key
+from middleware.tasks.order import PAUSE, RESUME, Order, order_of
 from middleware.tasks.task import (
     CANCELLED,
     COMPLETED,
     FAILED,
     MEMBER,
+    ORDER,
     RESULT,
     Member,
     Result,
@@ -37,6 +39,7 @@ COUNCIL = tuple(Contact(who.public, Address("10.0.0.1", 7000)) for who in (DOG, 
 TASK = Task("t1", "search", "Find it", {"camera": {"width": 208}}, {"radius": 0.3}, created=5.0, council=COUNCIL)
 UUID = DOG.node_id.hex()
 REPORT = Member(UUID, "dog", "WAITING", 1.5, UUID, "abcd", 3, "nearest")
+PAUSED = Order(PAUSE, "vaio", 5.0)
 DONE = Result(COMPLETED, "dog", 12.5, 3, (("dog", 1.5),))
 
 
@@ -236,3 +239,23 @@ class RefusalTests(SynchronousTestCase):
     def test_a_number_that_is_none_is_not_enough(self) -> None:
         """A capability of NaN meets no requirement."""
         self.assertEqual(len(refusals({"camera": {"width": float("nan")}}, {"camera": {"width": 1}})), 1)
+
+
+class OrderTests(SynchronousTestCase):
+    def test_newest_holds(self) -> None:
+        """Of several orders the newest holds, in any order of the records; equal moments are decided, too."""
+        resumed = replace(PAUSED, word=RESUME, at=6.0)
+        records = [record(ORDER, PAUSED.packed()), record(ORDER, resumed.packed())]
+        self.assertEqual(order_of(records), resumed)
+        self.assertEqual(order_of(records[::-1]), resumed)
+        tie = [record(ORDER, PAUSED.packed()), record(ORDER, replace(PAUSED, word=RESUME).packed())]
+        self.assertEqual(order_of(tie), order_of(tie[::-1]))
+
+    def test_nothing(self) -> None:
+        """Without an order, or with what is none, the task goes its way."""
+        lawful = msgpack.unpackb(PAUSED.packed())
+        crafted = [{}, {**lawful, "word": "FLY"}, {**lawful, "by": 5}, {**lawful, "at": float("nan")}, [1], b"\xc1"]
+        for value in crafted:
+            self.assertIsNone(order_of([record(ORDER, value)]), value)
+        self.assertIsNone(order_of([record(MEMBER, PAUSED.packed())]))
+        self.assertIsNone(order_of([]))
