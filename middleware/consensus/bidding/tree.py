@@ -84,12 +84,10 @@ class Branch:
         """When there is something to send."""
         return math.inf if self._under_way is not None else self._send_at
 
-    def join(self, bids: Iterable[Bid], now: float) -> bool:
-        """Take bids in; whether they changed anything."""
-        changed = self.summary.join(bids)
-        if changed:
+    def join(self, bids: Iterable[Bid], now: float) -> None:
+        """Take bids in."""
+        if self.summary.join(bids):
             self._send_at = min(self._send_at, now + (LATER if self._has_sent else self._hold))
-        return changed
 
     def offers(self, age: float, now: float) -> list[Offer]:
         """What goes out now."""
