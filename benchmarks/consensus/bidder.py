@@ -167,5 +167,14 @@ class Bidder:
         self.bundle = tuple(bids)
 
 
+def is_over(rounds: int, quiet: int, tasks: int, members: int) -> bool:
+    """Whether nothing can change any more after so many ``rounds`` in step, the last ``quiet`` of them without news.
+
+    Silence proves nothing: far away others may still change their minds.  What does is that each task is settled
+    within as many rounds as the longest way has hops (Choi and others, theorem 1), if no message is lost.
+    """
+    return rounds > tasks * max(1, members - 1)
+
+
 def _beats(bid: float, agent: str, rival: Statement) -> bool:
     return bid > rival.bid or (bid == rival.bid and agent < rival.agent)
