@@ -1,4 +1,4 @@
-"""Exploration: look all around, then walk to a new place where the way is open, and look around again; pure.
+"""Exploration: look all around, walk to a new place where the way is open, or round what is in the way; pure.
 
 Knows ranges and the robot's own odometry, and not what is searched for.
 """
@@ -22,6 +22,13 @@ AIMED = math.radians(8.0)
 HERE = 0.5
 """A bump not farther away than that says that its heading is no way from here either."""
 BUMPS = 3
+BACK = 0.10
+"""Metres of a detour backwards: nothing looks behind."""
+BACK_SPEED = 0.08
+DETOUR_LEG = 0.35
+AWAY = math.radians(70.0)
+DETOUR_PATIENCE_S = 4.0
+"""Seconds for each of the three legs of a detour; who is stuck goes on with the next."""
 
 Pose = tuple[float, float, float]
 
@@ -60,14 +67,13 @@ class Exploration:
             self._heading = self._most_open(pose)
         off = math.remainder(self._heading - pose[2], math.tau)
         if self._leg_from is None:
-            if abs(off) > max(AIMED, self.means.aim):
-                return self.means.spin(clipped(TURN_GAIN * off, self.means.look_turn))
+            if (turn := turn_to(self.means, off)) is not None:
+                return turn
             self._leg_from = pose[:2]
-        is_blocked = not math.isnan(ahead) and ahead < CLEARANCE
-        if is_blocked or math.dist(self._leg_from, pose[:2]) >= LEG:
+        if is_blocked(ahead) or math.dist(self._leg_from, pose[:2]) >= LEG:
             self._begin_turn()
             return STAND
-        return self.means.go(self.means.walk, clipped(TURN_GAIN * off, self.means.look_turn))
+        return walk_to(self.means, off)
 
     def _most_open(self, pose: Pose) -> float:
         """A heading with room ahead and beside it, in the own sector if there is one; chance decides among the best."""
@@ -90,6 +96,67 @@ class Exploration:
         self._side = self._rng.choice((-1.0, 1.0))
 
 
+class Detour:
+    """One robot's way round what it touched, or what stands before it: back off, turn away, walk on a little."""
+
+    def __init__(self, means: Means) -> None:
+        self.means = means
+        self._legs: list[str] = []
+        self._heading = 0.0
+        self._from: Pose = (0.0, 0.0, 0.0)
+        self._since = 0.0
+
+    def is_on(self, now: float) -> bool:
+        """Whether the robot is on its way round, and looks elsewhere."""
+        return bool(self._legs) and now - self._since <= DETOUR_PATIENCE_S
+
+    def begin(self, pose: Pose, side: float, now: float, has_touched: bool) -> None:
+        """Go round on ``side`` (1: left), from ``pose``; who has touched it backs off first."""
+        self._legs = ["back", "turn", "walk"] if has_touched else ["turn", "walk"]
+        self._heading = pose[2] + side * AWAY
+        self._from, self._since = pose, now
+
+    def end(self) -> None:
+        """Look where it is now."""
+        self._legs = []
+
+    def step(self, pose: Pose, ahead: float, now: float) -> Action | None:
+        """What to do next; None once it is round.  ``ahead`` is the range ahead, NaN: nothing."""
+        while self._legs:
+            action = None if now - self._since > DETOUR_PATIENCE_S else self._on_leg(self._legs[0], pose, ahead)
+            if action is not None:
+                return action
+            self._legs.pop(0)
+            self._from, self._since = pose, now
+        return None
+
+    def _on_leg(self, leg: str, pose: Pose, ahead: float) -> Action | None:
+        off = math.remainder(self._heading - pose[2], math.tau)
+        way = math.dist(pose[:2], self._from[:2])
+        if leg == "back":
+            return None if way >= BACK else self.means.go(-BACK_SPEED)
+        if leg == "turn":
+            return turn_to(self.means, off)
+        if way >= DETOUR_LEG or is_blocked(ahead):
+            return None
+        return walk_to(self.means, off)
+
+
 def clipped(value: float, limit: float) -> float:
     """``value``, or ``limit`` with its sign where it is larger."""
     return max(-limit, min(limit, value))
+
+
+def turn_to(means: Means, off: float) -> Action | None:
+    """Turn on the spot to a heading ``off`` radians to the left; None where the body looks there well enough."""
+    return None if abs(off) <= max(AIMED, means.aim) else means.spin(clipped(TURN_GAIN * off, means.look_turn))
+
+
+def walk_to(means: Means, off: float) -> Action:
+    """Walk on towards a heading ``off`` radians to the left."""
+    return means.go(means.walk, clipped(TURN_GAIN * off, means.look_turn))
+
+
+def is_blocked(ahead: float) -> bool:
+    """Whether something stands in the way, by the range ahead (NaN: nothing within reach)."""
+    return not math.isnan(ahead) and ahead < CLEARANCE

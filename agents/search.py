@@ -13,12 +13,10 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 
-from agents.circling import Circling
 from agents.context import Context
 from agents.detection import Detector
-from agents.detour import Detour
-from agents.exploration import TURN_GAIN, Exploration, Pose, clipped
-from agents.formation import Post
+from agents.exploration import TURN_GAIN, Detour, Exploration, Pose, clipped
+from agents.formation import Circling, Post
 from agents.means import FAR, LIT, NEAR, STAND, Means, is_bumped, is_lit
 from agents.vision import Sighting, Size, find_target
 from drivers.reading import Action, Observation

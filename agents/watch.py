@@ -10,13 +10,16 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Mapping
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 from twisted.logger import Logger
 
 from agents.context import Context
 from agents.means import Means
 from drivers.reading import Action, Observation
+
+if TYPE_CHECKING:
+    from agents.search import SearchAndApproach
 
 BEARING, DISTANCE = "target.bearing", "target.distance"
 STAND: Action = {}
@@ -33,23 +36,6 @@ STEP = 0.25
 _log = Logger()
 
 
-class Finder(Protocol):
-    """A body's way to find the target."""
-
-    @property
-    def cost(self) -> float | None:
-        """Metres to the target; None while it cannot tell."""
-
-    def look(self, seen: Observation, now: float) -> None:
-        """Take in what the body senses now."""
-
-    def is_in_view(self, now: float) -> bool:
-        """Whether the target is before its eyes."""
-
-    def search(self, now: float) -> Action:
-        """Look for the target; once it is seen, face it."""
-
-
 class WatchTarget:
     """One body and one red target.
 
@@ -63,7 +49,7 @@ class WatchTarget:
             raise ValueError(f"seconds must be more than 0 and at most {MAX_SECONDS:g}, is {self._needed:g}")
         self._parameters = parameters
         self._rng = rng
-        self._finder: Finder | None = None
+        self._finder: Told | SearchAndApproach | None = None
         self._has_motors = False
         self._means: Means | None = None
         self._watched = 0.0
@@ -108,7 +94,7 @@ class WatchTarget:
         self._looked_at = now if is_in_view else None
         return None if self._watched >= self._needed else self.search(now)
 
-    def _found(self, seen: Observation) -> Finder:
+    def _found(self, seen: Observation) -> Told | SearchAndApproach:
         if BEARING in seen.values:
             return Told()
         try:

@@ -182,7 +182,7 @@ class Crowd:
 
     def assigned(self, place: int) -> str | None:
         """Whom the agent at ``place`` takes for the winner."""
-        return self._rule.assigned(self.views[place])
+        return self._rule.decided(self.views[place])[0]
 
     # -- links ------------------------------------------------------------------------------------------------------
 
@@ -288,9 +288,9 @@ class Crowd:
         )
 
     def _told(self, place: int, reports: tuple[Report, ...]) -> None:
-        before = self._rule.assigned(self.views[place])
+        before = self._rule.decided(self.views[place])[0]
         self.views[place] = reports
-        if self._rule.assigned(reports) != before:
+        if self._rule.decided(reports)[0] != before:
             self.changed_at[place] = self.now
 
 

@@ -46,8 +46,7 @@ from middleware.tasks.task import COUNCIL, MEMBER, ORDER, RESULT, TASKS, Result,
 
 if TYPE_CHECKING:
     from middleware.admission.team import Team
-    from middleware.consensus.bidding.auctions import Dissemination
-    from middleware.consensus.bidding.bidding import Bidding
+    from middleware.consensus.bidding.auctions import Bidding, Dissemination
     from middleware.consensus.bidding.panel import Panel
     from middleware.consensus.bidding.party import OnSummary
     from middleware.consensus.guard import Guard

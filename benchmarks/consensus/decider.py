@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from benchmarks.consensus.mission import Mission
-from middleware.consensus.item import GroupAlgorithm, capacities, exact
+from middleware.consensus.item import Sharing, capacities, exact
 from middleware.consensus.strategies.cbba import Cbba, greedy
 from middleware.consensus.strategies.group_optimal import BIDS, GroupOptimal
 from middleware.consensus.strategies.nearest import Nearest
@@ -40,7 +40,7 @@ def bundled(mission: Mission, reports: list[Report]) -> Owners:
     return greedy(costs, capacities(reports))
 
 
-def shared(strategy: GroupAlgorithm) -> Decider:
+def shared(strategy: Sharing) -> Decider:
     """A strategy for several tasks."""
 
     def decide(mission: Mission, reports: list[Report]) -> Owners:

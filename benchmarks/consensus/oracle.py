@@ -22,7 +22,8 @@ def least_star(mission: Mission) -> tuple[float, str]:
         import numpy
         from scipy.optimize import linear_sum_assignment
     except ImportError:
-        return float(hungarian.total(costs, hungarian.solved(costs)[0])), "own Hungarian"
+        chosen_columns = hungarian.solved(costs)[0]
+        return float(sum(row[column] for row, column in zip(costs, chosen_columns, strict=True))), "own Hungarian"
     table: Any = numpy.array(costs, dtype=float)
     rows, chosen = linear_sum_assignment(table)
     return float(table[rows, chosen].sum()), "SciPy"

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import random
 import time
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import msgpack
 
+from benchmarks.consensus.bidder import Bidder, Score, Statement
 from benchmarks.consensus.mission import SIDE, Mission
-from middleware.consensus.strategies.bidder import Bidder, Score, Statement
-from middleware.consensus.strategies.exchange import met, partners
+from middleware.consensus.strategies.cbba import exchanged
 
 PAUSE = 5
 """Rounds between two messages of an agent: what it learns meanwhile goes in one."""
@@ -28,6 +29,31 @@ class Talked:
     messages: float
     octets: float
     cpu_s: float
+
+
+def partners(agent: str, owners: Mapping[str, str], near: Iterable[str], most: int = 16) -> list[str]:
+    """Whom an agent should meet, to swap with: who has the tasks that it would have liked best, ``near`` in order."""
+    found: dict[str, None] = {}
+    for task in near:
+        owner = owners.get(task, agent)
+        if owner != agent:
+            found[owner] = None
+            if len(found) >= most:
+                break
+    return list(found)
+
+
+def met(
+    one: str,
+    other: str,
+    owners: Mapping[str, str],
+    costs: Mapping[str, Mapping[str, int]],
+    capacities: Mapping[str, int],
+) -> dict[str, str]:
+    """Who of two agents has each of their tasks after they met: each told the other what those tasks cost it."""
+    both = {task: agent for task, agent in owners.items() if agent in (one, other)}
+    rows = {agent: {task: costs[agent][task] for task in both if task in costs[agent]} for agent in (one, other)}
+    return exchanged(both, rows, capacities)
 
 
 def after_meetings(mission: Mission, owners: dict[str, str]) -> tuple[dict[str, str], float]:

@@ -271,61 +271,21 @@ def broken(make: Make) -> dict[str, str]:
 
 
 class Conformance:
-    """Tests to be mixed into a test case that says ``make = ...``, the class of a strategy."""
+    """Tests to be mixed into a test case that says ``make = ...``, the class of a strategy; one for each check."""
 
     make: Any
 
-    def test_name(self) -> None:
-        """It says its name and version."""
-        check_name(self._made())
 
-    def test_purity(self) -> None:
-        """The answer depends on the reports alone."""
-        check_purity(self._made())
+def _test_of(check: Callable[[Make], None]) -> Callable[[Conformance], None]:
+    def test(self: Conformance) -> None:
+        check(type(self).make)
 
-    def test_order(self) -> None:
-        """Neither the order of the reports nor their repetition makes a difference."""
-        check_order(self._made())
+    test.__doc__ = check.__doc__
+    return test
 
-    def test_merge(self) -> None:
-        """``merge`` is a join, and a summary is enough."""
-        check_merge(self._made())
 
-    def test_ties(self) -> None:
-        """Among equals there is always one, and the same for everybody."""
-        check_ties(self._made())
-
-    def test_winners(self) -> None:
-        """Whoever is named has reported."""
-        check_winners(self._made())
-
-    def test_hostile(self) -> None:
-        """Unlawful reports make no difference."""
-        check_hostile(self._made())
-
-    def test_improves(self) -> None:
-        """Only what is better by more than the hysteresis takes over."""
-        check_improves(self._made())
-
-    def test_hashing(self) -> None:
-        """It makes no difference how the process hashes names."""
-        check_hashing(self._made())
-
-    def test_many(self) -> None:
-        """With 300 agents everything is as with three."""
-        check_many(self._made())
-
-    def test_group(self) -> None:
-        """Several tasks at once: one answer each, nobody beyond its capacity."""
-        check_group(self._made())
-
-    def test_reads(self) -> None:
-        """What it does not say that it reads makes no difference."""
-        check_reads(self._made())
-
-    def _made(self) -> Make:
-        make: Make = type(self).make
-        return make
+for _name, _check in CHECKS.items():
+    setattr(Conformance, f"test_{_name}", _test_of(_check))
 
 
 def _agent_of(report: Report) -> str:

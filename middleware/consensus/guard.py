@@ -42,22 +42,20 @@ class Lost(NoOpinion):
 
 
 class Guard:
-    """A strategy that cannot fail, around one that can; ``fallback`` decides where it has no opinion.
+    """A strategy that cannot fail, around one that can; the nearest acts where it has no opinion.
 
     ``twice`` asks everything a second time in another order, for strategies that nobody here has tested.
     """
 
     log = Logger()
 
-    def __init__(
-        self, strategy: ConsensusAlgorithm, fallback: ConsensusAlgorithm | None = None, twice: bool = False
-    ) -> None:
+    def __init__(self, strategy: ConsensusAlgorithm, twice: bool = False) -> None:
         self.strategy = strategy
         self.name = str(getattr(strategy, "name", type(strategy).__name__))[:MAX_NAME]
         self.version = str(getattr(strategy, "version", ""))[:MAX_NAME]
         self.reads = reads_of(strategy)
         self.why_not = ""
-        self._fallback = fallback or Nearest()
+        self._fallback = Nearest()
         self._twice = twice
         self._asked = 0
         self._losses: list[int] = []
@@ -65,7 +63,7 @@ class Guard:
 
     def find(self, contacts: Sequence[Report]) -> Consensus:
         """The consensus point of the lawful reports; the reason says where it is the fallback's."""
-        lawful = tuple(sorted((r for r in contacts if not refusal(r)), key=_order))
+        lawful = _lawful(contacts)
         try:
             self._may_be_asked()
             found = checked(self.strategy.find(lawful), lawful)
@@ -83,7 +81,7 @@ class Guard:
 
     def find_group(self, contacts: Sequence[Report], items: Sequence[Item]) -> tuple[Consensus, ...]:
         """One consensus point for each item; of a strategy for one task, or of the fallback, one after the other."""
-        lawful = tuple(sorted((r for r in contacts if not refusal(r)), key=_order))
+        lawful = _lawful(contacts)
         whole = getattr(self.strategy, "find_group", None)
         if whole is None:
             return one_by_one(self.find, lawful, items)
@@ -114,7 +112,7 @@ class Guard:
 
     def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
         """A summary of both, of lawful reports that are in one of them; the fallback's where it is not."""
-        lawful = tuple(sorted((r for r in (*a, *b) if not refusal(r)), key=_order))
+        lawful = _lawful((*a, *b))
         try:
             self._may_be_asked()
             merged = self.strategy.merge(lawful, ())
@@ -203,6 +201,11 @@ def one_by_one(
             room[point.assigned_agent] -= 1
         points.append(point)
     return tuple(points)
+
+
+def _lawful(contacts: Sequence[Report]) -> tuple[Report, ...]:
+    """The reports that count, in an order that does not depend on the given one."""
+    return tuple(sorted((r for r in contacts if not refusal(r)), key=_order))
 
 
 def _order(report: Report) -> tuple[object, ...]:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 from middleware.consensus.strategies.nearest import Nearest
-from middleware.consensus.strategy import Consensus, ConsensusAlgorithm, Report, digest_of, standing
+from middleware.consensus.strategy import Consensus, Report, digest_of, standing
 
 QUANTUM = 1_000_000
 """Costs are compared as whole millionths, so that sums are exact and equal everywhere."""
@@ -20,13 +19,6 @@ class Item:
     task: str
     position: tuple[float, ...] = ()
     slots: int = 1
-
-
-class GroupAlgorithm(ConsensusAlgorithm, Protocol):
-    """A strategy that shares out several tasks at once; with one task it is a strategy like any other."""
-
-    def find_group(self, contacts: Sequence[Report], items: Sequence[Item]) -> tuple[Consensus, ...]:
-        """One consensus point for each item, in the order of their names; nobody acts for more than its capacity."""
 
 
 class Sharing(Nearest):
@@ -42,7 +34,7 @@ class Sharing(Nearest):
         return standing((*a, *b))
 
     def find_group(self, contacts: Sequence[Report], items: Sequence[Item]) -> tuple[Consensus, ...]:
-        """As ``GroupAlgorithm`` promises."""
+        """One consensus point for each item, in the order of their names; nobody acts for more than its capacity."""
         raise NotImplementedError
 
 

@@ -11,12 +11,11 @@ import hashlib
 import importlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 from middleware.consensus.deployed import STRATEGY, Deployed, is_deployed, maker_of
 from middleware.errors import UnknownStrategy
 
-PROTOCOL = 2
 BUILT_IN = {
     "average": "middleware.consensus.strategies.average:Average",
     "capability_cost": "middleware.consensus.strategies.capability_cost:CapabilityCost",
@@ -90,13 +89,6 @@ class Consensus:
     reason: str = field(default="", compare=False)
 
 
-class Refused(NamedTuple):
-    """A report that counts for nothing: whose, and why in a person's words."""
-
-    agent: str
-    why: str
-
-
 class ConsensusAlgorithm(Protocol):
     """What a strategy is.  Each method is a pure function; equal reports in any order give an equal result.
 
@@ -143,11 +135,6 @@ def refusal(report: Report) -> str:
     if 0.0 < report.valid_for < report.age:
         return f"stale: {report.age:g} s old, valid for {report.valid_for:g} s"
     return ""
-
-
-def refused(contacts: Iterable[Report]) -> tuple[Refused, ...]:
-    """Which of the reports count for nothing, by name, and why; in the order of the names."""
-    return tuple(sorted(Refused(str(r.agent)[:MAX_NAME], why) for r in contacts if (why := refusal(r))))
 
 
 def cost_of(report: Report) -> float:
@@ -197,16 +184,6 @@ def led_by(
         name,
         reason,
     )
-
-
-def better(current: Report, offer: Report, hysteresis: float) -> bool:
-    """Whether the cost of ``offer`` is lower than that of ``current`` by more than the share ``hysteresis``.
-
-    One that counts for nothing is better than no other, and any that counts is better than it.
-    """
-    if refusal(offer):
-        return False
-    return bool(refusal(current)) or offer.cost < current.cost * (1.0 - hysteresis)
 
 
 def reads_of(strategy: object) -> tuple[str, ...]:

@@ -4,7 +4,7 @@ Records under the group's key and bids to the council are two ways of the same r
 strategy decides the same by either.  What it does not read is not shown to it, and is no part of the digest.
 
 Not shown to any strategy is how old a report is, since each member would see another age: what is stale is left out
-before (``agents.circle``).  So are reports of older rounds, and all but the newest of each member: ``epoch`` and
+before (``agents.conference``).  So are reports of older rounds, and all but the newest of each member: ``epoch`` and
 ``sequence`` of a report stay 0.  Who lacks what the task requires takes no part in it: ``unmet`` stays empty.  A body
 does one thing at a time: ``capacity`` stays 1.
 """

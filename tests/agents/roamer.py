@@ -42,8 +42,6 @@ def described(kind: str) -> Description:
     """A robot with a camera."""
     if kind == "sim":
         return describe(kind, {"robot": "dog1"})
-    if kind == "aibo":
-        return describe(kind, {"host": "192.0.2.1"})
     if kind == "create2":
         return filming(describe(kind, {"port": "/dev/ttyUSB0"}))
     if kind == "bittle":
@@ -69,20 +67,6 @@ def quantised(description: Description, gaits: Mapping[str, Velocity] = GAITS) -
     return does
 
 
-def shared(description: Description) -> Does:
-    """Walks the more slowly the more it turns, as an AIBO does."""
-
-    def does(action: Action) -> Action:
-        done = dict(clipped(description)(action))
-        left = 1.0 - abs(done["base.wz"]) / description.limits["base.wz"][1]
-        for key in ("base.vx", "base.vy"):
-            most = left * description.limits[key][1]
-            done[key] = min(max(done[key], -most), most)
-        return done
-
-    return does
-
-
 class Roamer:
     """A robot in place of the yard's first dog; ``lag`` seconds pass before it does what it is told."""
 
@@ -90,7 +74,7 @@ class Roamer:
         self, kind: str, seed: int, does: Does | None = None, lag: float = 0.1, description: Description | None = None
     ) -> None:
         self.description = description or described(kind)
-        make = {"bittle": quantised, "aibo": shared}.get(kind, clipped)
+        make = {"bittle": quantised}.get(kind, clipped)
         self.does = does or make(self.description)
         self.world = World(Random(seed), loaded("three-dogs"))
         self.camera = Camera(Random(seed + 1), self.world)
@@ -131,7 +115,7 @@ class Roamer:
         if self._kind == "bittle":
             told |= {f"odom.{axis}": value for axis, value in zip(("x", "y", "yaw"), self._reckoned, strict=True)}
         near, far = float(told["range.near"]), float(told["range.far"])
-        if self._kind in ("sim", "aibo"):
+        if self._kind == "sim":
             return told
         told = {key: value for key, value in told.items() if not key.startswith("range.")}
         if self._kind == "create2":

@@ -8,18 +8,14 @@ from random import Random
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from agents.catalogue import DEMO, TASKS
 from agents.context import Context
 from agents.means import WALK, Means
 from agents.search import SearchAndApproach
 from agents.vision import Sighting
 from drivers.bittle.gait import Velocity
 from drivers.reading import Action, Observation, Value
-from middleware.tasks.task import refusals
-from sim.robots.sensor import NOSE
 from tests.agents.roamer import Roamer, described, quantised
 
-KINDS = ("sim", "aibo", "create2", "bittle", "rosbridge")
 LAG = {"bittle": 0.3}
 ARCS = {"f": Velocity(0.08, 0.0), "b": Velocity(-0.05, 0.0), "l": Velocity(0.06, 0.4), "r": Velocity(0.06, -0.4)}
 JERKS = {"f": Velocity(0.15, 0.0), "b": Velocity(-0.1, 0.0), "l": Velocity(0.0, 1.2), "r": Velocity(0.0, -1.2)}
@@ -48,34 +44,6 @@ class BodyTests(SynchronousTestCase):
         self.assertLessEqual(robot.gap, 0.15)
         self.assertLessEqual(robot.hardest, max(WALK, robot.means.walk) + 0.01)
 
-    def test_each_kind_meets_what_the_demonstration_asks_for(self) -> None:
-        """With a camera each kind may take part in the demonstration; without one none may."""
-        asked = TASKS[DEMO].requirements
-        for kind in KINDS:
-            has = described(kind).capabilities
-            self.assertEqual(refusals(has, asked), [], kind)
-            blind = {name: properties for name, properties in has.items() if name != "camera"}
-            self.assertEqual(refusals(blind, asked), ["has no camera"], kind)
-
-    def test_each_kind_finds_and_reaches_the_target(self) -> None:
-        """From several places each kind finds the target, tells its distance to 10 %, and stops before it untouched."""
-        for kind in KINDS:
-            for seed in (1, 2, 3, 4):
-                with self.subTest(kind=kind, seed=seed):
-                    robot = roamer(kind, seed)
-                    cost = robot.find(60.0)
-                    assert cost is not None
-                    target = robot.world.target
-                    assert target is not None
-                    lens = (
-                        robot.dog.x + NOSE * math.cos(robot.dog.heading),
-                        robot.dog.y + NOSE * math.sin(robot.dog.heading),
-                    )
-                    self.assertLess(abs(cost / math.dist(lens, (target.x, target.y)) - 1.0), 0.10)
-                    self.arrived(robot)
-                    self.assertEqual(robot.world.collisions, 0)
-                    self.assertGreater(robot.gap, 0.05)
-
     def test_robots_that_feel_their_way_find_it_too(self) -> None:
         """Who ranges nothing walks about for a minute, bumps no harder than it walks, and still gets there."""
         for kind in ("create2", "bittle"):
@@ -88,11 +56,6 @@ class BodyTests(SynchronousTestCase):
                     robot.world.place_target_at_random()
                     self.assertIsNotNone(robot.find(180.0))
                     self.arrived(robot)
-
-    def test_faster_bodies_are_faster_where_they_see_ahead(self) -> None:
-        """A robot whose ranger sees far walks faster than a dog; one that feels walls with its bumper does not."""
-        walks = {kind: Means(described(kind)).walk for kind in KINDS}
-        self.assertEqual(walks, {"sim": 0.16, "aibo": 0.16, "create2": 0.16, "bittle": 0.15, "rosbridge": 0.22})
 
     def test_robot_that_turns_in_jerks_does_not_swing_for_ever(self) -> None:
         """A body that knows 1.2 rad/s or nothing accepts a coarse aim: it gets there, and hardly swings."""
@@ -177,17 +140,6 @@ class BumpTests(SynchronousTestCase):
                 backed.append(now)
         self.assertTrue(backed)
 
-    def test_robot_of_which_nobody_asks_anything_is_not_stuck(self) -> None:
-        """A pause in which nobody acts is not taken for a wall."""
-        behaviour, means = SearchAndApproach({}, Random(1)), Means(described("bittle"))
-        behaviour.embody(means)
-        values = {"odom.x": 1.0, "odom.y": 1.0, "odom.yaw": 0.0}
-        for now in (0.0, 5.0, 10.0):
-            behaviour.look(Observation(now, now, values), now)
-            behaviour.search(now)
-            means.did(means.go(0.1), {"base.vx": 0.1, "base.wz": 0.0})
-        self.assertFalse(behaviour._detour.is_on(10.0))
-
 
 class Told:
     """A behaviour in a body of this kind that is told where the target is, instead of seeing it."""
@@ -198,13 +150,13 @@ class Told:
         self.behaviour.embody(self.means)
         self.now = 0.0
 
-    def see(self, distance: float, bearing: float = 0.0, is_filling: bool = False, **values: Value) -> None:
+    def see(self, distance: float, bearing: float = 0.0, **values: Value) -> None:
         """Look once; ``bump_left`` stands for ``bump.left``."""
         self.now += 0.05
         told: dict[str, Value] = {"odom.x": 0.0, "odom.y": 0.0, "odom.yaw": 0.0}
         told |= {key.replace("_", "."): value for key, value in values.items()}
         self.behaviour.look(Observation(self.now, self.now, told), self.now)
-        self.behaviour._saw(self.now, self.behaviour._pose, Sighting(bearing, distance, not is_filling, is_filling))
+        self.behaviour._saw(self.now, self.behaviour._pose, Sighting(bearing, distance, True))
 
     def execute(self) -> Action | None:
         """What it does next."""
@@ -237,21 +189,6 @@ class NearTests(SynchronousTestCase):
             assert action is not None
             self.assertGreater(sign * action["base.vx"], 0.0, distance)
             self.assertEqual(action["base.wz"] > 0.0, sign > 0.0)
-
-    def test_picture_that_is_filled_does_not_push_the_target_away(self) -> None:
-        """A picture that is all target says less than what was seen before and the way walked since."""
-        told = Told("create2")
-        told.see(0.40)
-        told.see(0.38, is_filling=True, odom_x=0.15)
-        self.assertAlmostEqual(told.behaviour._gap, 0.40 - 0.15 - 0.08)
-
-    def test_ranger_of_unknown_place_is_not_believed_to_be_nearer_than_the_eye(self) -> None:
-        """A scanner that sits behind the camera ranges too far: the nearer of picture and scanner counts."""
-        told = Told("rosbridge")
-        told.see(0.40, range_front=0.40)
-        self.assertAlmostEqual(told.behaviour._gap, 0.32)
-        told.see(0.40, range_front=0.28)
-        self.assertAlmostEqual(told.behaviour._gap, 0.28)
 
 
 class WayTests(SynchronousTestCase):

@@ -1,4 +1,4 @@
-"""Tests of ``agents.caretaker``: the council of a task outlives its members, one after the other."""
+"""Tests of ``agents.part``: the council of a task outlives its members, one after the other."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Any
 from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
-from agents.caretaker import AGAIN, VISIT
 from agents.catalogue import task_named
+from agents.part import LOOK_AGAIN_S, VISIT_S
 from middleware.consensus.lease.charter import pin
 from middleware.entangled.record import Record
 from middleware.tasks.councils import SILENT
@@ -18,7 +18,7 @@ from middleware.tasks.task import COMPLETED, TASKS, Task, council_of, outcome_of
 from swarmnode.rehearsal import VirtualTeam
 
 OTHERS = ("witness1", "witness2", "witness3")
-LATEST = SILENT + AGAIN + VISIT + 2.0
+LATEST = SILENT + LOOK_AGAIN_S + VISIT_S + 2.0
 """Seconds within which a silent member is replaced."""
 TURNS = 60.0
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from agents.behaviour import KINDS
 from agents.catalogue import DEMO, TASKS, task_named
 from drivers.registry import describe
 from middleware.consensus.strategy import strategy_for
@@ -36,12 +35,6 @@ class CatalogueTests(SynchronousTestCase):
         self.assertEqual([refusals(each, TASKS["watch-target"].requirements) for each in (phone, dog)], [[], []])
         self.assertIn("has no base2d", refusals(phone, TASKS[DEMO].requirements))
         self.assertIn("has no base2d", refusals(phone, TASKS["turn-around"].requirements))
-
-    def test_doable_tasks_have_a_behaviour(self) -> None:
-        """What a dog of the yard can do there is a behaviour for."""
-        capabilities = describe("sim", {}, "dog1").capabilities
-        kinds = {task.kind for task in TASKS.values() if not refusals(capabilities, task.requirements)}
-        self.assertEqual(kinds - set(KINDS), set())
 
     def test_unknown_name_lists_the_known(self) -> None:
         """A task that is not predefined is refused with those that are."""

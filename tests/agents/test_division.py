@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Sequence
 from dataclasses import replace
 from itertools import permutations
 from types import SimpleNamespace
@@ -15,8 +14,7 @@ from agents.decision import Decision, decide
 from agents.division import GATHERING, Division, group_of
 from agents.loop import due
 from middleware.consensus.guard import Guard
-from middleware.consensus.item import Item, Sharing
-from middleware.consensus.strategy import Consensus, Report, strategy_for
+from middleware.consensus.strategy import strategy_for
 from middleware.directory.presence import EXECUTING, SEARCHING, WAITING
 from middleware.tasks.task import Member, Task
 from tests.invariants.groups import Groups
@@ -126,33 +124,6 @@ class DivisionTests(SynchronousTestCase):
         self.assertEqual((found["t1"].assigned, found["t1"].why), (None, "waiting for dog-b"))
         self.assertEqual(self.decided(costs, since=8.0)["t1"].assigned, "b")
         self.assertEqual(self.decided(costs, since=7.9, t2="a")["t1"].assigned, "b")
-
-    def test_failing_strategy(self) -> None:
-        """Where the strategy raises, the tasks go to the nearest one by one, and the reason says so."""
-
-        class Broken(Sharing):
-            name = "broken"
-
-            def find_group(self, contacts: Sequence[Report], items: Sequence[Item]) -> tuple[Consensus, ...]:
-                """Fail."""
-                raise ZeroDivisionError("no luck")
-
-        division = Division(Guard(Broken()))
-        here = members({"a": 1.0, "b": 2.0})
-        for name in ("t1", "t2"):
-            division.join(task(name), lambda now: here, 0.0)
-        found = [decide(here, division.share(task(name), 50.0, 40.0), 0.1, 8.0, 40.0) for name in ("t1", "t2")]
-        self.assertEqual([decision.assigned for decision in found], ["a", "b"])
-        self.assertIn("broken has no opinion (ZeroDivisionError: no luck)", found[0].fault)
-        self.assertEqual(len(self.flushLoggedErrors(ZeroDivisionError)), 1)
-
-    def test_what_left_is_not_divided(self) -> None:
-        """A task that has left its group needs nobody any more."""
-        costs: Costs = {"t1": {"a": 1.0}, "t2": {"a": 2.0}}
-        division = self.division(costs)
-        division.leave("t1")
-        decision = decide(members(costs["t2"]), division.share(task("t2"), 50.0, 40.0), 0.1, 8.0, 40.0)
-        self.assertEqual(decision.assigned, "a")
 
     def test_what_is_divided_together(self) -> None:
         """Tasks of one group with one strategy and equal requirements are; a task without a group is by itself."""

@@ -11,7 +11,7 @@ from twisted.trial.unittest import SynchronousTestCase
 from agents.behaviour import STAND
 from agents.context import Context
 from agents.engagement import SEARCH_TTL, Deed, Engagement
-from agents.state import Event, State
+from agents.state import Event
 from drivers.driver import Permit
 from drivers.reading import Action, Observation
 from middleware.consensus.bidding.panel import Panel
@@ -244,14 +244,6 @@ class EngagementTests(SynchronousTestCase):
         permit = self.step().permit
         self.assertEqual((permit.token, permit.deadline), (4, self.clock.seconds() + SEARCH_TTL))
 
-    def test_lease_is_not_claimed_by_those_that_stand_by(self) -> None:
-        """An agent that is not the assigned one claims nothing."""
-        self.hear(self.report(2, 0.5))
-        self.see(1.0)
-        self.step()
-        self.assertFalse(self.council.is_wanted)
-        self.assertEqual(self.engagement.me.assigned, self.others[2].node_id.hex())
-
     def test_body_stops_before_the_lease_goes_back(self) -> None:
         """When a better report takes the task away, the body is stopped first and the lease is given back after."""
         self.acting()
@@ -278,17 +270,6 @@ class EngagementTests(SynchronousTestCase):
         self.hear(self.report(2, 0.5, EXECUTING))
         self.step()
         self.assertEqual(self.council.places, [2, 1])
-
-    def test_who_claims_lets_a_better_one_act(self) -> None:
-        """A better report that comes before the lease was granted ends the claim; there was no body to stop."""
-        self.hear(self.report(2, 2.0))
-        self.see(1.0)
-        self.step()
-        self.assertEqual((self.council.is_wanted, self.engagement.course.state), (True, State.CLAIMING))
-        self.hear(self.report(2, 0.5))
-        self.assertEqual(self.step().action, HOLD)
-        self.assertEqual((self.council.is_wanted, self.council.places), (False, [0, 2]))
-        self.assertEqual(self.events, [])
 
     def test_who_is_not_let_insists(self) -> None:
         """Who is to act, and has no lease, says so again each second; nobody can take it for one that gave up."""
@@ -318,26 +299,6 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.step().action, HOLD)
         self.assertEqual(self.events, ["halted", "released"])
 
-    def test_lease_that_comes_too_late_is_given_back(self) -> None:
-        """Who stopped because its lease ran out gives back the next one, where another should act meanwhile."""
-        self.acting()
-        self.clock.advance(1.6)
-        self.step()
-        self.assertEqual(self.engagement.course.state, State.FENCED)
-        self.council.grant(6)
-        self.hear(self.report(2, 0.5))
-        for _ in range(3):
-            self.assertEqual(self.step().action, HOLD)
-        self.assertEqual(self.events, ["halted", "released"])
-        self.assertEqual(self.dog.executed, 1)
-
-    def test_report_within_the_hysteresis_changes_nothing(self) -> None:
-        """A late report that is hardly better leaves the task where it is."""
-        self.acting()
-        self.hear(self.report(2, 0.95))
-        self.assertEqual(self.step().action, GO)
-        self.assertEqual(self.events, [])
-
     def test_member_that_left_is_decided_without(self) -> None:
         """When the assigned agent disappears, the next one claims the lease at its next step."""
         self.hear(self.report(2, 0.5, EXECUTING), self.report(3, 3.0))
@@ -365,16 +326,6 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.step(), Deed(GO, Permit(9, self.council.deadline)))
         self.assertEqual(self.events, ["halted", "moved to 3"])
 
-    def test_council_that_does_not_come_back(self) -> None:
-        """Without its lease after one ttl it is fenced like anybody whose lease ran out."""
-        self.acting()
-        self.engagement.hand_council([CONTACT] * 3)
-        self.assertIsNone(self.engagement.step(self.clock.seconds()))
-        self.clock.advance(TASK.lease_ttl)
-        self.step()
-        self.assertEqual(self.events, ["halted", "moved to 3", "halted"])
-        self.assertNotEqual(self.told[-1].status, EXECUTING)
-
     def test_moved_target_is_reported_again(self) -> None:
         """A distance that grew is reported anew by everybody; one that shrank only by those that do not walk."""
         self.see(1.0)
@@ -391,22 +342,6 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.engagement.me.cost, 0.6)
         self.see(1.9)
         self.assertEqual(self.engagement.me.cost, 1.9)
-
-    def test_lost_sight_is_reported(self) -> None:
-        """Who loses the target takes its report back, and searches."""
-        self.see(1.0)
-        self.see(None)
-        self.assertIsNone(self.engagement.me.cost)
-        self.assertEqual(self.step().action, LOOK)
-
-    def test_lost_body_is_reported(self) -> None:
-        """An agent whose robot does not answer leaves the task to the others and gives the lease back."""
-        self.acting()
-        self.engagement.lose_body()
-        self.clock.advance(2.1)
-        self.step()
-        self.assertEqual(self.engagement.me.assigned, self.others[2].node_id.hex())
-        self.assertEqual(self.events, ["halted", "released"])
 
     def test_lost_body_may_still_move(self) -> None:
         """With the lease of a robot that does not hear that it is to stop goes back for how long it still moves."""
@@ -427,23 +362,6 @@ class EngagementTests(SynchronousTestCase):
             self.see(cost)
             self.assertEqual((self.told[-1].cost, self.told[-1].available), (cost, True), str(cost))
 
-    def test_renewed_lease_goes_on_and_does_not_start_over(self) -> None:
-        """While the token stays the same the execution goes on: nothing is said twice, nothing begins again."""
-        self.acting()
-        for _ in range(40):
-            self.clock.advance(0.05)
-            self.council.grant(5)
-            self.assertEqual(self.step().action, GO)
-        self.assertEqual(self.dog.executed, 41)
-        self.assertEqual([line for line in self.said if line.startswith("goes")], ["goes: dog1, 1.00, best of 2"])
-        self.assertEqual(self.events, [])
-
-    def test_highest_token_is_remembered(self) -> None:
-        """After a lease the body's own motions carry its token, so that the driver does not refuse them."""
-        self.acting(9)
-        self.clock.advance(2.0)
-        self.assertEqual(self.step().permit.token, 9)
-
     def test_done_is_recorded_and_the_lease_kept_until_it_is_known(self) -> None:
         """The finished agent stops, records the outcome once, and gives the lease back when the outcome is known."""
         self.dog.steps = 1
@@ -458,47 +376,6 @@ class EngagementTests(SynchronousTestCase):
         self.engagement.abandon(self.clock.seconds())
         self.assertEqual(self.events[-1], "released")
 
-    def test_outcome_of_another_ends_it_at_once(self) -> None:
-        """A task that was cancelled or done by another is over: the body stops and no step follows."""
-        self.acting()
-        self.end(CANCELLED, "vaio")
-        self.assertTrue(self.engagement.is_over)
-        self.assertEqual(self.events, ["halted"])
-        self.assertIsNone(self.engagement.step(self.clock.seconds()))
-        self.assertEqual(self.said[-1], "cancelled by vaio")
-        self.see(0.5)
-
-    def test_own_report_from_the_network_is_not_a_second_member(self) -> None:
-        """The agent's own record that comes back does not count as another's."""
-        own = Member(ME.node_id.hex(), "dog1", WAITING, 9.0)
-        self.hear(own)
-        self.see(1.0)
-        self.step()
-        self.assertEqual(self.engagement.me.why, "dog1, 1.00, best of 1")
-
-    def test_unchanged_reports_are_told_once(self) -> None:
-        """Deciding the same again tells nobody anything."""
-        self.hear(self.report(2, 0.5))
-        self.see(1.0)
-        self.step()
-        before = len(self.told)
-        for _ in range(20):
-            self.clock.advance(0.05)
-            self.step()
-        self.assertEqual(len(self.told), before)
-
-    def test_same_token_resumes_and_a_new_one_is_told(self) -> None:
-        """After the lease was lost and won anew the behaviour goes on, and knows that others may have acted."""
-        self.acting(5)
-        self.clock.advance(2.0)
-        self.step()
-        self.assertEqual(self.engagement.course.state, State.FENCED)
-        self.step()
-        self.council.grant(7)
-        self.step()
-        self.step()
-        self.assertEqual([(c.token, c.is_resumed) for c in self.dog.contexts], [(5, False), (7, False), (7, True)])
-
     def test_task_changes_hands_at_safe_points_only(self) -> None:
         """A better report waits until the body may be stopped; a lost body, a cancellation and a pause do not."""
         self.acting()
@@ -507,14 +384,6 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.step().action, GO)
         self.dog.is_safe = True
         self.assertEqual(self.step().action, HOLD)
-        self.assertEqual(self.events, ["halted", "released"])
-
-    def test_unsafe_body_that_is_lost_gives_way(self) -> None:
-        """Who lost its robot gives the task back whether or not the point is safe."""
-        self.acting()
-        self.dog.is_safe = False
-        self.engagement.lose_body()
-        self.step()
         self.assertEqual(self.events, ["halted", "released"])
 
     def test_pause_and_resume(self) -> None:
@@ -533,15 +402,6 @@ class EngagementTests(SynchronousTestCase):
         self.council.grant(6)
         self.assertEqual(self.step().action, GO)
         self.assertEqual(self.said[-3:], ["resumed by vaio", "reports 0.90 m", "goes: dog1, 0.90, best of 2"])
-
-    def test_put_aside_for_another_task(self) -> None:
-        """Without its body the agent claims nothing, says so, and keeps nobody waiting."""
-        self.acting()
-        self.engagement.put_aside("busy with T", self.clock.seconds())
-        self.assertEqual(self.events, ["halted", "released"])
-        self.assertIsNone(self.engagement.step(self.clock.seconds()))
-        me = self.engagement.me
-        self.assertEqual((me.status, me.state, me.why, me.available), (ASSIGNED, "IDLE", "busy with T", False))
 
     def test_lease_is_kept_while_the_outcome_is_on_its_way(self) -> None:
         """A pause or another task that comes between the deed and its record does not give the lease to another."""
@@ -669,16 +529,6 @@ class EngagementTests(SynchronousTestCase):
         self.see(1.0)
         self.assertGreater((self.told[-1].epoch, self.told[-1].serial), (4, 3))
 
-    def test_decisions_name_their_round(self) -> None:
-        """A member that leaves after a decision opens a round, which the report of the new decision names."""
-        self.hear(self.report(2, 0.5, EXECUTING), self.report(3, 3.0))
-        self.see(1.0)
-        self.step()
-        before = self.engagement.me.epoch
-        self.hear(self.report(3, 3.0))
-        self.step()
-        self.assertEqual(self.engagement.me.epoch, before + 1)
-
     def test_heirs_hear_of_a_leave_from_the_one_that_leaves(self) -> None:
         """Who leaves the task names those that stand by, the next one first, and never itself."""
         contacts = {n: Contact(each.public, Address("10.0.0.1", n)) for n, each in self.others.items()}
@@ -712,15 +562,3 @@ class EngagementTests(SynchronousTestCase):
         self.clock.advance(5.0)
         self.step()
         self.assertEqual(len(accounts), 2)
-
-    def test_epoch_follows_the_token(self) -> None:
-        """The epoch is the token under which somebody acts; when that agent is gone, the next one."""
-        accounts = self.ports.accounts
-        self.see(2.0)
-        self.hear(replace(self.report(2, 1.0, EXECUTING), token=3))
-        self.step()
-        self.hear()
-        self.step()
-        self.council.grant(4)
-        self.step()
-        self.assertEqual([(v.epoch, v.token) for v in accounts], [(3, 0), (4, 0), (4, 4)])

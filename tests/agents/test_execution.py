@@ -77,11 +77,3 @@ class ExecutionTests(SynchronousTestCase):
             execution.go_on(tenth / 10, 1, 9.0)
         self.assertTrue(execution.has_stalled(5.2))
         self.assertFalse(execution.has_stalled(7.2))
-
-    def test_no_limit(self) -> None:
-        """A task without a limit never stalls, and a behaviour that does not tell is always at a safe point."""
-        execution = self.execution(Digger())
-        for now in range(100):
-            execution.go_on(float(now), 1, 999.0)
-        self.assertFalse(execution.has_stalled(99.0))
-        self.assertTrue(execution.is_safe)

@@ -1,4 +1,4 @@
-"""Tests of ``agents.formation`` and ``agents.circling``: where those stand who do not act, and how they get there."""
+"""Tests of ``agents.formation`` and ``agents.formation``: where those stand who do not act, and how they get there."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
-from agents.circling import NEAREST, Circling
-from agents.formation import Formation, Post, posts, sector
+from agents.formation import NEAREST, Circling, Formation, Post, posts, sector
 from middleware.tasks.task import Member
 
 ANGLES = st.lists(st.floats(-math.pi, math.pi), min_size=1, max_size=6, unique=True)

@@ -160,12 +160,6 @@ class GuardedTests(SynchronousTestCase):
             spin.cost = cost
             self.assertIsNone(guarded(spin)[0].cost)
 
-    def test_closed_with_its_task(self) -> None:
-        """Its agent has left the task: it is asked no more."""
-        behaviour, way = guarded(Spin())
-        behaviour.close()
-        self.assertEqual((way.is_closed, behaviour.search(0.0), way.asked), (True, STAND, []))
-
     def test_behaviour_by_its_deployed_name(self) -> None:
         """A task of the kind ``deployed:x`` gets the deployed behaviour; others are refused with those there are."""
         deployed: dict[tuple[str, str], Make] = {

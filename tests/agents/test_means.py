@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from agents.means import COARSEST, FACING, STAND, STOP_AT, Means, is_bumped, is_lit
+from agents.means import COARSEST, FACING, STAND, STOP_AT, Means
 from drivers.reading import Description
 from tests.agents.roamer import described
 
@@ -26,22 +26,11 @@ class DescriptionTests(SynchronousTestCase):
             self.assertEqual(getattr(Means(), name), getattr(Means(described("sim")), name), name)
         self.assertEqual((Means().walk, Means().look_turn, Means().stop_at, Means().aim), (0.16, 1.6, STOP_AT, FACING))
 
-    def test_sideways_gait_is_known_by_its_limit(self) -> None:
-        """Dogs step aside; wheels and the gaits of a Bittle do not."""
-        self.assertEqual(
-            [Means(described(k)).strafes for k in ("sim", "aibo", "create2", "bittle")], [True, True, False, False]
-        )
-
     def test_lens_is_as_described(self) -> None:
         """The lens in degrees becomes radians; without a word on its height the pixels are square."""
         self.assertEqual(with_camera(fov_h_deg=90.0).lens, (math.pi / 2, None))
         self.assertEqual(with_camera(fov_h_deg=90.0, fov_v_deg=60.0).lens, (math.pi / 2, math.radians(60.0)))
         self.assertEqual(with_camera().lens, Means().lens)
-
-    def test_numbers_that_cannot_be_are_not_believed(self) -> None:
-        """A lens of no degrees, or of NaN, is as none."""
-        for wrong in (0.0, -5.0, math.nan, math.inf):
-            self.assertEqual(with_camera(fov_h_deg=wrong).lens, Means().lens, wrong)
 
     def test_slow_camera_slows_the_turn(self) -> None:
         """With two pictures a second the body turns by no more than half a view between them, and waits longer."""
@@ -115,15 +104,3 @@ class LearningTests(SynchronousTestCase):
         self.assertAlmostEqual(means.go(-0.04)["base.vx"], -0.06)
         means.did({"base.vx": 0.06, "base.wz": 0.0}, {"base.vx": 0.15, "base.wz": 0.0})
         self.assertTrue(before < means.stop_at < before + 0.05)
-
-
-class FeelingTests(SynchronousTestCase):
-    def test_bump_is_any_bumper(self) -> None:
-        """Each bumper counts; what is not pressed, or is another thing, does not."""
-        self.assertTrue(is_bumped({"bump.left": False, "bump.right": True}))
-        self.assertFalse(is_bumped({"bump.left": False, "lightbump.left.hit": True, "button.clean": True}))
-
-    def test_light_bumpers_ahead_count(self) -> None:
-        """Those at the very sides see what the robot passes by."""
-        self.assertTrue(is_lit({"lightbump.center_left.hit": True}))
-        self.assertFalse(is_lit({"lightbump.left.hit": True, "lightbump.center_right.hit": False}))

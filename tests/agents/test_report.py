@@ -52,11 +52,6 @@ class ReporterTests(SynchronousTestCase):
         self.clock.advance(9.0)
         self.assertEqual(self.news(), {})
 
-    def test_what_nobody_reads_is_not_told(self) -> None:
-        """For a strategy that goes by the cost alone nothing else is told."""
-        self.reporter = Reporter(self.minded)
-        self.assertEqual(self.news(), {"cost": 2.0, "available": True})
-
     def test_without_cost_nothing_is_offered(self) -> None:
         """Who cannot tell what it would cost has no vote and no value."""
         self.minded.cost = None

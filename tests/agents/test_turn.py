@@ -60,8 +60,3 @@ class TurnTests(SynchronousTestCase):
         turn.embody(Means(Description("slow", "", {}, limits, 0.1)))
         turn.look(seen(odom_yaw=0.0), 0.0)
         self.assertEqual(turn.execute(Context(0.0, is_resumed=True)), {**STAND, "base.wz": 0.5})
-
-    def test_others_stand(self) -> None:
-        """Whoever does not act stands still."""
-        turn = TurnAround({}, random.Random(1))
-        self.assertEqual((turn.search(0.0), turn.hold(0.0)), (STAND, STAND))

@@ -9,8 +9,9 @@ from typing import Any
 
 from twisted.internet.defer import Deferred, succeed
 
-from agents import circle
+from agents import conference
 from agents.docket import Docket
+from benchmarks.consensus import bidder
 from drivers.errors import StaleCommand
 from drivers.gate import Gate
 from middleware.consensus.lease import charter, lessee
@@ -18,7 +19,7 @@ from middleware.consensus.lease.charter import pin
 from middleware.consensus.lease.council import Council
 from middleware.consensus.lease.lease_codec import pack_members
 from middleware.consensus.lease.lessee import Lease, Lessee
-from middleware.consensus.strategies import bidder, nearest
+from middleware.consensus.strategies import nearest
 from middleware.consensus.strategies.nearest import Nearest
 from middleware.consensus.strategy import Report
 from middleware.entangled.contact import Contact
@@ -294,7 +295,7 @@ BUGS: dict[str, list[tuple[Any, str, Any]]] = {
     # Tasks.
     "the end of a task is forgotten": [(Docket, "bury", _buried_and_forgotten)],
     "a little better is enough": [(Nearest, "improves", lambda self, held, offer, _: offer.cost < held.cost)],
-    "old rounds count": [(circle, "is_older", lambda told, known: False)],
+    "old rounds count": [(conference, "is_older", lambda told, known: False)],
     # Strategies.
     "no tie-break": [(nearest, "best_of", _first_come)],
     "agents are numbered in a byte": [(nearest, "best_of", _numbered_in_a_byte)],

@@ -11,8 +11,8 @@ from __future__ import annotations
 import math
 import random
 
+from benchmarks.consensus import bidder
 from benchmarks.consensus.mission import Mission
-from middleware.consensus.strategies import bidder
 from middleware.consensus.strategies.nearest import Nearest
 from middleware.consensus.strategy import Report
 from sim.team.schedule import Schedule

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Callable, Iterable
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -19,9 +20,7 @@ from twisted.logger import Logger
 from middleware.consensus.bidding.announcement import announcement_of
 from middleware.consensus.bidding.auction import MAX_WAITING, Auction, auction_of
 from middleware.consensus.bidding.bid import Bid, bid_of, is_cost
-from middleware.consensus.bidding.bidding import Bidding
 from middleware.consensus.bidding.errand import MAX_BIDS, Cry, Errand, Notice, Offer
-from middleware.consensus.bidding.parties import OWN, Parties
 from middleware.consensus.bidding.party import OnSummary, Party
 from middleware.consensus.bidding.rule import Rule
 from middleware.consensus.bidding.scale import Scale
@@ -36,6 +35,47 @@ ERRAND_S = 0.4
 """Seconds for an errand: three tries on a path of 100 ms.  More of them finds slow peers, less goes round dead ones."""
 OFFER, ANNOUNCE, CRY = "bid.offer", "bid.announce", "bid.cry"
 FALLBACK = "nearest"
+
+
+class Bidding:
+    """One agent's place in ``auction``; ``on_summary`` is told of the reports that the council announces."""
+
+    def __init__(self, auction: Auction, on_summary: OnSummary, dissemination: Dissemination) -> None:
+        self.auction = auction
+        self.on_summary = on_summary
+        self._dissemination = dissemination
+        self._last: Report | None = None
+        self._has_bid = False
+
+    @property
+    def is_standing(self) -> bool:
+        """Whether there is a bid that was not taken back."""
+        return self._last is not None
+
+    def report(self, report: Report) -> None:
+        """Bid, or bid anew; an equal bid is not sent again.  Raises ``ValueError`` for a cost that is none."""
+        if not self._has_bid or report != self._last:
+            self._next(report)
+
+    def withdraw(self) -> None:
+        """Take the bid back; before the first one: abstain, so that nobody waits for this agent."""
+        if not self._has_bid or self._last is not None:
+            self._next(None)
+
+    def expect(self, bidders: float) -> None:
+        """Where this node is of the council: close the bidding as soon as that many have bid or abstained.
+
+        Infinity: when the waiting period is over.
+        """
+        self._dissemination.expect(self.auction, bidders)
+
+    def leave(self) -> None:
+        """Hear no more of it; the node goes on carrying the bids of others."""
+        self._dissemination.leave(self)
+
+    def _next(self, report: Report | None) -> None:
+        self._dissemination.publish(self.auction, report)
+        self._has_bid, self._last = True, report
 
 
 class Wire(Protocol):
@@ -64,6 +104,63 @@ class Surroundings:
     may_bid: Callable[[bytes, bytes], bool] = lambda key, public: True
 
 
+MAX_PARTIES = 256
+LIFE_S = 300.0
+"""Seconds after which a party in which nothing happens is forgotten, unless it is this node's own."""
+OWN = b""
+
+
+@dataclass
+class _Held:
+    party: Party
+    opener: bytes
+    touched_at: float
+
+
+class Parties:
+    """Parties by the digest of their auction; those that this node entered itself are never driven out."""
+
+    def __init__(self) -> None:
+        self._held: dict[bytes, _Held] = {}
+
+    def __len__(self) -> int:
+        return len(self._held)
+
+    def __iter__(self) -> Iterator[Party]:
+        return iter([held.party for held in self._held.values()])
+
+    def get(self, digest: bytes) -> Party | None:
+        """The party in the auction with this digest."""
+        held = self._held.get(digest)
+        return held.party if held is not None else None
+
+    def touch(self, digest: bytes, now: float) -> None:
+        """Take note that something happened in a party."""
+        held = self._held.get(digest)
+        if held is not None:
+            held.touched_at = now
+
+    def add(self, party: Party, opener: bytes, now: float) -> list[Party]:
+        """Keep ``party``, which ``opener`` (a node id, or ``OWN``) asked for; those that had to go for it."""
+        idle = [d for d, held in self._held.items() if held.opener != OWN and held.touched_at < now - LIFE_S]
+        gone = [self._held.pop(digest).party for digest in idle]
+        while len(self._held) >= MAX_PARTIES:
+            counts = Counter(held.opener for held in self._held.values() if held.opener != OWN)
+            if not counts:
+                break
+            busiest = counts.most_common(1)[0][0]
+            digest = next(digest for digest, held in self._held.items() if held.opener == busiest)
+            gone.append(self._held.pop(digest).party)
+        self._held[party.auction.digest] = _Held(party, opener, now)
+        return gone
+
+    def own(self, digest: bytes, is_own: bool, opener: bytes = b"left") -> None:
+        """Let a party be this node's own, or no longer."""
+        held = self._held.get(digest)
+        if held is not None:
+            held.opener = OWN if is_own else opener
+
+
 class Dissemination:
     """The auctions of one node."""
 
@@ -87,7 +184,7 @@ class Dissemination:
     def enter(self, auction: Auction, on_summary: OnSummary) -> Bidding:
         """Take part in ``auction``; ``on_summary`` is told what is announced, at once where something was."""
         party = self._party(auction, OWN)
-        bidding = Bidding(auction, on_summary, self._publish, self._expect, self._leave)
+        bidding = Bidding(auction, on_summary, self)
         self._biddings.setdefault(auction.digest, []).append(bidding)
         self._parties.own(auction.digest, True)
         if party.told:
@@ -200,7 +297,8 @@ class Dissemination:
         if party.is_outlived and party.own is not None:
             self._bid(party, party.own.report)
 
-    def _publish(self, auction: Auction, report: Report | None) -> None:
+    def publish(self, auction: Auction, report: Report | None) -> None:
+        """Make this node's bid in ``auction``, or take it back.  Raises ``ValueError`` for a cost that is none."""
         if report is not None:
             if not is_cost(report.cost):
                 raise ValueError(f"{report.cost!r} is no cost: it must be finite and not negative")
@@ -214,12 +312,14 @@ class Dissemination:
         bid = Bid(self._identity.public, report, party.next_revision).signed(self._identity, party.auction)
         party.bid(bid, self._scale.counted(self._around.team_size()), self._clock.seconds())
 
-    def _expect(self, auction: Auction, bidders: float) -> None:
+    def expect(self, auction: Auction, bidders: float) -> None:
+        """Close the bidding as soon as that many have bid or abstained."""
         party = self._party(auction, OWN)
         party.expect(bidders)
         self._pump(party)
 
-    def _leave(self, bidding: Bidding) -> None:
+    def leave(self, bidding: Bidding) -> None:
+        """Tell ``bidding`` nothing any more."""
         digest = bidding.auction.digest
         here = [each for each in self._biddings.pop(digest, []) if each is not bidding]
         if here:

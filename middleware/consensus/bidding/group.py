@@ -6,7 +6,7 @@ Thesis, section 4.2.5: agents assigned to the same task write to one part of the
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Set
 from typing import TYPE_CHECKING
 
 from twisted.internet.defer import Deferred
@@ -21,7 +21,7 @@ from middleware.entangled.replication.owner import Stored
 from middleware.tasks.task import DONE, MEMBER, Member, Result, Task, done_packed, group_key, member_of, outcome_of
 
 if TYPE_CHECKING:
-    from middleware.consensus.bidding.bidding import Bidding
+    from middleware.consensus.bidding.auctions import Bidding
 
 Heard = Callable[[list[Member], Result | None], None]
 """Told of every member that is present, oneself included, and how the task ended (None: it is open)."""
@@ -31,6 +31,66 @@ Enter = Callable[[Callable[[tuple[Report, ...]], None]], "Bidding"]
 
 Later = Callable[[float, Callable[[], None]], Callable[[], None]]
 """Calls after so many seconds; calling what it returns prevents that."""
+
+
+class Roll:
+    """The members of one task, as one of them sees them, from two sources; ``view`` is what the strategy goes by.
+
+    Records under the group's key say who is present; the council announces the bids that decide.  The later of the two
+    counts.  A member that is not present bids nothing, whatever was announced; what was announced of one that has not
+    come yet is kept until it comes.
+    """
+
+    def __init__(self, view: View | None = None) -> None:
+        self._view = view or View()
+        self._present: dict[str, Member] = {}
+        self._announced: dict[str, Report] = {}
+        self._early: set[str] = set()
+        self._left: set[str] = set()
+
+    def __len__(self) -> int:
+        return len(self._present)
+
+    def present(self, members: Iterable[Member]) -> None:
+        """Take what the records say now; where a report is another than before, it is the later word."""
+        before, self._present = self._present, {member.uuid: member for member in members}
+        for uuid, member in self._present.items():
+            if uuid in before and self._view.report(before[uuid]) != self._view.report(member):
+                self._forget(uuid)
+        gone = before.keys() - self._present.keys()
+        for uuid in gone:
+            self._forget(uuid)
+        self._left = (self._left | gone) - self._present.keys()
+
+    def announced(self, reports: Iterable[Report]) -> None:
+        """Take what the council announces; whom it does not name, it says nothing about.
+
+        Except those of whom it spoke before their records came: what these say may be later.
+        """
+        named = {report.agent: report for report in reports if report.agent not in self._left}
+        for uuid in self._early - named.keys():
+            self._forget(uuid)
+        self._early |= named.keys() - self._present.keys()
+        self._announced.update(named)
+
+    def awaited(self) -> list[Report]:
+        """What was announced of those who have not come yet."""
+        return [report for uuid, report in self._announced.items() if uuid not in self._present]
+
+    def uuids(self) -> Set[str]:
+        """Who is present."""
+        return self._present.keys()
+
+    def members(self) -> list[Member]:
+        """Everybody that is present, with the bid that counts."""
+        return [
+            self._view.told(member, self._announced[uuid]) if uuid in self._announced else member
+            for uuid, member in self._present.items()
+        ]
+
+    def _forget(self, uuid: str) -> None:
+        self._announced.pop(uuid, None)
+        self._early.discard(uuid)
 
 
 class Group:
@@ -63,9 +123,6 @@ class Group:
         self._heard = heard
         self._ordered = ordered
         self._quietly = quietly
-        # Imported by the first who takes part: a plain node has no group.
-        from middleware.consensus.bidding.roll import Roll
-
         self._view = view or View()
         self._roll = Roll(self._view)
         self._outcome: Result | None = None

@@ -42,7 +42,7 @@ class Panel:
 
     def __init__(self, uuid: str, place: float = 0.0) -> None:
         self._uuid = uuid
-        self._place = place
+        self.place = place
         self._devices = 1
         self._is_standing = False
         self._turn_at = self._whole_at = math.inf
@@ -76,7 +76,7 @@ class Panel:
             self._turn_at = self._whole_at = math.inf
         elif self._turn_at == math.inf:
             begins, lasts = now + LISTENING, SPACING * devices
-            self._turn_at = begins + self._place * lasts
+            self._turn_at = begins + self.place * lasts
             self._whole_at = begins + lasts + SETTLING
 
     def announced(self, agents: Collection[str], now: float) -> None:
@@ -108,16 +108,11 @@ class Panel:
 
 
 def panel_of(uuid: str, key: bytes) -> Panel:
-    """The panel of the task with the group's ``key``, as ``uuid`` sees it."""
-    return Panel(uuid, place_of(uuid, key))
-
-
-def place_of(uuid: str, key: bytes) -> float:
-    """The place of a participant's turn, 0 to 1, at the task with the group's ``key``.
+    """The panel of the task with the group's ``key``, as ``uuid`` sees it.
 
     The farthest come first: the nearest hold the records, and most of them sit in the council already.
     """
-    return 1.0 - distance(bytes.fromhex(uuid), key) / (1 << (8 * ID_BYTES))
+    return Panel(uuid, 1.0 - distance(bytes.fromhex(uuid), key) / (1 << (8 * ID_BYTES)))
 
 
 def _urgent(member: Member) -> tuple[object, ...]:

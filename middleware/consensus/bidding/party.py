@@ -13,8 +13,7 @@ from middleware.consensus.bidding.announcement import Announcement
 from middleware.consensus.bidding.auction import Auction
 from middleware.consensus.bidding.audience import Audience
 from middleware.consensus.bidding.bid import Bid
-from middleware.consensus.bidding.check import Check
-from middleware.consensus.bidding.direct import Direct
+from middleware.consensus.bidding.check import Check, Direct
 from middleware.consensus.bidding.errand import Errand, Notice, Offer
 from middleware.consensus.bidding.flood import Flood
 from middleware.consensus.bidding.rule import Rule
@@ -57,6 +56,7 @@ class Party:
         self._rank = auction.rank(me.node_id)
         self._teller = Teller(auction, self._rank, rule, sign) if self._rank is not None else None
         self._branch = Branch(auction, me.node_id, rule, contacts)
+        self._gatherer: Teller | Branch = self._teller or self._branch
         self._check = Check(auction, me.node_id, rule, rng)
         self._direct = Direct(auction, me.node_id)
         self._flood = Flood(me.node_id, rule, contacts, rng)
@@ -73,15 +73,14 @@ class Party:
     @property
     def summary(self) -> Summary:
         """The bids that this node has gathered."""
-        return self._teller.summary if self._teller is not None else self._branch.summary
+        return self._gatherer.summary
 
     @property
     def due(self) -> float:
         """When there is something to do, if nothing happens before."""
-        always = min(self._direct.due, self._flooded_at, self.audience.due(self.announcement, self._is_mine))
-        if self._teller is not None:
-            return min(always, self._teller.due)
-        return min(always, self._branch.due, self._check.due)
+        told_at = self.audience.due(self.announcement, self._is_mine)
+        checked_at = self._check.due if self._teller is None else math.inf
+        return min(self._direct.due, self._flooded_at, told_at, self._gatherer.due, checked_at)
 
     @property
     def own(self) -> Bid | None:
@@ -134,10 +133,10 @@ class Party:
             self.audience.knows(sender, self.announcement)
         return self.announcement
 
-    def announced(self, announcement: Announcement, now: float) -> bool:
-        """Take a genuine announcement; whether it is newer than the one known."""
+    def announced(self, announcement: Announcement, now: float) -> None:
+        """Take a genuine announcement; one that is not newer than the one known changes nothing."""
         if self.announcement is not None and announcement.precedence <= self.announcement.precedence:
-            return False
+            return
         self.announcement = announcement
         if self._teller is not None:
             self._teller.heard(announcement)
@@ -148,7 +147,6 @@ class Party:
                 is_mine = own is not None and (own.revision, own.report) == (entry.revision, entry.report)
                 self.next_revision = max(self.next_revision, entry.revision + (1 if is_mine else 2))
         self._tell()
-        return True
 
     def cried(self, bids: Iterable[Bid], sender: Contact, now: float) -> None:
         """Take what a neighbour cries; an exclusive task is not decided so."""
@@ -168,9 +166,8 @@ class Party:
             made = self._teller.announcement(self.announcement, self.audience.is_shared, now)
             if made is not None:
                 self.announced(made, now)
-            out += self._teller.offers(age, now)
-        else:
-            out += self._branch.offers(age, now)
+        out += self._gatherer.offers(age, now)
+        if self._teller is None:
             out += self._check.offers(self.announcement, age, now)
         out += self._direct.offers(age, now)
         out += self.audience.notices(self.announcement, self._is_mine, now)
@@ -189,10 +186,8 @@ class Party:
                 self._check.answered(self.announcement, now)
             elif errand.is_shared:
                 self._direct.answered(errand)
-            elif self._teller is not None:
-                self._teller.answered(errand, now)
             else:
-                self._branch.answered(errand, now)
+                self._gatherer.answered(errand, now)
 
     def failed(self, errand: Errand, now: float) -> None:
         """Take note that nobody answered an errand."""
@@ -203,10 +198,8 @@ class Party:
                 self._check.failed(errand.to, now)
             elif errand.is_shared:
                 self._direct.failed(errand, now)
-            elif self._teller is not None:
-                self._teller.failed(errand, now)
             else:
-                self._branch.failed(errand, now)
+                self._gatherer.failed(errand, now)
             is_alone = self._check.is_alone or self._direct.is_alone or self._branch.is_alone
             if is_alone and self._teller is None:
                 self._cry(now)

@@ -40,15 +40,8 @@ class Rule:
             return leading(chosen, (), MAX_REPORTS)
         return tuple(sorted(chosen, key=_order))
 
-    def assigned(self, reports: Sequence[Report]) -> str | None:
-        """The agent that should act, going by these reports."""
-        return self._consensus(reports)[0]
-
     def decided(self, reports: Sequence[Report]) -> tuple[str | None, str]:
         """What is decided by these reports, all but who stands by: equal where nothing depends on the difference."""
-        return self._consensus(reports)
-
-    def _consensus(self, reports: Sequence[Report]) -> tuple[str | None, str]:
         try:
             consensus = self._find(tuple(reports))
             agent = consensus.assigned_agent

@@ -56,8 +56,8 @@ class Teller:
         idle = [at for node_id, at in self._send_at.items() if node_id not in self._under_way]
         return min([self._speak_at, *idle])
 
-    def join(self, bids: Iterable[Bid], sender: bytes, is_shared: bool, age: float, now: float) -> bool:
-        """Take bids in that ``sender`` gave; whether they changed anything."""
+    def join(self, bids: Iterable[Bid], sender: bytes, is_shared: bool, age: float, now: float) -> None:
+        """Take bids in that ``sender`` gave."""
         bids = tuple(bids)
         if len(self._bidders) < MAX_COUNTED:
             self._bidders.update(bid.agent for bid in bids)
@@ -74,7 +74,6 @@ class Teller:
         if len(self._bidders) >= self.expected and now < self._closes_at:
             self._closes_at = now
             self._speak_at = now + self._rank * STAND_IN
-        return changed
 
     def heard(self, announcement: Announcement) -> None:
         """Take note of what a fellow announced."""

@@ -13,10 +13,10 @@ from collections.abc import Callable, Iterable
 from middleware.consensus.bidding.auction import Auction
 from middleware.consensus.bidding.bid import Bid
 from middleware.consensus.bidding.errand import MAX_BIDS, Offer
-from middleware.consensus.bidding.route import hops, shared_bits
 from middleware.consensus.bidding.rule import Rule
 from middleware.consensus.bidding.summary import Summary
 from middleware.entangled.contact import Contact
+from middleware.entangled.kademlia.distance import closest, distance
 
 HOLD_PER_BIT = 0.02
 """Seconds to wait for each bit that the own id shares with the key: a hop gains three bits and takes 30 ms and more."""
@@ -34,6 +34,30 @@ MAX_CHILDREN = 64
 Who joined early is known to far more nodes than others are, and all of them would send to the one that stands nearest
 to the key: 340 of 10,000.
 """
+
+
+MAX_HOPS = 4
+"""Contacts that are tried before the council itself."""
+
+
+def hops(auction: Auction, own_id: bytes, contacts: Iterable[Contact]) -> list[Contact]:
+    """Whom to send to, in the order of trying: the nearest contacts to the key, then the council.
+
+    Only contacts nearer than this node count, so no bid goes round in a circle (Kademlia, section 2).
+    Where the nearest is a member of the council it is the goal, and the other members follow.
+    """
+    own = distance(own_id, auction.key)
+    nearer = [c for c in contacts if distance(c.node_id, auction.key) < own]
+    found = closest(nearer, auction.key, MAX_HOPS)
+    council = [member for member in auction.council if member.node_id != own_id]
+    if found and auction.rank(found[0].node_id) is not None:
+        return [found[0], *(member for member in council if member.node_id != found[0].node_id)]
+    return [*(c for c in found if auction.rank(c.node_id) is None), *council]
+
+
+def shared_bits(a: bytes, b: bytes) -> int:
+    """How many of the first bits two ids share."""
+    return 8 * len(a) - distance(a, b).bit_length()
 
 
 class Branch:
@@ -60,12 +84,10 @@ class Branch:
         """When there is something to send."""
         return math.inf if self._under_way is not None else self._send_at
 
-    def join(self, bids: Iterable[Bid], now: float) -> bool:
-        """Take bids in; whether they changed anything."""
-        changed = self.summary.join(bids)
-        if changed:
+    def join(self, bids: Iterable[Bid], now: float) -> None:
+        """Take bids in."""
+        if self.summary.join(bids):
             self._send_at = min(self._send_at, now + (LATER if self._has_sent else self._hold))
-        return changed
 
     def offers(self, age: float, now: float) -> list[Offer]:
         """What goes out now."""

@@ -149,7 +149,9 @@ class Council:
         self._rounds = max(self._rounds, believed((reply.promised.counter // LIFE for reply in replies), size))
         self.token = max(self.token, believed((reply.token for reply in replies), size))
         told = [self._read(self.task_id, reply.proof) for reply in replies if reply.kind is Kind.MOVED]
-        newest = max((each for each in told if each is not None), key=_configuration, default=None)
+        newest = max(
+            (each for each in told if each is not None), key=lambda charter: charter.configuration, default=None
+        )
         if newest is not None and newest.configuration > self.configuration:
             self._adopt(newest)
             return
@@ -318,10 +320,6 @@ class Council:
             self.charter, self.configuration, self.members = charter, charter.configuration, charter.members
             if is_news:
                 self.moved()
-
-
-def _configuration(charter: Charter) -> int:
-    return charter.configuration
 
 
 def _raise(round_: Round, what: str) -> None:

@@ -12,11 +12,11 @@ from weakref import WeakValueDictionary
 
 from twisted.internet.defer import Deferred, maybeDeferred
 from twisted.internet.interfaces import IReactorTime
+from twisted.internet.task import deferLater
 
 from middleware.consensus.lease.acceptor import LeaseAcceptor
 from middleware.consensus.lease.charter import LEAST, Judge, sign_change, sign_end
 from middleware.consensus.lease.lease_codec import MAX_COUNCIL, members_of, pack_reply
-from middleware.consensus.lease.patience import in_time
 from middleware.entangled.contact import Contact
 from middleware.entangled.data.store import Store
 from middleware.entangled.errors import Refused
@@ -204,3 +204,25 @@ def _check(task_id: str, *numbers: int, ttl: float = 1.0, rest: float = 0.0) -> 
         raise Refused(f"a lease lasts more than 0 and at most {MAX_TTL:g} seconds")
     if not 0.0 <= rest <= MAX_TTL:
         raise Refused(f"a robot comes to rest within 0 to {MAX_TTL:g} seconds")
+
+
+MOST_WAIT_S = 0.15
+"""Seconds for which an answer is put off."""
+MIN_WAIT_S = 0.001
+"""Seconds that pass at least until a proposal is looked at again."""
+
+
+def in_time(propose: Callable[[], Reply], clock: IReactorTime) -> Deferred[Reply]:
+    """What ``propose`` brings: now, or in a moment where only the end of another's lease is missing.
+
+    So neither a round trip nor a guess at its length lies between the end of one lease and the next.
+    """
+    return Deferred.fromCoroutine(_in_time(propose, clock))
+
+
+async def _in_time(propose: Callable[[], Reply], clock: IReactorTime) -> Reply:
+    reply = propose()
+    while reply.kind is Kind.HELD and reply.remaining <= MOST_WAIT_S:
+        await deferLater(clock, max(MIN_WAIT_S, reply.remaining))
+        reply = propose()
+    return reply

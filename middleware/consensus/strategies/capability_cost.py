@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from middleware.consensus.strategies.nearest import best_of
-from middleware.consensus.strategy import Consensus, Report, led_by, refusal
+from middleware.consensus.strategies.nearest import Nearest, best_of
+from middleware.consensus.strategy import Consensus, Report, led_by
 
 BATTERY_S = 30.0
 """An empty battery weighs as much as so many seconds of way."""
@@ -17,7 +17,7 @@ LOAD_S = 20.0
 """Each task that an agent has already weighs as much as so many seconds of way."""
 
 
-class CapabilityCost:
+class CapabilityCost(Nearest):
     """``cost`` in seconds, plus what a low battery and other tasks weigh; the least wins, ties go by the id."""
 
     name = "capability_cost"
@@ -25,23 +25,13 @@ class CapabilityCost:
     reads = ("battery", "load")
 
     def find(self, contacts: Sequence[Report]) -> Consensus:
-        """The consensus point; None is assigned where nobody can, and ``strategy.refused`` says why for each."""
+        """The consensus point; None is assigned where nobody can, and ``strategy.refusal`` says why for each."""
         order = best_of(contacts, self.weigh)
         if not order:
             return Consensus(None, strategy=self.name, reason="no device can do it")
         first = order[0]
         reason = f"{first.cost:.1f} s away, battery {first.battery:.0%}, {first.load:g} other tasks"
         return led_by(self.name, order, order, reason)
-
-    def improves(self, current: Report, offer: Report, hysteresis: float) -> bool:
-        """Whether ``offer`` weighs less by more than the share ``hysteresis``; who cannot do it never does."""
-        if refusal(offer):
-            return False
-        return bool(refusal(current)) or self.weigh(offer) < self.weigh(current) * (1.0 - hysteresis)
-
-    def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
-        """The best of both."""
-        return tuple(best_of((*a, *b), self.weigh))
 
     def weigh(self, report: Report) -> float:
         """What a report weighs, in seconds: it rises with way and load, and falls with the battery."""

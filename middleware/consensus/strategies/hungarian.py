@@ -1,35 +1,26 @@
 """Hungarian: the cheapest assignment of rows to columns, exactly, by shortest augmenting paths.
 
 Jonker, Volgenant, Computing 38, 1987.  Costs are whole numbers, so that sums are exact and every machine finds the
-same: of several optima the one whose columns, read row by row, come first.  SciPy solves it where it is installed; the
-result is the same.
+same: of several optima the one whose columns, read row by row, come first.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 Costs = Sequence[Sequence[float]]
 """Whole numbers, as ``int`` or, while they are small, as ``float``, which reckons as exactly and faster."""
 BEYOND = 2**52
-"""Sums from here on are not exact in the floating point that SciPy reckons in."""
+"""Sums from here on are not exact in floating point."""
 
 
-def assigned(costs: Costs, with_scipy: bool = True) -> list[int]:
+def assigned(costs: Costs) -> list[int]:
     """The column of each row; there are at least as many columns as rows, and all rows are equally long."""
     if not costs:
         return []
     if max(map(max, costs)) * len(costs) < BEYOND:
         costs = [list(map(float, row)) for row in costs]
-    found = _by_scipy(costs) if with_scipy else None
-    columns, prices = found or solved(costs)
-    return first_of_equals(costs, columns, prices)
-
-
-def total(costs: Costs, columns: Sequence[int]) -> float:
-    """What an assignment costs."""
-    return sum(row[column] for row, column in zip(costs, columns, strict=True))
+    return first_of_equals(costs, *solved(costs))
 
 
 def solved(costs: Costs) -> tuple[list[int], list[float]]:
@@ -151,27 +142,3 @@ def _changed_hands(row: int, wanted: int, columns: list[int], owner: dict[int, i
                     came[other] = holder
                     line.append(other)
     return False
-
-
-def _by_scipy(costs: Costs) -> tuple[list[int], list[float]] | None:
-    """The same by SciPy, with prices that prove it; None where it is not installed, or cannot be exact."""
-    try:
-        import numpy
-        from scipy.optimize import linear_sum_assignment
-    except ImportError:
-        return None
-    if max(map(max, costs)) * len(costs) >= BEYOND or min(map(min, costs)) < 0:
-        return None
-    table: Any = numpy.array(costs, dtype=numpy.int64)
-    columns = linear_sum_assignment(table)[1]
-    own = table[numpy.arange(len(costs)), columns]
-    lowered = numpy.zeros(table.shape[1], dtype=numpy.int64)
-    if table.shape[1] > len(costs):
-        lowered[columns] = BEYOND
-    for _ in range(len(costs) + 1):
-        better = numpy.minimum(lowered[columns], (table + lowered).min(axis=1) - own)
-        if (better == lowered[columns]).all():
-            most = int(lowered.min()) if table.shape[1] == len(costs) else 0
-            return [int(c) for c in columns], [most - int(p) for p in lowered]
-        lowered[columns] = better
-    return None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from middleware.consensus.strategy import Consensus, Report, better, cost_of, led_by, standing
+from middleware.consensus.strategy import Consensus, Report, led_by, refusal, standing
 
 KEPT = 4
 """How many of the best a summary keeps: one to act, the others to stand by; signed, that many fill a datagram."""
@@ -18,19 +18,28 @@ class Nearest:
     reads: tuple[str, ...] = ()
 
     def find(self, contacts: Sequence[Report]) -> Consensus:
-        """The consensus point; None is assigned where no report counts (``strategy.refused`` says why)."""
-        order = best_of(contacts, cost_of)
+        """The consensus point; None is assigned where no report counts (``strategy.refusal`` says why)."""
+        order = best_of(contacts, self.weigh)
         if not order:
             return Consensus(None, strategy=self.name, reason="no report counts")
         return led_by(self.name, order, order, f"{order[0].cost:.2f}, least of {len(order)}")
 
     def improves(self, current: Report, offer: Report, hysteresis: float) -> bool:
-        """Whether ``offer`` is nearer by more than the share ``hysteresis``; what is no distance never is."""
-        return better(current, offer, hysteresis)
+        """Whether ``offer`` weighs less than ``current`` by more than the share ``hysteresis``.
+
+        One that counts for nothing is better than no other, and any that counts is better than it.
+        """
+        if refusal(offer):
+            return False
+        return bool(refusal(current)) or self.weigh(offer) < self.weigh(current) * (1.0 - hysteresis)
 
     def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
         """The best of both."""
-        return tuple(best_of((*a, *b), cost_of))
+        return tuple(best_of((*a, *b), self.weigh))
+
+    def weigh(self, report: Report) -> float:
+        """The lowest weight wins."""
+        return report.cost
 
 
 def best_of(contacts: Sequence[Report], rank: Callable[[Report], float]) -> list[Report]:

@@ -30,7 +30,7 @@ class Sequential(Cbba):
         """One consensus point for each item, in the order of their names; without positions as ``cbba`` does it."""
         items = listed(items)
         counted = [r for r in standing(contacts) if r.value]
-        ways = _ways(counted, items)
+        ways = ways_of(contacts, items)
         if ways is None:
             return super().find_group(contacts, items)
         owners = {task: [agent] for agent, way in ways.items() for task in way}
@@ -42,10 +42,7 @@ def ways_of(contacts: Sequence[Report], items: Sequence[Item]) -> dict[str, list
 
     An agent that reports about tasks by name takes only those; one that names none takes any.
     """
-    return _ways([r for r in standing(contacts) if r.value], listed(items))
-
-
-def _ways(counted: Sequence[Report], items: Sequence[Item]) -> dict[str, list[str]] | None:
+    counted = [r for r in standing(contacts) if r.value]
     places = {item.task: item.position for item in items}
     starts: dict[str, Place] = {}
     able: dict[str, set[str]] = {}

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from twisted.internet.interfaces import IReactorTime
 
 from middleware.consensus.bidding.auction import Auction
-from middleware.consensus.bidding.bidding import Bidding
+from middleware.consensus.bidding.auctions import Bidding
 from middleware.consensus.lease.lessee import Lessee
 from middleware.consensus.strategies.nearest import Nearest
 from middleware.consensus.strategy import Report

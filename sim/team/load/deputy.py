@@ -14,8 +14,7 @@ from typing import Any
 from twisted.internet.interfaces import IReactorTime
 
 from middleware.consensus.bidding.auction import Auction
-from middleware.consensus.bidding.auctions import Dissemination, Surroundings
-from middleware.consensus.bidding.bidding import Bidding
+from middleware.consensus.bidding.auctions import Bidding, Dissemination, Surroundings
 from middleware.consensus.bidding.party import OnSummary
 from middleware.consensus.bidding.scale import team_size
 from middleware.consensus.lease.lessee import Lessee

@@ -1,4 +1,4 @@
-"""Tests of averages, meeting points, and of the average without anybody who gathers."""
+"""Tests of averages and meeting points."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.consensus.strategies.average import Average
-from middleware.consensus.strategies.push_sum import PushSum, Share
 from middleware.consensus.strategies.rendezvous import Centre, Median, Rendezvous, centre, median
 from middleware.consensus.strategy import Report
 
@@ -84,63 +83,3 @@ class RendezvousTests(SynchronousTestCase):
         self.assertEqual(centre([(0.0,), (1.0,), (9.0,)]), (4.5,))
         here = centre([(0.0, 0.0, 0.0), (2.0, 0.0, 0.0), (1.0, 0.5, 0.0)])
         self.assertLess(math.dist(here, (1.0, 0.0, 0.0)), 0.02)
-
-
-class PushSumTests(SynchronousTestCase):
-    def run_team(self, count: int, seed: int, loss: float, rounds: int) -> list[PushSum]:
-        """Rounds of giving, with messages and acknowledgements lost, doubled and late."""
-        dice = random.Random(seed)
-        team = {f"a{n}": PushSum(f"a{n}", [dice.uniform(0, 100)]) for n in range(count)}
-        names = list(team)
-        self.mean = math.fsum(one.mass[0] for one in team.values()) / count
-        for _ in range(rounds):
-            sent: list[tuple[str, Share]] = []
-            for name, one in team.items():
-                sent += one.unacknowledged()
-                other = dice.choice([n for n in names if n != name])
-                sent.append((other, one.give(other)))
-            for taker, share in dice.sample(sent, len(sent)):
-                for _ in range(2 if dice.random() < 0.1 else 1):
-                    if dice.random() >= loss:
-                        number = team[taker].take(share)
-                        if dice.random() >= loss:
-                            team[share.giver].acknowledged(number)
-        self.team = team
-        return list(team.values())
-
-    def mass(self) -> tuple[float, float]:
-        """All there is, in hand and on its way, each share once."""
-        on_the_way = [
-            share
-            for one in self.team.values()
-            for taker, share in one.unacknowledged()
-            if not self.team[taker].has_taken(share)
-        ]
-        held = list(self.team.values())
-        return (
-            math.fsum([one.mass[0] for one in held] + [share.mass[0] for share in on_the_way]),
-            math.fsum([one.weight for one in held] + [share.weight for share in on_the_way]),
-        )
-
-    def test_converges(self) -> None:
-        """Without loss everybody is within a millionth after 4 log2 N + 40 rounds."""
-        for count in (2, 10, 100):
-            for one in self.run_team(count, count, 0.0, round(4 * math.log2(count)) + 40):
-                self.assertLess(abs(one.value[0] - self.mean) / self.mean, 1e-6)
-
-    def test_mass_stays(self) -> None:
-        """Nothing is lost and nothing counts twice, whatever is lost or doubled."""
-        for loss in (0.0, 0.1, 0.3):
-            self.run_team(12, 3, loss, 25)
-            mass, weight = self.mass()
-            self.assertAlmostEqual(mass / 12, self.mean, 9)
-            self.assertAlmostEqual(weight, 12.0, 9)
-
-    def test_join_and_leave(self) -> None:
-        """Who comes adds its value, who goes leaves everything to another."""
-        one, other = PushSum("a", [1.0]), PushSum("b", [5.0])
-        other.take(one.give("b", whole=True))
-        self.assertEqual((other.value, other.weight, one.weight, one.value), ((3.0,), 2.0, 0.0, ()))
-        newcomer = PushSum("c", [9.0])
-        other.take(newcomer.give("b", whole=True))
-        self.assertEqual(other.value, (5.0,))

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.consensus.strategies.capability_cost import CapabilityCost
-from middleware.consensus.strategy import Report, refused
+from middleware.consensus.strategy import Report
 
 shares = st.floats(0.0, 1.0)
 seconds = st.floats(0.0, 1e6)
@@ -21,14 +21,13 @@ class CapabilityCostTests(SynchronousTestCase):
         self.strategy = CapabilityCost()
 
     def test_the_incapable_never_win(self) -> None:
-        """Who lacks something does not win at any price, and is told by name what it lacks."""
+        """Who lacks something does not win at any price."""
         for cost in (0.0, math.nan, math.inf, -1.0):
             unable = Report("dog1", cost, unmet=("has no camera",))
             found = self.strategy.find([unable, Report("dog2", 9e8)])
             self.assertEqual((found.assigned_agent, found.standby), ("dog2", ()))
             self.assertEqual(self.strategy.find([unable]).assigned_agent, None)
             self.assertFalse(self.strategy.improves(Report("dog2", 9e8), unable, 0.0))
-        self.assertEqual(refused([replace(unable, cost=1.0)]), (("dog1", "cannot do it: has no camera"),))
 
     @settings(max_examples=100, deadline=None, derandomize=True, database=None)
     @given(seconds, shares, st.integers(0, 9), seconds, shares, st.integers(1, 9))
@@ -51,20 +50,3 @@ class CapabilityCostTests(SynchronousTestCase):
         tired, fresh = Report("a", 5.0, battery=0.2), Report("a", 6.0)
         self.assertEqual(self.strategy.merge([tired], [fresh]), (fresh,))
         self.assertEqual(self.strategy.find([tired, fresh, Report("b", 10.0)]).assigned_agent, "a")
-
-    def test_one_switch_each_swing(self) -> None:
-        """A cost that swings changes the holder once for each swing beyond the threshold, and never for less."""
-
-        def switches(swing: float) -> int:
-            holder, other, count = Report("a", 10.0), Report("b", 10.0), 0
-            for step in range(200):
-                level = 10.0 + swing * math.sin(2 * math.pi * step / 50)
-                now = {"a": Report("a", 10.0), "b": Report("b", level)}
-                holder, other = now[holder.agent], now[other.agent]
-                if self.strategy.improves(holder, other, 0.1):
-                    holder, other, count = other, holder, count + 1
-            return count
-
-        self.assertEqual(switches(0.9), 0)
-        self.assertLessEqual(switches(5.0), 8)
-        self.assertGreaterEqual(switches(5.0), 4)

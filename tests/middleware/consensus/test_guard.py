@@ -8,9 +8,10 @@ from dataclasses import replace
 
 from twisted.trial.unittest import SynchronousTestCase
 
+from middleware.consensus.deployed import Make
 from middleware.consensus.guard import SPAN, STRIKES, Guard, Lost
 from middleware.consensus.item import Item
-from middleware.consensus.selection import guarded
+from middleware.consensus.selection import Strategies, guarded
 from middleware.consensus.strategies.cbba import Cbba
 from middleware.consensus.strategies.nearest import Nearest
 from middleware.consensus.strategy import Consensus, Report
@@ -118,14 +119,6 @@ class GuardTests(SynchronousTestCase):
         self.assertIn(why, found.reason)
         guard.find(TEAM)
         self.assertTrue(self.flushLoggedErrors())
-
-    def test_good_one(self) -> None:
-        """A good strategy is not changed by its guard, and nothing is logged."""
-        guard = Guard(Nearest(), twice=True)
-        self.assertEqual(guard.find(TEAM), Nearest().find(TEAM))
-        self.assertEqual((guard.name, guard.version), ("nearest", "2"))
-        self.assertTrue(guard.improves(TEAM[0], TEAM[1], 0.1))
-        self.assertEqual(guard.merge(TEAM[:2], TEAM[2:]), Nearest().merge(TEAM, ()))
 
     def test_raising(self) -> None:
         """One that raises has no opinion; its exception is named, and the trace is logged once for the same."""
@@ -250,15 +243,24 @@ class GuardTests(SynchronousTestCase):
         self.assertIn("nearest", str(error))
         self.assertRaises(UnknownStrategy, guarded, "this:s")
 
-    def test_fallback_of_choice(self) -> None:
-        """Another strategy than the nearest can be what decides then, and is named."""
 
-        class Farthest(Nearest):
-            name = "farthest"
+class StrategiesTests(SynchronousTestCase):
+    def test_built_in(self) -> None:
+        """A built-in strategy is made anew for each task, also when its node has left; an unknown name is an error."""
+        strategies = Strategies()
+        first, second = strategies.named("nearest", {}), strategies.named("nearest", {})
+        self.assertIsInstance(first.strategy, Nearest)
+        self.assertIsNot(first, second)
+        strategies.stop()
+        self.assertIsInstance(strategies.named("cbba", {}).strategy, Cbba)
+        self.assertRaises(UnknownStrategy, strategies.named, "farthest", {})
 
-            def find(self, contacts: Sequence[Report]) -> Consensus:
-                return replace(super().find(contacts), assigned_agent="a", standby=())
-
-        found = Guard(Raising(), Farthest()).find(TEAM)
-        self.assertEqual((found.assigned_agent, found.strategy), ("a", "farthest"))
-        self.flushLoggedErrors()
+    def test_deployed(self) -> None:
+        """Each task gets the version that was deployed last; who had the one before keeps it."""
+        deployed: dict[tuple[str, str], Make] = {("strategy", "best"): Nearest}
+        strategies = Strategies()
+        before = strategies.named("deployed:best", deployed)
+        deployed["strategy", "best"] = Cbba
+        self.assertIsInstance(strategies.named("deployed:best", deployed).strategy, Cbba)
+        self.assertIsInstance(before.strategy, Nearest)
+        self.assertRaises(UnknownStrategy, strategies.named, "deployed:best", {})

@@ -12,7 +12,6 @@ from middleware.consensus.strategies.nearest import Nearest
 from middleware.consensus.strategy import READABLE, Consensus, Report
 from middleware.consensus.verdict import (
     BEST,
-    KEPT,
     MANY,
     MAX_VERDICT,
     Verdict,
@@ -24,7 +23,7 @@ from middleware.consensus.verdict import (
 from middleware.consensus.view import View
 from middleware.directory.presence import EXECUTING, WAITING
 from middleware.entangled.identity import Identity
-from middleware.entangled.record import MAX_NAME, Record
+from middleware.entangled.record import Record
 from middleware.tasks.task import Member
 
 
@@ -167,8 +166,3 @@ class VerdictTests(SynchronousTestCase):
         self.assertTrue(all(decided(n, members[:MANY]).is_witness for n in range(1, MANY + 1)))
         told = [verdict for n in range(1, MANY + 2) if (verdict := decided(n, members)).is_witness]
         self.assertEqual([verdict.name for verdict in told], [f"dog{n}" for n in range(1, BEST + 1)])
-
-    def test_slots_are_few(self) -> None:
-        """However many epochs a task has, an agent fills few slots under it."""
-        self.assertEqual(len({slot_of(epoch) for epoch in range(1000)}), KEPT)
-        self.assertLessEqual(max(len(slot_of(epoch)) for epoch in range(1000)), MAX_NAME)

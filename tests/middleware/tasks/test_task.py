@@ -1,4 +1,4 @@
-"""Tests of tasks, reports and results as records, and of who can do what."""
+"""Tests of tasks, reports, results and orders as records, and of who can do what."""
 
 from __future__ import annotations
 
@@ -14,11 +14,13 @@ from middleware.entangled.contact import Contact
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.network import Address
 from middleware.entangled.record import Record, hashed_key
+from middleware.tasks.order import PAUSE, RESUME, Order, order_of
 from middleware.tasks.task import (
     CANCELLED,
     COMPLETED,
     FAILED,
     MEMBER,
+    ORDER,
     RESULT,
     Member,
     Result,
@@ -37,6 +39,7 @@ COUNCIL = tuple(Contact(who.public, Address("10.0.0.1", 7000)) for who in (DOG, 
 TASK = Task("t1", "search", "Find it", {"camera": {"width": 208}}, {"radius": 0.3}, created=5.0, council=COUNCIL)
 UUID = DOG.node_id.hex()
 REPORT = Member(UUID, "dog", "WAITING", 1.5, UUID, "abcd", 3, "nearest")
+PAUSED = Order(PAUSE, "vaio", 5.0)
 DONE = Result(COMPLETED, "dog", 12.5, 3, (("dog", 1.5),))
 
 
@@ -118,45 +121,33 @@ class DecoderTests(SynchronousTestCase):
 
     def test_crafted_reports(self) -> None:
         """A report with a wrong type is none; one whose cost is no distance has nothing to report."""
-        for name, value in [
-            ("name", 5),
-            ("status", 5),
-            ("assigned", None),
-            ("digest", 5),
-            ("token", -1),
-            ("why", 5),
-            ("token", 1.0),
-            ("token", 2**60),
-            ("epoch", -1),
-            ("serial", 0.5),
-            ("state", None),
-            ("available", 1),
-            ("load", -1),
-            ("age", -1.0),
-            ("valid_for", float("nan")),
-            ("progress", "half"),
-            ("angle", float("inf")),
-            ("post", [1.0]),
-            ("uuid", 5),
-            ("battery", 1.5),
-            ("battery", None),
-            ("battery", float("nan")),
-            ("value", 5),
-            ("value", "ab"),
-            ("value", ["a"]),
-            ("value", [float("inf")]),
-            ("value", [1e12]),
-            ("value", [0.0] * 9),
-            ("choice", 5),
-            ("choice", "x" * 65),
-            ("choice", "red\x1b[2J"),
-            ("weight", -1.0),
-            ("weight", 1e12),
-            ("weight", True),
-            ("electorate", float("nan")),
-            ("electorate", "all"),
-        ]:
-            self.assertIsNone(member_of(record(MEMBER, changed(REPORT.packed(), **{name: value}))), (name, value))
+        bad: dict[str, list[object]] = {
+            "name": [5],
+            "status": [5],
+            "assigned": [None],
+            "digest": [5],
+            "token": [-1, 1.0, 2**60],
+            "why": [5],
+            "epoch": [-1],
+            "serial": [0.5],
+            "state": [None],
+            "available": [1],
+            "load": [-1],
+            "age": [-1.0],
+            "valid_for": [float("nan")],
+            "progress": ["half"],
+            "angle": [float("inf")],
+            "post": [[1.0]],
+            "uuid": [5],
+            "battery": [1.5, None, float("nan")],
+            "value": [5, "ab", ["a"], [float("inf")], [1e12], [0.0] * 9],
+            "choice": [5, "x" * 65, "red\x1b[2J"],
+            "weight": [-1.0, 1e12, True],
+            "electorate": [float("nan"), "all"],
+        }
+        for name, values in bad.items():
+            for value in values:
+                self.assertIsNone(member_of(record(MEMBER, changed(REPORT.packed(), **{name: value}))), (name, value))
         for cost in ("near", -1.0, float("nan"), float("inf"), True, [1]):
             report = member_of(record(MEMBER, changed(REPORT.packed(), cost=cost)))
             self.assertEqual(report, replace(REPORT, cost=None), cost)
@@ -181,23 +172,17 @@ class DecoderTests(SynchronousTestCase):
 
     def test_crafted_results(self) -> None:
         """A result with a wrong type, number or outcome is none."""
-        for name, value in [
-            ("outcome", "WON"),
-            ("outcome", []),
-            ("by", 5),
-            ("why", 5),
-            ("took", "5"),
-            ("took", float("nan")),
-            ("token", float("inf")),
-            ("token", "5"),
-            ("token", -1),
-            ("bids", 5),
-            ("bids", [5]),
-            ("bids", [["a"]]),
-            ("bids", [["a", "b"]]),
-            ("bids", [[5, 1.0]]),
-        ]:
-            self.assertIsNone(result_of(record(RESULT, changed(DONE.packed(), **{name: value}))), (name, value))
+        bad: dict[str, list[object]] = {
+            "outcome": ["WON", []],
+            "by": [5],
+            "why": [5],
+            "took": ["5", float("nan")],
+            "token": [float("inf"), "5", -1],
+            "bids": [5, [5], [["a"]], [["a", "b"]], [[5, 1.0]]],
+        }
+        for name, values in bad.items():
+            for value in values:
+                self.assertIsNone(result_of(record(RESULT, changed(DONE.packed(), **{name: value}))), (name, value))
         for value in (None, b"", {}, {"outcome": COMPLETED}, DEPTH):
             self.assertIsNone(result_of(record(RESULT, value)), value)
 
@@ -254,3 +239,23 @@ class RefusalTests(SynchronousTestCase):
     def test_a_number_that_is_none_is_not_enough(self) -> None:
         """A capability of NaN meets no requirement."""
         self.assertEqual(len(refusals({"camera": {"width": float("nan")}}, {"camera": {"width": 1}})), 1)
+
+
+class OrderTests(SynchronousTestCase):
+    def test_newest_holds(self) -> None:
+        """Of several orders the newest holds, in any order of the records; equal moments are decided, too."""
+        resumed = replace(PAUSED, word=RESUME, at=6.0)
+        records = [record(ORDER, PAUSED.packed()), record(ORDER, resumed.packed())]
+        self.assertEqual(order_of(records), resumed)
+        self.assertEqual(order_of(records[::-1]), resumed)
+        tie = [record(ORDER, PAUSED.packed()), record(ORDER, replace(PAUSED, word=RESUME).packed())]
+        self.assertEqual(order_of(tie), order_of(tie[::-1]))
+
+    def test_nothing(self) -> None:
+        """Without an order, or with what is none, the task goes its way."""
+        lawful = msgpack.unpackb(PAUSED.packed())
+        crafted = [{}, {**lawful, "word": "FLY"}, {**lawful, "by": 5}, {**lawful, "at": float("nan")}, [1], b"\xc1"]
+        for value in crafted:
+            self.assertIsNone(order_of([record(ORDER, value)]), value)
+        self.assertIsNone(order_of([record(MEMBER, PAUSED.packed())]))
+        self.assertIsNone(order_of([]))

@@ -16,7 +16,7 @@ from middleware.consensus.bidding.panel import (
     SETTLING,
     SPACING,
     Panel,
-    place_of,
+    panel_of,
 )
 from middleware.directory.presence import EXECUTING, SEARCHING, WAITING
 from middleware.tasks.task import Member
@@ -108,6 +108,6 @@ class PanelTests(SynchronousTestCase):
     def test_places_are_spread(self) -> None:
         """The farthest from the key comes first, the nearest last."""
         key = bytes(20)
-        self.assertEqual(place_of("00" * 20, key), 1.0)
-        self.assertAlmostEqual(place_of("ff" * 20, key), 0.0)
-        self.assertAlmostEqual(place_of("80" + "00" * 19, key), 0.5)
+        self.assertEqual(panel_of("00" * 20, key).place, 1.0)
+        self.assertAlmostEqual(panel_of("ff" * 20, key).place, 0.0)
+        self.assertAlmostEqual(panel_of("80" + "00" * 19, key).place, 0.5)

@@ -8,14 +8,13 @@ import random
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.consensus.bidding.auction import Auction
+from middleware.consensus.bidding.auctions import LIFE_S, MAX_PARTIES, OWN, Parties
 from middleware.consensus.bidding.audience import MAX_LISTENERS, PAUSES, Audience
 from middleware.consensus.bidding.check import MAX_RELAYED
-from middleware.consensus.bidding.errand import MAX_BIDS, Cry, Errand, Notice, Offer
-from middleware.consensus.bidding.parties import LIFE_S, MAX_PARTIES, OWN, Parties
+from middleware.consensus.bidding.errand import Cry, Errand, Notice, Offer
 from middleware.consensus.bidding.party import Party
-from middleware.consensus.bidding.route import hops, shared_bits
 from middleware.consensus.bidding.scale import DIRECT, LEAST_TREE, MOST_DIRECT, NEAR, TREE, Scale, team_size
-from middleware.consensus.bidding.tree import MAX_CHILDREN
+from middleware.consensus.bidding.tree import MAX_CHILDREN, hops, shared_bits
 from middleware.entangled.contact import Contact
 from middleware.entangled.kademlia.distance import distance
 from middleware.entangled.network.network import Address
@@ -64,12 +63,6 @@ class RouteTests(SynchronousTestCase):
         auction = Auction(AUCTION.task_id, 1, (CONTACTS[11], member))
         far = max(CONTACTS, key=lambda c: distance(c.node_id, key))
         self.assertEqual(hops(auction, far.node_id, CONTACTS), [member, CONTACTS[11]])
-
-    def test_shared_bits(self) -> None:
-        """The first bits that two ids have in common are counted."""
-        self.assertEqual(shared_bits(b"\x00", b"\x80"), 0)
-        self.assertEqual(shared_bits(b"\x0f\x00", b"\x0f\x01"), 15)
-        self.assertEqual(shared_bits(b"ab", b"ab"), 16)
 
 
 class ScaleTests(SynchronousTestCase):
@@ -288,15 +281,6 @@ class BranchTests(SynchronousTestCase):
                 self.party.answered(offer, step * 0.1)
         self.assertEqual(straight, MAX_RELAYED)
 
-    def test_so_many_children(self) -> None:
-        """A branch that carries the bids of as many as it may has no room for another one, but for those it has."""
-        children = [Contact(number.to_bytes(32), Address("10.0.0.1", 1)) for number in range(MAX_CHILDREN)]
-        for child in children:
-            self.assertTrue(self.party.has_room(child))
-            self.party.offered([], child, 0.0, False, 0.0)
-        self.assertFalse(self.party.has_room(CONTACTS[6]))
-        self.assertTrue(self.party.has_room(children[0]))
-
     def test_the_council_hears_everybody(self) -> None:
         """A member of the council has room for whoever comes: there is nobody else to go to."""
         member = party(0)
@@ -362,16 +346,6 @@ class TellerTests(SynchronousTestCase):
         self.assertEqual(self.first.announcement.number, 2)
         self.assertEqual(self.first.announcement.reports[0].cost, 1.0)
 
-    def test_withdrawal_is_announced(self) -> None:
-        """When the winner takes its bid back, the others learn it."""
-        self.take(self.first, 5, 1.0, 0.0)
-        self.take(self.first, 6, 2.0, 0.0)
-        self.first.errands(0.5)
-        self.take(self.first, 5, None, 1.0, revision=1)
-        self.first.errands(2.0)
-        assert self.first.announcement is not None
-        self.assertEqual([r.cost for r in self.first.announcement.reports], [2.0])
-
     def test_fellows_share(self) -> None:
         """What a member alone was given goes to its fellows; what all were given does not."""
         self.take(self.second, 5, 2.0, 0.0, shared=True)
@@ -380,14 +354,6 @@ class TellerTests(SynchronousTestCase):
         sent = offers(self.second.errands(0.41))
         self.assertEqual({o.to for o in sent}, {COUNCIL[0], COUNCIL[2]})
         self.assertTrue(all(b.report and b.report.cost == 1.0 for o in sent for b in o.bids))
-
-    def test_large_summary_in_several_messages(self) -> None:
-        """No message has more bids than its receiver checks in one go."""
-        one = party(1)
-        many = [bid(5, None, revision) for revision in range(1, 3)]
-        self.assertLessEqual(len(many), MAX_BIDS)
-        one.offered(many, CONTACTS[5], 0.0, False, 0.0)
-        self.assertTrue(all(len(o.bids) <= MAX_BIDS for o in offers(one.errands(1.0))))
 
 
 class FloodTests(SynchronousTestCase):
@@ -420,12 +386,6 @@ class FloodTests(SynchronousTestCase):
         self.assertEqual(told, [])
         one.errands(one.due)
         self.assertEqual(told, [[1.0]])
-
-    def test_cries_for_exclusive_tasks(self) -> None:
-        """What is cried for an exclusive task is not heard."""
-        one = party(5)
-        one.cried([bid(6, 1.0)], CONTACTS[6], 0.0)
-        self.assertEqual(one.errands(9.0), [])
 
 
 class PartiesTests(SynchronousTestCase):

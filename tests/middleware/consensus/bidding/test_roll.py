@@ -7,8 +7,7 @@ from dataclasses import replace
 from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.consensus.bidding.group import Group, Heard
-from middleware.consensus.bidding.roll import Roll
+from middleware.consensus.bidding.group import Group, Heard, Roll
 from middleware.consensus.strategy import Report
 from middleware.consensus.view import View
 from middleware.tasks.task import Member, Result, Task

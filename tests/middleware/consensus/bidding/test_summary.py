@@ -131,7 +131,7 @@ class RuleTests(SynchronousTestCase):
         raising = Rule(Raising(), lambda method, error: blamed.append(method))
         both = (Report("a", 2.0), Report("b", 1.0))
         self.assertEqual(raising.merged(both, ()), (both[1], both[0]))
-        self.assertEqual(raising.assigned(both), "b")
+        self.assertEqual(raising.decided(both)[0], "b")
         self.assertEqual(blamed, ["merge", "find"])
 
     def test_strategy_that_lies(self) -> None:
@@ -139,8 +139,8 @@ class RuleTests(SynchronousTestCase):
         lying = Rule(Lying())
         both = (Report("a", 2.0), Report("b", 1.0))
         self.assertEqual(lying.merged(both, ()), (both[1], both[0]))
-        self.assertEqual(lying.assigned(both), "b")
-        self.assertIsNone(lying.assigned(()))
+        self.assertEqual(lying.decided(both)[0], "b")
+        self.assertIsNone(lying.decided(())[0])
 
     def test_strategy_that_hoards(self) -> None:
         """A summary never has more reports than there is room for, and one of each agent."""

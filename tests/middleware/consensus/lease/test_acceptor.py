@@ -10,7 +10,7 @@ from middleware.consensus.lease.acceptor import IDLE_AGE, MAX_LISTENERS, LeaseAc
 from middleware.consensus.lease.lease_codec import CODEC, LIFE
 from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.quorum import log
-from middleware.entangled.quorum.ballot import ROOM, Ballot
+from middleware.entangled.quorum.ballot import Ballot
 from middleware.entangled.quorum.register import Kind, Reply
 from tests.middleware.consensus.lease.test_lease_codec import MEMBERS
 
@@ -33,14 +33,6 @@ class AcceptorTests(SynchronousTestCase):
     def propose(self, number: int, agent: str, token: int, now: float, configuration: int = 1) -> Reply:
         """Ask for a lease."""
         return self.acceptor.lease("t", configuration, ballot(number, agent), token, TTL, now)
-
-    def test_promise_and_grant(self) -> None:
-        """A ballot is promised, the lease granted for a ttl, and the next one told its token and how long it runs."""
-        self.assertEqual(self.prepare(1, "a", 0.0).kind, Kind.GRANTED)
-        self.assertEqual(self.propose(1, "a", 1, 0.5)[0:4], (Kind.GRANTED, ballot(1, "a"), 1, TTL))
-        refused = self.prepare(2, "b", 1.0)
-        self.assertEqual((refused.kind, refused.token, refused.remaining), (Kind.HELD, 1, 1.5))
-        self.assertEqual(self.prepare(2, "b", 2.5).kind, Kind.GRANTED)
 
     def test_promise_for_the_time_after_a_lease(self) -> None:
         """Shortly before a lease ends another is promised what follows; nothing is granted sooner for that."""
@@ -65,15 +57,6 @@ class AcceptorTests(SynchronousTestCase):
         self.assertEqual(self.propose(1, "a", 1, 2.2).kind, Kind.GRANTED)
         self.assertEqual(self.propose(2, "b", 2, 4.3).kind, Kind.OUTBID)
         self.assertEqual(self.prepare(3, "b", 4.3).kind, Kind.GRANTED)
-
-    def test_token_never_falls_and_belongs_to_one(self) -> None:
-        """A token at most as high as one granted to another is refused, under whatever ballot."""
-        self.prepare(1, "a", 0.0)
-        self.propose(1, "a", 5, 0.0)
-        self.prepare(2, "b", 3.0)
-        for token in (1, 4, 5):
-            self.assertEqual(self.propose(2, "b", token, 3.0)[:5:2], (Kind.OUTBID, 5, 1))
-        self.assertEqual(self.propose(2, "b", 6, 3.0).kind, Kind.GRANTED)
 
     def test_former_life_is_another(self) -> None:
         """A restarted agent waits like everybody until what its former life held has run out: its robot may move."""
@@ -162,11 +145,6 @@ class AcceptorTests(SynchronousTestCase):
         told = self.acceptor.free("t", ballot(1, "a"), 1.0)
         self.assertEqual((len(told), told[-1]), (MAX_LISTENERS, f"b{3 * MAX_LISTENERS - 1:03d}"))
 
-    def test_numbers_are_bounded(self) -> None:
-        """The highest ballot that there is gets no promise, so that others can still ask."""
-        self.assertEqual(self.prepare(ROOM + 1, "a", 0.0).kind, Kind.OUTBID)
-        self.assertEqual(self.prepare(1, "b", 0.0).kind, Kind.GRANTED)
-
     def test_no_room(self) -> None:
         """A member that can remember no more tasks says so, and grants nothing that it would forget."""
         self.patch(log, "MAX_REGISTERS", 1)
@@ -199,11 +177,6 @@ class AcceptorTests(SynchronousTestCase):
         self.acceptor.accept("t", 1, ballot(2, "b"), MEMBERS, 3.0, 5)
         self.assertEqual([self.acceptor.close("t", agent, 1, 5, 3.0).kind for agent in ("a", "b")], [Kind.BEHIND] * 2)
 
-    def test_lower_token_that_is_heard(self) -> None:
-        """A proposer of a change that knows only a lower token lowers none."""
-        self.propose(1, "a", 3, 0.0)
-        self.assertEqual(self.acceptor.accept("t", 1, ballot(2, "b"), MEMBERS, TTL, 1).token, 3)
-
     def test_close(self) -> None:
         """After the end nothing is granted or renewed; who ends it learns how long another may still act."""
         self.prepare(1, "a", 0.0)
@@ -234,26 +207,6 @@ class AcceptorTests(SynchronousTestCase):
         self.assertEqual(self.propose(3, "b", 4, 0.4, configuration=2).kind, Kind.OUTBID)
         self.assertEqual(self.propose(3, "b", 5, 0.4, configuration=2).kind, Kind.GRANTED)
 
-    def test_late_installs(self) -> None:
-        """What is installed twice, or after something newer, changes nothing."""
-        self.acceptor.install("t", 3, MEMBERS[:3], 9, 0.0)
-        self.prepare(1, "a", 0.0, configuration=3)
-        self.propose(1, "a", 10, 0.0, configuration=3)
-        self.assertEqual(self.acceptor.install("t", 3, MEMBERS[:3], 9, 0.1).kind, Kind.GRANTED)
-        self.assertEqual(self.acceptor.install("t", 2, MEMBERS[1:4], 5, 0.1).kind, Kind.MOVED)
-        self.assertEqual(self.prepare(2, "b", 0.2, configuration=3).kind, Kind.HELD)
-
-    def test_restart(self) -> None:
-        """Another process leases what was leased for as long again, and keeps promises and tokens."""
-        store = MemoryStore()
-        self.acceptor = LeaseAcceptor(store, -math.inf)
-        self.prepare(2, "a", 0.0)
-        self.propose(2, "a", 5, 0.0)
-        self.acceptor = LeaseAcceptor(store, 50.0)
-        self.assertEqual(self.prepare(3, "b", 51.0).kind, Kind.HELD)
-        self.assertEqual(self.prepare(1, "b", 50.0 + TTL)[:3], (Kind.OUTBID, ballot(2, "a"), 5))
-        self.assertEqual(self.prepare(3, "b", 50.0 + TTL).kind, Kind.GRANTED)
-
     def test_promise_survives_a_restart(self) -> None:
         """What was only promised is promised by another process, too; where a note is rotten it grants nothing."""
         store = MemoryStore()
@@ -266,19 +219,6 @@ class AcceptorTests(SynchronousTestCase):
         store.note(CODEC.bucket_of("t"), b"rotten")
         self.acceptor = LeaseAcceptor(store, 50.0)
         self.assertEqual(self.prepare(1, "b", 51.0).kind, Kind.QUIET)
-
-    def test_look(self) -> None:
-        """To look is promised nothing, and lowers no promise."""
-        self.prepare(2, "a", 0.0)
-        self.assertEqual(self.prepare(0, "b", 0.0).kind, Kind.GRANTED)
-        self.assertEqual(self.prepare(1, "c", 0.0).kind, Kind.OUTBID)
-
-    def test_release_of_others(self) -> None:
-        """A ballot that was promised nothing here ends nothing, and bars nobody."""
-        self.propose(1, "a", 1, 0.0)
-        self.assertEqual(self.acceptor.free("t", ballot(9, "b"), 0.5), [])
-        self.assertEqual(self.prepare(2, "b", 0.5).kind, Kind.HELD)
-        self.assertEqual(self.prepare(2, "b", TTL).kind, Kind.GRANTED)
 
     def test_forgotten(self) -> None:
         """What a member forgot for want of room leaves a floor under its ballots and tokens, also after a restart."""
@@ -293,10 +233,3 @@ class AcceptorTests(SynchronousTestCase):
         for acceptor in (self.acceptor, LeaseAcceptor(store, 1.2 * IDLE_AGE)):
             asked = acceptor.prepare("t", 1, ballot(2, "a"), TTL, 1.3 * IDLE_AGE)
             self.assertEqual((asked.kind, asked.token), (Kind.OUTBID, 5))
-
-    def test_silence_after_a_restart(self) -> None:
-        """Who may have forgotten grants nothing for the longest ttl, and says how long that is."""
-        acceptor = LeaseAcceptor(MemoryStore(), 10.0)
-        self.assertEqual(acceptor.prepare("t", 1, ballot(1, "a"), TTL, 11.0), Reply(Kind.QUIET, remaining=1.0))
-        self.assertEqual(acceptor.lease("t", 1, ballot(1, "a"), 1, TTL, 11.0).kind, Kind.QUIET)
-        self.assertEqual(acceptor.prepare("t", 1, ballot(1, "a"), TTL, 12.0).kind, Kind.GRANTED)

@@ -21,7 +21,7 @@ from middleware.consensus.lease.charter import (
     sign_end,
 )
 from middleware.entangled.errors import Refused
-from middleware.entangled.quorum.ballot import ROOM, Ballot, Ceiling, believed
+from middleware.entangled.quorum.ballot import Ballot, believed
 from tests.middleware.consensus.lease.room import RoomCase, T
 
 
@@ -119,15 +119,6 @@ class CharterTests(RoomCase):
 
 
 class NumberTests(RoomCase):
-    def test_ceiling(self) -> None:
-        """Numbers rise by so much at once and so much a second, counted from what was known."""
-        ceiling = Ceiling(10.0, 2**20)
-        self.assertTrue(ceiling.admits(10.0, ROOM * 2**20, ROOM))
-        self.assertFalse(ceiling.admits(10.0, 0, ROOM + 1))
-        self.assertFalse(ceiling.admits(10.0, (ROOM + 1) * 2**20))
-        self.assertTrue(ceiling.admits(11.0, 0, ROOM + 1024))
-        self.assertTrue(Ceiling(10.0, 2**20, token=2 * ROOM).admits(10.0, 0, 2 * ROOM))
-
     def test_believed(self) -> None:
         """Of the numbers that members tell one alone is believed only where it is low."""
         self.assertEqual(believed([5, 7, 3], 3), 7)

@@ -1,4 +1,4 @@
-"""Tests of ``agents.epoch`` and ``agents.circle``: rounds of a task, and what counts of what is heard."""
+"""Tests of ``agents.conference`` and ``agents.conference``: rounds of a task, and what counts of what is heard."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ from dataclasses import replace
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from agents.circle import LINGERING, Circle
-from agents.epoch import Epoch, is_older
+from agents.conference import LINGERING, Circle, Epoch
 from middleware.tasks.task import Member
 
 B = Member("b", "dog2", "WAITING", 2.0, "a", "d1", epoch=3, serial=1)
@@ -35,14 +34,6 @@ class EpochTests(SynchronousTestCase):
         self.assertEqual(epoch.decide((2,), "a", "d1", (B,)), 3)
         epoch.hear(5)
         self.assertEqual(epoch.decide((3,), "b", "d1", (replace(B, epoch=5),)), 6)
-
-    def test_older(self) -> None:
-        """A report is older by its round first, and then by its place in it; nothing is older than nothing."""
-        self.assertTrue(is_older(replace(B, epoch=2, serial=9), B))
-        self.assertTrue(is_older(replace(B, serial=0), B))
-        self.assertFalse(is_older(B, B))
-        self.assertFalse(is_older(replace(B, epoch=4, serial=0), B))
-        self.assertFalse(is_older(B, None))
 
 
 class CircleTests(SynchronousTestCase):
@@ -80,14 +71,6 @@ class CircleTests(SynchronousTestCase):
         self.assertEqual(self.costs(circle, 12.1), {"b": None})
         circle.hear([replace(bid, serial=2)], 12.2)
         self.assertEqual(self.costs(circle, 12.3), {"b": 2.0})
-
-    def test_bids_that_are_none(self) -> None:
-        """NaN, infinite, negative and enormous bids are left out; their owners stay present."""
-        circle = Circle("a")
-        for cost in (float("nan"), float("inf"), -1.0, 1e300):
-            circle.hear([replace(B, cost=cost)], 0.0)
-            self.assertEqual(self.costs(circle, 0.0), {"b": None})
-            circle = Circle("a")
 
     def test_own_report_comes_back(self) -> None:
         """The own report is kept apart: of an older life, it says where the others' counting stands."""

@@ -1,10 +1,10 @@
-"""Tests of ``middleware.consensus.lease.vacancy``."""
+"""Tests of ``middleware.tasks.councils``."""
 
 from __future__ import annotations
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.consensus.lease.vacancy import filled
+from middleware.tasks.councils import filled
 from tests.middleware.consensus.lease.test_lease_codec import MEMBERS
 
 
