@@ -4,11 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import io
+import os
 import random
+import shutil
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.entangled.control.place import made
 from middleware.entangled.control.verb import Verbs
 from middleware.node import SwarmNode
 from swarmnode.rehearsal import VirtualTeam
@@ -16,6 +22,18 @@ from swarmnode.team.verb import TeamVerbs
 
 Main = Callable[..., int]
 PATIENCE = 5.0
+
+
+def runtime_folder(case: SynchronousTestCase, node: str = "vaio") -> Path:
+    """A folder in which commands find the control socket of ``node``, until the test ends.
+
+    Trial's own folders are deeper than the path of a socket may be.
+    """
+    folder = Path(tempfile.mkdtemp())
+    case.addCleanup(shutil.rmtree, folder)
+    case.patch(os, "environ", {**os.environ, "XDG_RUNTIME_DIR": str(folder)})
+    made(node).touch()
+    return folder
 
 
 class Shell:

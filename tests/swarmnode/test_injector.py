@@ -129,24 +129,6 @@ class TransitionTests(SynchronousTestCase):
         self.assertEqual({there for (source, _), there in TRANSITIONS.items() if source is State.OVER}, {State.OVER})
 
 
-class FrozenNodeTests(SynchronousTestCase):
-    def test_frozen_node_is_missed_and_comes_back(self) -> None:
-        """A dog whose node stands still is gone from the page within its presence lease, and back after the thaw."""
-        team = VirtualTeam(3, camera_fps=0.1)
-        self.addCleanup(team.stop)
-
-        def here() -> list[str]:
-            return [device["name"] for device in team.state()["devices"] if device["gone"] is None]
-
-        self.assertEqual(here(), ["vaio", "dog1", "dog2", "dog3"])
-        team.freeze("dog2")
-        team.clock.advance(4.0)
-        self.assertEqual(here(), ["vaio", "dog1", "dog3"])
-        team.thaw("dog2")
-        team.clock.advance(4.0)
-        self.assertEqual(here(), ["vaio", "dog1", "dog2", "dog3"])
-
-
 class ForbiddenTests(SynchronousTestCase):
     def test_nothing_where_not_allowed(self) -> None:
         """A node whose settings do not allow faults has no such method, and its network is its own."""
