@@ -53,7 +53,6 @@ class Newcomer:
         self._public = Identity(seed).public
         self._network = network
         self._clock = clock
-        self._rng = rng
         self._ephemeral = rng.randbytes(32)
         shared = bindings.crypto_scalarmult_base(self._ephemeral)
         self._knock = knock.knock(self._key, self._public, shared, wish, rng)

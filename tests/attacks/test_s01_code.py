@@ -8,13 +8,13 @@ import pickle
 import random
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
-from twisted.logger import formatEvent, globalLogPublisher
+from twisted.logger import formatEvent
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.record import hashed_key
 from middleware.entangled.wire.message import Answer, Question, Told, decoded, encoded
+from tests.attacks.siege import events_of
 from tests.fleet import FleetCase
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -196,14 +196,7 @@ class ContentTests(FleetCase):
         """Nothing has fired; what is logged is kept."""
         super().setUp()
         FIRED.clear()
-        self.logged: list[str] = []
-        observer: Any = self.note
-        globalLogPublisher.addObserver(observer)
-        self.addCleanup(globalLogPublisher.removeObserver, observer)
-
-    def note(self, event: dict[str, Any]) -> None:
-        """Keep what is logged, as people read it."""
-        self.logged.append(formatEvent(event))
+        self.events = events_of(self)
 
     def test_the_corpus_fires(self) -> None:
         """The corpus is no dud: read as what it is, it fires."""
@@ -245,7 +238,8 @@ class ContentTests(FleetCase):
             )
         self.assertEqual(heard, texts)
         self.assertEqual(FIRED, [])
-        self.assertFalse([line for line in self.logged if "<class" in line or "49" in line and "7*7" in line])
+        logged = [formatEvent(event) for event in self.events]
+        self.assertFalse([line for line in logged if "<class" in line or "49" in line and "7*7" in line])
 
     def test_any_bytes_as_methods(self) -> None:
         """A method that nobody exposed is refused by name, whatever it is called."""

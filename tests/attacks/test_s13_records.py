@@ -15,8 +15,8 @@ from middleware.entangled.space.tuplespace import TupleSpace
 from middleware.stop.halt import HALT, SLOT
 from middleware.stop.stop_set import Statement
 from middleware.tasks.task import TASKS
-from tests.attacks.siege import SOURCE, ClosedTeam, SiegeCase
-from tests.middleware.admission.village import House
+from tests.attacks.siege import SOURCE, SiegeCase
+from tests.middleware.admission.village import House, Village
 
 JUNK = 12_400
 PAGE = 60
@@ -35,7 +35,7 @@ class RecordCase(SiegeCase):
     def setUp(self) -> None:
         """Everybody knows everybody."""
         super().setUp()
-        self.team: ClosedTeam = self.siege()
+        self.team: Village = self.village()
         for name in ("dog1", "dog2", "dog3"):
             self.team.enlist(name, DEVICE)
         self.team.run(10.0)

@@ -16,13 +16,13 @@ from middleware.entangled.identity import Identity
 from middleware.entangled.record import Record, Slot
 from middleware.stop.halt import HALT, METHOD, NO_ROBOT, SLOT, STANDS, UNSAVED, Halt, answer_halt
 from middleware.stop.stop_set import ID_BYTES, MAX_NAMED, MAX_OF_SENDER, MAX_RELEASED, MAX_SENDERS
-from tests.attacks.siege import SOURCE, ClosedTeam, SiegeCase, Tape
-from tests.middleware.admission.village import House
+from tests.attacks.siege import SOURCE, SiegeCase
+from tests.middleware.admission.village import House, Tape, Village, network_of
 
 SEQUENCES, STEPS = 6, 25
 
 
-class HaltingTeam(ClosedTeam):
+class HaltingTeam(Village):
     """A closed team each of whose nodes answers ``device.halt``; ``halts`` are those of the present lives, by name."""
 
     def __init__(self, seed: int) -> None:
@@ -65,9 +65,7 @@ class StopCase(SiegeCase):
     def setUp(self) -> None:
         """All have learnt that nothing is stopped."""
         super().setUp()
-        self.team = HaltingTeam(1)
-        self.addCleanup(self.left, self.team)
-        self.addCleanup(self.team.stop)
+        self.team = self.kept(HaltingTeam(1))
         self.ann = self.team.houses[0]
         self.bob = self.team.enlist("bob", OPERATOR)
         self.dogs = [self.team.enlist(name, DEVICE) for name in ("dog1", "dog2")]
@@ -240,7 +238,7 @@ class ReplayTests(StopCase):
         first = self.stops(self.dogs[0])
         tape = Tape()
         for house in self.team.houses:
-            tape.tap(house.node._network)  # type: ignore[arg-type]
+            tape.tap(network_of(house))
         self.release(self.bob, first)
         old = [record for record in self.ann.node.store.get(HALT) if record.name == SLOT]
         self.assertEqual(set(self.team.is_on().values()), {False})

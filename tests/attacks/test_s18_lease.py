@@ -7,7 +7,6 @@ from typing import Any
 
 from twisted.internet.defer import Deferred
 
-from middleware.admission import roles
 from middleware.admission.team import Team
 from middleware.consensus.bidding.group import Group
 from middleware.consensus.lease.lease_codec import pack_members
@@ -20,15 +19,15 @@ from middleware.entangled.quorum.register import Kind, Reply
 from middleware.entangled.record import Record
 from middleware.node import SwarmNode
 from middleware.tasks.task import COMPLETED, RESULT, TASKS, Result, Task, group_key, tasks_of
-from tests.attacks.siege import SOURCE, ClosedTeam, SiegeCase
-from tests.middleware.admission.village import House
+from tests.attacks.siege import SOURCE, SiegeCase
+from tests.middleware.admission.village import House, Village
 
 TASK = Task("t1", "search", "Find it")
 HUGE = 2**62 - 2
 DEVICE_NAME = "dog1"
 
 
-class LeaseTeam(ClosedTeam):
+class LeaseTeam(Village):
     """A closed team of swarm nodes: a gateway and devices."""
 
     def __init__(self, seed: int = 1, bootstraps: int = 1) -> None:
@@ -41,7 +40,7 @@ class LeaseTeam(ClosedTeam):
     def open(self, house: House) -> None:
         """Begin a life of a swarm node."""
         place = house.place
-        house.team = Team(house.kept, self.store(place), self.wall, self.rng(place), roles)
+        house.team = Team(house.kept, self.store(place), self.wall, self.rng(place))
         name = house.team.door.me.name
         node = SwarmNode(
             Device("", name, capabilities={"camera": {"width": 208}}),
@@ -72,9 +71,7 @@ class LeaseCase(SiegeCase):
     def setUp(self) -> None:
         """Pin the council of a task."""
         super().setUp()
-        self.team = team = LeaseTeam()
-        self.addCleanup(self.left, team)
-        self.addCleanup(team.stop)
+        self.team = team = self.kept(LeaseTeam())
         self.task: Task = self.outcome(team, Deferred.fromCoroutine(team.nodes[0].submit(TASK)), 1.0)
         self.lessees: list[Lessee] = []
         self.bad, self.own = self.insider(team, "bad", "device")
