@@ -158,8 +158,6 @@ def _last(node: ast.AST) -> str:
 
 
 class TreeTests(SynchronousTestCase):
-    """What the tree does not have cannot be called."""
-
     def test_nothing_in_the_tree_runs_content(self) -> None:
         """No module of a node evaluates, unpickles, formats by or loads anything that it was sent."""
         found = [fault for module, tree in trees() for fault in faults_of(module, tree)]
@@ -190,10 +188,7 @@ class TreeTests(SynchronousTestCase):
 
 
 class ContentTests(FleetCase):
-    """What would run where anything reads it as code, sent as every kind of content."""
-
     def setUp(self) -> None:
-        """Nothing has fired; what is logged is kept."""
         super().setUp()
         FIRED.clear()
         self.events = events_of(self)

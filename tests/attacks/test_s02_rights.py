@@ -22,8 +22,6 @@ NAMES = ("order", "member", "result", "council", "done", "verdict/1", "source", 
 
 
 class MethodTests(SiegeCase):
-    """Every method, and every role."""
-
     def test_every_method_by_every_role(self) -> None:
         """What a role may not call does not run and is refused by its name; what it may is not refused for its role."""
         team = self.village()
@@ -64,8 +62,6 @@ class MethodTests(SiegeCase):
 
 
 class RecordTests(SiegeCase):
-    """Every kind of record, and every role."""
-
     def test_every_kind_by_every_role(self) -> None:
         """A record of a kind that its owner's role may not write is not held, and its writer is told why."""
         team = self.village()
@@ -86,8 +82,6 @@ class RecordTests(SiegeCase):
 
 
 class OwnerTests(SiegeCase):
-    """The records of others."""
-
     def setUp(self) -> None:
         """A team of three with a record of the first, and a member gone bad."""
         super().setUp()
@@ -174,8 +168,6 @@ class OwnerTests(SiegeCase):
 
 
 class CertificateTests(SiegeCase):
-    """Passes that do not hold."""
-
     def refused(self, number: int, shown: bytes, life: Identity, secret: bytes) -> str:
         """What a member with that pass is told, on both sides."""
         attacker = self.attacker(self.team, life, secret, shown, SOURCE._replace(port=700 + number))

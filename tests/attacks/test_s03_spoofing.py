@@ -105,8 +105,6 @@ class Spoofing(RuleBasedStateMachine):
 
 
 class SpoofingTests(SynchronousTestCase):
-    """Whoever knows no key."""
-
     def test_any_sequence(self) -> None:
         """No sequence of forged, bent, recorded and guessed datagrams changes what a node remembers."""
         run_state_machine_as_test(Spoofing, settings=SEQUENCES)
@@ -121,10 +119,7 @@ class SpoofingTests(SynchronousTestCase):
 
 
 class ElsewhereTests(SynchronousTestCase):
-    """Answers that come from elsewhere, or from the wrong one."""
-
     def setUp(self) -> None:
-        """A node with a session to another one."""
         self.ground = Ground()
         self.addCleanup(self.ground.stop)
         self.counters = self.ground.target.counters

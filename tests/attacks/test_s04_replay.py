@@ -119,8 +119,6 @@ class ReplayCase(SiegeCase):
 
 
 class ReplayTests(ReplayCase):
-    """The tape, whole."""
-
     def test_the_tape_is_rich(self) -> None:
         """The recording has each kind of datagram that a team sends, and many of them."""
         kinds = {datagram[0] for _, datagram, _ in self.tape.heard}

@@ -31,7 +31,6 @@ class CourierCase(SynchronousTestCase):
     """A courier, and members by their keys."""
 
     def setUp(self) -> None:
-        """A courier that delivers to a list."""
         self.clock = HeapClock()
         self.counters: Counter[str] = Counter()
         self.delivered: list[tuple[bytes, int]] = []
@@ -64,8 +63,6 @@ class CourierCase(SynchronousTestCase):
 
 
 class FragmentTests(CourierCase):
-    """What one or many may pile up."""
-
     def test_never_completed(self) -> None:
         """One member has at most its own share in assembly, and after ten seconds nothing any more."""
         for number in range(2000):
@@ -145,8 +142,6 @@ class FragmentTests(CourierCase):
 
 
 class EndToEndTests(SynchronousTestCase):
-    """A member that sends parts by hand, and a node that goes on working."""
-
     def test_a_transfer_beside(self) -> None:
         """While a member fills its share with parcels that never end, another message of 64 KiB of its own passes."""
         ground = Ground()

@@ -90,8 +90,6 @@ class FloodCase(SiegeCase):
 
 
 class FloodTests(FloodCase):
-    """What each flood costs."""
-
     def test_forged_handshakes(self) -> None:
         """INITs of a good form and a wrong mac cost a hash each: no keys are exchanged, nothing is sent or kept."""
         dice = random.Random(1)

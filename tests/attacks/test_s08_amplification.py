@@ -30,8 +30,6 @@ VICTIM = Address("10.7.7.7", 77)
 
 
 class AmplificationTests(SiegeCase):
-    """What comes back to an address that has not proved itself."""
-
     def setUp(self) -> None:
         """A team of eight, so that answers are long, and a count of what one of them sends to whom."""
         super().setUp()
@@ -112,8 +110,6 @@ class AmplificationTests(SiegeCase):
 
 
 class IntroductionTests(SiegeCase):
-    """A member that has others knock where it likes."""
-
     def test_knocks_at_a_victim(self) -> None:
         """However many introductions a member makes, a node writes no more to an address that it names than a share."""
         team = self.village()
@@ -146,8 +142,6 @@ class IntroductionTests(SiegeCase):
 
 
 class RelayTests(SiegeCase):
-    """Those who carry for others."""
-
     def test_a_stranger_is_not_carried_for(self) -> None:
         """Only in a session anything is carried: the same bytes in the open are dropped."""
         team = self.village()

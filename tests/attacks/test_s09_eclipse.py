@@ -30,8 +30,6 @@ def sybils(count: int, seed: int = 1) -> list[Contact]:
 
 
 class OutsiderTests(SiegeCase):
-    """Those without a certificate, of whom there may be any number."""
-
     def everybody(self, team: Village) -> set[bytes]:
         """The keys that anybody in the team takes for a member's."""
         nodes = [house.node for house in team.houses]
@@ -78,8 +76,6 @@ class OutsiderTests(SiegeCase):
 
 
 class TableTests(SynchronousTestCase):
-    """The routing table alone."""
-
     def test_flushed_by_ever_new_ids(self) -> None:
         """Ten thousand newcomers displace nobody who keeps answering."""
         old, [me] = sybils(40, 3), sybils(1, 2)
@@ -103,8 +99,6 @@ class TableTests(SynchronousTestCase):
 
 
 class InsiderTests(FleetCase):
-    """Members that lie, ten to thirty of a hundred."""
-
     def lied(self, fleet: Fleet, share: float) -> list[int]:
         """Let some members name only each other, hold nothing back and find nothing; gives the honest places."""
         dice = random.Random(4)

@@ -18,7 +18,6 @@ class RevocationCase(SiegeCase):
     members = 9
 
     def setUp(self) -> None:
-        """Everybody knows everybody."""
         super().setUp()
         self.team: Village = self.village(bootstraps=2)
         for number in range(2, self.members):
@@ -53,8 +52,6 @@ class RevocationCase(SiegeCase):
 
 
 class TwentyTests(RevocationCase):
-    """A team of twenty."""
-
     members = 20
 
     def test_out_within_ten_seconds(self) -> None:
@@ -80,8 +77,6 @@ class TwentyTests(RevocationCase):
 
 
 class RevocationTests(RevocationCase):
-    """A smaller team."""
-
     def test_across_a_restart(self) -> None:
         """Nodes that were restarted since still refuse it, with nobody there to ask."""
         self.revoke()

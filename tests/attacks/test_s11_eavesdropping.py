@@ -30,8 +30,6 @@ def found(stream: Iterable[bytes], needles: Iterable[bytes]) -> list[bytes]:
 
 
 class EavesdroppingTests(SiegeCase):
-    """An ear on every wire, from the first datagram on."""
-
     def setUp(self) -> None:
         """Joining by code, writing, reading, watching, calling, leaving, all of it on tape."""
         super().setUp()

@@ -23,8 +23,6 @@ from tests.middleware.admission.paper import operator as drawn
 
 
 class FileTests(SiegeCase):
-    """The files."""
-
     def setUp(self) -> None:
         """A membership and an operator's key, each in its file."""
         super().setUp()
@@ -82,8 +80,6 @@ class FileTests(SiegeCase):
 
 
 class SaidTests(SiegeCase):
-    """What is logged, shown and told."""
-
     def setUp(self) -> None:
         """Everything that is logged is kept, with its fields."""
         super().setUp()

@@ -20,8 +20,6 @@ BOOT = identity("boot")
 
 
 class BackdatingTests(SiegeCase):
-    """A revoked bootstrap node and a used code."""
-
     def setUp(self) -> None:
         """Make a team with a bootstrap node that was revoked, and one member that this node let in before."""
         super().setUp()
@@ -78,8 +76,6 @@ class BackdatingTests(SiegeCase):
 
 
 class RoomTests(SiegeCase):
-    """The membership list, filled by those who may sign admissions."""
-
     def test_room_for_the_operator(self) -> None:
         """A list that a bootstrap node filled takes the operator's revocation, which makes room again."""
         signer = operator(1)
@@ -105,8 +101,6 @@ class RoomTests(SiegeCase):
 
 
 class UnlistedTests(SiegeCase):
-    """A member whose grant nobody was told of."""
-
     def test_who_is_met_is_listed(self) -> None:
         """A member that shows a grant which it kept to itself is on every list after its first session."""
         team = self.village()
@@ -132,8 +126,6 @@ class UnlistedTests(SiegeCase):
 
 
 class GuestTests(SiegeCase):
-    """A gateway that vouches for a crowd."""
-
     def test_guests_of_one_gateway_are_few(self) -> None:
         """A node lets in so many guests of one gateway at a time, and refuses the others by name."""
         team = self.village()

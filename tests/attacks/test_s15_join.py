@@ -39,7 +39,6 @@ class JoinTests(SiegeCase):
     """A team with a code that is open, and a hostile member that knows all that a member knows."""
 
     def setUp(self) -> None:
-        """Make the team, the code, and the member."""
         super().setUp()
         self.team: Village = self.village()
         self.code: Code = read(self.team.invite("dog"))
@@ -172,8 +171,6 @@ class JoinTests(SiegeCase):
 
 
 class SettingsTests(SynchronousTestCase):
-    """The settings that a newcomer gets."""
-
     @settings(max_examples=100, deadline=None, derandomize=True, database=None)
     @given(LINE, LINE)
     def test_no_text_becomes_structure(self, kind: str, membership: str) -> None:

@@ -63,7 +63,6 @@ class StopCase(SiegeCase):
     """A team of an operator ``ann``, a second operator ``bob`` and two robots."""
 
     def setUp(self) -> None:
-        """All have learnt that nothing is stopped."""
         super().setUp()
         self.team = self.kept(HaltingTeam(1))
         self.ann = self.team.houses[0]
@@ -111,8 +110,6 @@ class StopCase(SiegeCase):
 
 
 class DisablingTests(StopCase):
-    """What could make a later stop impossible."""
-
     def test_no_number_disables_a_stop(self) -> None:
         """An operator's key that sends the greatest numbers, in calls and records, prevents no later stop."""
         bare, own = self.insider(self.team, "thief", OPERATOR)
@@ -163,8 +160,6 @@ class DisablingTests(StopCase):
 
 
 class RightsTests(StopCase):
-    """Who may stop, and who may release."""
-
     def test_only_who_may_order(self) -> None:
         """By call and by record, no role but operator and gateway stops the team or releases a stop."""
         self.stop(self.ann)
@@ -230,8 +225,6 @@ class RightsTests(StopCase):
 
 
 class ReplayTests(StopCase):
-    """What was true once."""
-
     def test_a_replayed_release_ends_no_later_stop(self) -> None:
         """Every datagram of a release is played again after the next stop, and the released record is stored again."""
         self.stop(self.ann)
@@ -267,8 +260,6 @@ class ReplayTests(StopCase):
 
 
 class LossTests(StopCase):
-    """A stop that was acknowledged is in force until its release."""
-
     def test_a_restart_of_all_releases_nothing(self) -> None:
         """All nodes end at once without a word and come back: all stand at once, before they have asked anybody."""
         self.assertEqual(self.stop(self.ann)["dog1"], STANDS)
@@ -351,8 +342,6 @@ class LossTests(StopCase):
 
 
 class SequenceTests(StopCase):
-    """Random sequences over whole nodes."""
-
     def test_stop_holds_on_whole_nodes(self) -> None:
         """Stops, releases, partitions, restarts, a viewer's messages: a stop is kept until a release names it."""
         bare, own = self.insider(self.team, "eye", VIEWER)

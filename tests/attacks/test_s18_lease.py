@@ -69,7 +69,6 @@ class LeaseCase(SiegeCase):
     """A team with a task, and a member with the role of a device that obeys no rule."""
 
     def setUp(self) -> None:
-        """Pin the council of a task."""
         super().setUp()
         self.team = team = self.kept(LeaseTeam())
         self.task: Task = self.outcome(team, Deferred.fromCoroutine(team.nodes[0].submit(TASK)), 1.0)
@@ -120,8 +119,6 @@ class LeaseCase(SiegeCase):
 
 
 class ReconfigurationTests(LeaseCase):
-    """A council that nobody elected."""
-
     def test_forged_council(self) -> None:
         """A council that one device invents is installed nowhere, and no second node wins the lease through it."""
         holder = self.held_by(self.members()[0])
@@ -178,8 +175,6 @@ class ReconfigurationTests(LeaseCase):
 
 
 class ClosingTests(LeaseCase):
-    """The end of a task that another device holds."""
-
     def test_device_closes(self) -> None:
         """A device that holds nothing ends no task: not as an operator, not under the token, not under a higher one."""
         holder = self.held_by(self.members()[0])
@@ -214,8 +209,6 @@ class ClosingTests(LeaseCase):
 
 
 class NumberTests(LeaseCase):
-    """Numbers after which there are no higher ones."""
-
     def test_highest_ballot(self) -> None:
         """After a device has asked under the highest ballots there are, others still win."""
         for counter in (HUGE, HUGE - 1, 2**61, 2**52, 2**40):
@@ -257,8 +250,6 @@ class NumberTests(LeaseCase):
 
 
 class TaskTests(LeaseCase):
-    """Records of tasks that a device may not write."""
-
     def record(self, key: bytes, name: str, value: bytes, owner: Identity | None = None) -> Record:
         """A team record of the device."""
         own = owner or self.own
@@ -300,8 +291,6 @@ class TaskTests(LeaseCase):
 
 
 class NameTests(LeaseCase):
-    """The name of another device."""
-
     def test_name_of_another(self) -> None:
         """A device that announces itself under another's name, in the slot or in the value, is not shown under it."""
         device = Device(self.own.node_id.hex(), DEVICE_NAME, capabilities={"camera": {"width": 208}}, joined=9)

@@ -178,10 +178,7 @@ class RecordedQuestionTests(SiegeCase):
 
 
 class TimestampTests(SiegeCase):
-    """A recorded INIT, sent again when its RESP is not remembered any more."""
-
     def setUp(self) -> None:
-        """Record what comes to the first node."""
         super().setUp()
         self.team = self.village()
         self.house = self.team.houses[0]
@@ -244,8 +241,6 @@ class TimestampTests(SiegeCase):
 
 
 class RoundTripTests(EndpointCase):
-    """What it costs that a change waits for the session."""
-
     def asked(self, method: str, *arguments: object, changes: bool) -> float:
         """The round trips that the first question to a peer takes."""
         identity = Identity(self.rng.randbytes(32))
@@ -292,8 +287,6 @@ class RoundTripTests(EndpointCase):
 
 
 class KeyLifeTests(SiegeCase):
-    """A member whose keys are stolen from memory."""
-
     def test_keys_are_replaced(self) -> None:
         """Sessions in use have new keys every two minutes, and no node holds keys that are older than three."""
         team = self.village()

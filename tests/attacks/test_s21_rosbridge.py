@@ -61,8 +61,6 @@ DEEP = {
 
 
 class MessageTests(SynchronousTestCase):
-    """What one message costs."""
-
     def peak(self, data: bytes) -> tuple[bool, int]:
         """Whether a message is taken, and the most memory that this needed."""
         tracemalloc.start()
@@ -127,8 +125,6 @@ class MessageTests(SynchronousTestCase):
 
 
 class FloodTests(SynchronousTestCase):
-    """A driver of a robot whose rosbridge sends what it likes."""
-
     def setUp(self) -> None:
         """Connect a driver to an emulated robot, and count the frames that are made."""
         self.clock = Clock()

@@ -45,7 +45,6 @@ class PushedCodeTests(SynchronousTestCase):
     """A closed team: the laptop is its first node, ``author`` pushes, and the dog lists the author's key."""
 
     def setUp(self) -> None:
-        """The team runs; nothing was pushed."""
         self.folder = runtime_folder(self, "author")
         self.addCleanup(sys.modules.pop, CANARY, None)
         self.team = VirtualTeam(11, dogs=())

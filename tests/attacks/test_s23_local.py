@@ -26,7 +26,6 @@ class ControlSocketTests(SynchronousTestCase):
     """Another user made the folder, or the socket, before the node did."""
 
     def setUp(self) -> None:
-        """A folder for sockets."""
         # Trial's own folders are deeper than the path of a socket may be.
         self.runtime = Path(tempfile.mkdtemp())
         self.addCleanup(shutil.rmtree, self.runtime)
@@ -129,10 +128,7 @@ class ControlSocketTests(SynchronousTestCase):
 
 
 class TeamKeyTests(SynchronousTestCase):
-    """The secret of an open team, which the list of processes must not show."""
-
     def setUp(self) -> None:
-        """A file that holds it."""
         self.path = Path(self.mktemp())
         self.path.touch(mode=0o600)
         self.path.write_text(f"{SECRET}\n", encoding="utf-8")

@@ -25,7 +25,6 @@ class RenewalCase(SiegeCase):
     """A team with two bootstrap nodes, of which the second one is hostile, and a plain member that judges."""
 
     def setUp(self) -> None:
-        """Make the team."""
         super().setUp()
         self.port = 700
         self.team = self.village(bootstraps=2)
@@ -86,8 +85,6 @@ class RenewalCase(SiegeCase):
 
 
 class RevokedBootstrapTests(RenewalCase):
-    """Renewals of a bootstrap node that was revoked."""
-
     def test_backdated(self) -> None:
         """Of a revoked bootstrap node's renewals those count that the operator kept, whatever dates others bear."""
         old = self.word()
@@ -149,8 +146,6 @@ class RevokedBootstrapTests(RenewalCase):
 
 
 class SelfRenewalTests(RenewalCase):
-    """Members that renew themselves."""
-
     def test_a_plain_member(self) -> None:
         """A renewal that a member without the role bootstrap signs, for itself or for another, is none."""
         old = self.word(("device", "operator", "gateway"))
@@ -188,8 +183,6 @@ class SelfRenewalTests(RenewalCase):
 
 
 class WideningTests(RenewalCase):
-    """Renewals that would change more than the end."""
-
     def test_roles_that_were_taken_away(self) -> None:
         """A renewal of an earlier grant does not bring back roles that the operator took away since."""
         old = self.word(("device", "operator"))
@@ -294,8 +287,6 @@ class WideningTests(RenewalCase):
 
 
 class RevivalTests(RenewalCase):
-    """Keys that the operator meant to be out."""
-
     def test_revoked_member(self) -> None:
         """A revoked member stays out, whoever renews it, before or after its revocation, and no node offers to."""
         dog = self.team.enlist("dog")

@@ -344,8 +344,6 @@ class AdmissionTests(SynchronousTestCase):
 
 
 class TeamSettingsTests(SynchronousTestCase):
-    """Which team a node belongs to."""
-
     def refusal(self, **node: str) -> str:
         """Why a node is not made."""
         settings = Settings.from_mapping({"node": {"name": "a", **node}}, "a.toml")

@@ -28,8 +28,6 @@ DOG = identity("dog")
 
 
 class CertificateTests(SynchronousTestCase):
-    """What a member shows, and what is believed."""
-
     def test_granted_by_the_operator(self) -> None:
         """A grant of the operator makes a member, of the key that it names and no other."""
         shown = pass_of(granted(OPERATOR, "dog", "device", "gateway"))

@@ -54,8 +54,6 @@ def knocked(wish: str = "dog") -> bytes:
 
 
 class KnockTests(SynchronousTestCase):
-    """Both datagrams."""
-
     def test_knock_is_read_as_it_was_said(self) -> None:
         """A bootstrap node that knows the invitation reads the newcomer's key, wish and proof."""
         said = knocked()

@@ -16,8 +16,6 @@ from tests.middleware.admission.paper import NOW, operator
 
 
 class MembershipTests(SynchronousTestCase):
-    """What lies on a member's disk, and on the operator's."""
-
     def setUp(self) -> None:
         self.path = Path(self.mktemp())
         self.membership = operator().founded("vaio", ("device", "bootstrap"), NOW, random.Random(1))

@@ -10,8 +10,6 @@ from tests.middleware.admission.village import House, VillageCase
 
 
 class RebuffTests(VillageCase):
-    """What ``rebuffs`` has after refusals."""
-
     def met(self, house: House, side: str) -> list[Rebuff]:
         """The refusals that a house met on one side."""
         now = house.node.endpoint.rebuffs.newest(1e9, 1e10)

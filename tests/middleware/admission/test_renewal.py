@@ -42,8 +42,6 @@ class YearsCase(VillageCase):
 
 
 class YearAndAHalfTests(YearsCase):
-    """A team of five for a year and a half."""
-
     def test_nobody_attends(self) -> None:
         """All five renew, one that sleeps for 60 days is back in place, and one that was revoked stays out."""
         years = self.years()
@@ -88,8 +86,6 @@ class YearAndAHalfTests(YearsCase):
 
 
 class LargeTeamTests(YearsCase):
-    """A team in which a bootstrap node does not see everybody."""
-
     def test_not_in_sight(self) -> None:
         """A member that is no contact of the bootstrap node is looked up in a large team, and has to answer."""
         years = self.years(bootstraps=1)
@@ -108,8 +104,6 @@ class LargeTeamTests(YearsCase):
 
 
 class BatchTests(YearsCase):
-    """Many members of one day."""
-
     def test_a_few_at_once(self) -> None:
         """A bootstrap node signs a few renewals at a time, and goes on until all are renewed."""
         years = self.years(bootstraps=1)
@@ -128,8 +122,6 @@ class BatchTests(YearsCase):
 
 
 class SleeperTests(YearsCase):
-    """A member that sleeps beyond its end."""
-
     def slept(self, years: Years, house: House) -> None:
         """Have a house asleep from before its renewal until after its end."""
         years.live(230)

@@ -78,8 +78,6 @@ def slot(key: bytes, name: str = "x") -> Slot:
 
 
 class TableTests(SynchronousTestCase):
-    """What is in the table."""
-
     def exposed(self) -> set[str]:
         """The methods of a real node that has a robot, an agent, and allows all that can be allowed."""
         tables: dict[str, Any] = {
@@ -180,8 +178,6 @@ class TableTests(SynchronousTestCase):
 
 
 class TeamTests(SynchronousTestCase):
-    """A team that lives by the table."""
-
     def test_the_experiments_by_roles(self) -> None:
         """With a gateway, dogs as devices and somebody who looks on, both experiments pass, and nobody is refused."""
         plain: Any = SwarmNode

@@ -31,8 +31,6 @@ ENTRIES = entries()
 
 
 class RollTests(SynchronousTestCase):
-    """What a node knows of its team."""
-
     def test_foreign_statements_are_refused(self) -> None:
         """What another team's operator signed, or nobody, never enters."""
         mine = Roll(OPERATOR.public)

@@ -12,8 +12,6 @@ from tests.middleware.admission.village import VillageCase
 
 
 class JoiningTests(VillageCase):
-    """By a code into a team."""
-
     def test_join_by_code(self) -> None:
         """A newcomer with a code gets certificate, secret and contacts, and is then a member that others talk to."""
         village = self.village()
@@ -131,8 +129,6 @@ class JoiningTests(VillageCase):
 
 
 class RevocationTests(VillageCase):
-    """Out of a team again."""
-
     def test_revoked_invitation(self) -> None:
         """With an invitation all that came by it go, and the code opens no more."""
         village = self.village()
@@ -150,8 +146,6 @@ class RevocationTests(VillageCase):
 
 
 class RotationTests(VillageCase):
-    """A new secret for those that stay."""
-
     def test_rotation(self) -> None:
         """After a rotation all members go by the new secret, sessions and new ones work, and newcomers get it."""
         village = self.village()
@@ -197,8 +191,6 @@ class RotationTests(VillageCase):
 
 
 class StrangersTests(VillageCase):
-    """Who looks like a member and is none."""
-
     def test_certificate_of_another_team(self) -> None:
         """Who knows the secret and shows a pass of another operator is refused as foreign, and both say so once."""
         village = self.village()

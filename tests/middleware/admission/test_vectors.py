@@ -75,8 +75,6 @@ def made() -> dict[str, str]:
 
 
 class VectorTests(SynchronousTestCase):
-    """What is written down is what is made."""
-
     def test_made_again(self) -> None:
         """Code, statements, passes and both datagrams are made again byte for byte."""
         self.assertEqual(made(), json.loads(VECTORS.read_text(encoding="utf-8")))

@@ -317,8 +317,6 @@ class DirectoryTests(FleetCase):
 
 
 class TeamTests(FleetCase):
-    """Real nodes; ``python -m benchmarks.directory --team 100`` has more than are known whole."""
-
     def names(self, fleet: SwarmFleet, place: int) -> list[str]:
         """The names of all whom one node lists."""
         listing = self.done(fleet, fleet.nodes[place].list_devices(), 1.0)
