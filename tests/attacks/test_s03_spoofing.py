@@ -31,7 +31,6 @@ def member(ground: Ground) -> Contact:
 
 
 def sealed(ground: Ground, plain: bytes) -> bytes:
-    """A datagram of that member."""
     return next(iter(ground.other._sessions.values())).seal(plain)
 
 
@@ -50,7 +49,6 @@ class Spoofing(RuleBasedStateMachine):
         self.before = self.ground.state()
 
     def teardown(self) -> None:
-        """Leave nothing."""
         if hasattr(self, "ground"):
             self.ground.stop()
 
@@ -61,12 +59,10 @@ class Spoofing(RuleBasedStateMachine):
 
     @rule(kind=st.sampled_from(KINDS), size=st.integers(0, 1460), source=st.sampled_from(PLACES))
     def anything(self, kind: int, size: int, source: Address) -> None:
-        """Random bytes of a kind."""
         self.fire(bytes([kind]) + self.dice.randbytes(size), source)
 
     @rule(index=st.integers(0, 39), source=st.sampled_from(PLACES))
     def recorded(self, index: int, source: Address) -> None:
-        """What came before, from anywhere."""
         self.fire(self.ground.recorded[index % len(self.ground.recorded)], source)
 
     @rule(index=st.integers(0, 39), bit=st.integers(0, 11199), source=st.sampled_from(PLACES))

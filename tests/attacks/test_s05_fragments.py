@@ -47,7 +47,6 @@ class CourierCase(SynchronousTestCase):
         self.addCleanup(self.courier.stop)
 
     def take(self, member: int, plain: bytes) -> None:
-        """Let a part of a member come in."""
         session: Any = OneSession(member.to_bytes(32, "little"))
         self.courier.on_part(session, plain)
 

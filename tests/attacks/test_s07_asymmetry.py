@@ -69,7 +69,6 @@ class FloodCase(SiegeCase):
 
     @property
     def lines(self) -> list[str]:
-        """What was logged for people."""
         return [str(each.get("log_format")) for each in self.events if each["log_level"] >= LogLevel.info]
 
     def flood(self, made: Callable[[int], bytes], seconds: int = SECONDS) -> int:

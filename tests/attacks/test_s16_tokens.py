@@ -84,15 +84,12 @@ class PageCase(SynchronousTestCase):
         return Web(signed, followed, node, ground)
 
     def now(self) -> float:
-        """The wall clock of all."""
         return self.team.clock.seconds()
 
     def run_for(self, seconds: float) -> None:
-        """Let time pass."""
         self.team.clock.advance(seconds)
 
     def signed(self, web: Web, proof: str = CODE, source: str = HOME) -> Token:
-        """A session at a web node."""
         return self.successResultOf(web.sessions.sign_in(proof, source, self.now()))
 
     def refused(self, web: Web, proof: str, source: str = HOME, later: float = 0.0) -> int:
@@ -117,7 +114,6 @@ class PageCase(SynchronousTestCase):
         self.run_for(IN_FORCE)
 
     def revoke(self, name: str) -> None:
-        """The operator revokes a member."""
         web = self.webs[name]
         self.tell(self.team.operator.revoke(web.node.entangled.identity.public, name, self.now()))
 
@@ -156,7 +152,6 @@ def old_token(secret: bytes, until: int, limit: int) -> str:
 
 class MintTests(PageCase):
     def claim(self, seconds: float = 365 * 86_400.0) -> Claim:
-        """An operator, for a year."""
         end = int(self.now() + seconds)
         return Claim("ab" * 8, "eve", "operator", end, limit=end)
 

@@ -46,11 +46,9 @@ class HaltingTeam(Village):
         node._chores.every(0.5, halt.refresh)
 
     def halt(self, house: House) -> Halt:
-        """What a node knows of the stops."""
         return self.halts[house.name]
 
     def is_on(self) -> dict[str, bool]:
-        """Which nodes stand."""
         return {name: halt.is_on for name, halt in self.halts.items()}
 
     def reopen(self, house: House) -> None:
@@ -76,21 +74,17 @@ class StopCase(SiegeCase):
         return self.said(self.team.halt(house).stop(house.name, self.contacts(others)))
 
     def release(self, house: House, stops: Sequence[bytes], others: Sequence[House] | None = None) -> dict[str, str]:
-        """An operator releases these stops."""
         return self.said(self.team.halt(house).release(stops, house.name, self.contacts(others)))
 
     def contacts(self, houses: Sequence[House] | None) -> list[Any]:
-        """How to ask these, or all."""
         return [self.team.contact(house) for house in (self.team.houses if houses is None else houses)]
 
     def said(self, asked: Deferred[dict[str, str]]) -> dict[str, str]:
-        """What each says, by name."""
         told = self.outcome(self.team, asked)
         names = {house.node.identity.node_id.hex(): house.name for house in self.team.houses}
         return {names[uuid]: words for uuid, words in told.items()}
 
     def stops(self, house: House) -> list[bytes]:
-        """The stops that a node obeys."""
         return list(self.team.halt(house).stops)
 
     def ask(self, bare: Any, house: House, *arguments: object) -> Any:
@@ -98,7 +92,6 @@ class StopCase(SiegeCase):
         return self.outcome(self.team, bare.ask(self.team.contact(house), METHOD, *arguments, changes=True), 0.2)
 
     def record(self, own: Identity, fields: object, sequence: int = 1) -> Record:
-        """A record of a stop or release."""
         return Record(HALT, SLOT, own.public, sequence, "team", 600.0, msgpack.packb(fields)).signed(own)
 
     def store(self, bare: Any, record: Record) -> None:

@@ -38,7 +38,6 @@ class LeaseTeam(Village):
         self.run(TASK.lease_ttl)
 
     def open(self, house: House) -> None:
-        """Begin a life of a swarm node."""
         place = house.place
         house.team = Team(house.kept, self.store(place), self.wall, self.rng(place))
         name = house.team.door.me.name
@@ -61,7 +60,6 @@ class LeaseTeam(Village):
         node.startService()
 
     def close(self, house: House, is_sudden: bool = False) -> None:
-        """End a life of a swarm node."""
         self.nodes[house.place].stopService()
 
 
@@ -105,7 +103,6 @@ class LeaseCase(SiegeCase):
         return found
 
     def store(self, *records: Record) -> list[Any]:
-        """Bring records to every node."""
         return self.attack("store", [record.packed() for record in records])
 
     def members(self) -> list[int]:
@@ -114,7 +111,6 @@ class LeaseCase(SiegeCase):
         return [known.index(member.public) for member in self.task.council]
 
     def outsiders(self) -> list[int]:
-        """The places of the others."""
         return [place for place in range(len(self.team.houses)) if place not in self.members()]
 
 
@@ -251,7 +247,6 @@ class NumberTests(LeaseCase):
 
 class TaskTests(LeaseCase):
     def record(self, key: bytes, name: str, value: bytes, owner: Identity | None = None) -> Record:
-        """A team record of the device."""
         own = owner or self.own
         return Record(key, name, own.public, 2**40, "team", 600.0, value).signed(own)
 
@@ -312,7 +307,6 @@ class NameTests(LeaseCase):
         self.assertEqual(twins, sorted(f"dog2-{node.uuid[:6]}" for node in self.twins()))
 
     def twins(self) -> list[SwarmNode]:
-        """The nodes of that name."""
         return [node for node in self.team.nodes if node.presence.device.name == "dog2"]
 
     def names(self, records: list[Record]) -> list[str]:

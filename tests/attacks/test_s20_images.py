@@ -194,8 +194,6 @@ class PooledClock(Clock):
         return self
 
     def callInThreadWithCallback(self, done: Callable[[bool, object], None], function: Callable[[], object]) -> None:  # noqa: N802 (Twisted's)
-        """Keep it."""
-
         def job() -> None:
             try:
                 result = function()

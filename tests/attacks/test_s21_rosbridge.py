@@ -155,13 +155,11 @@ class FloodTests(SynchronousTestCase):
         self.addCleanup(self.end)
 
     def end(self) -> None:
-        """Leave nothing on the clock."""
         self.driver.disconnect()
         self.robot.stop()
         self.pass_time(0.1)
 
     def pass_time(self, seconds: float) -> None:
-        """Turn the clock."""
         self.clock.pump([0.005] * round(seconds / 0.005))
 
     @property

@@ -95,12 +95,10 @@ class PushedCodeTests(SynchronousTestCase):
         self.team_told(self.team.services["vaio"].assembly.node.submit(task))
 
     def pose(self) -> tuple[float, ...]:
-        """Where the dog is."""
         (robot,) = [each for each in self.team.truth()["dogs"] if each["name"] == "dog1"]
         return tuple(round(robot[key], 4) for key in ("x", "y", "heading"))
 
     def team_told(self, work: object) -> object:
-        """The kind of a statement."""
         done = Deferred.fromCoroutine(work)  # type: ignore[arg-type,var-annotated]
         self.team.clock.advance(1.0)
         return self.successResultOf(done)

@@ -37,7 +37,6 @@ class ControlSocketTests(SynchronousTestCase):
         self.patch(os, "getuid", lambda: self.me + 1)
 
     def listening(self, name: str) -> Path:
-        """A socket with a listener."""
         path = folder() / f"{name}.control"
         server = socket.socket(socket.AF_UNIX)
         self.addCleanup(server.close)
@@ -119,7 +118,6 @@ class ControlSocketTests(SynchronousTestCase):
                 self.user = user
 
             def getsockopt(self, level: int, option: int, size: int) -> bytes:
-                """Its process, user and group."""
                 return struct.pack("3i", 1, self.user, 1)
 
         check_peer(Connection(0), path)  # type: ignore[arg-type]
@@ -134,7 +132,6 @@ class TeamKeyTests(SynchronousTestCase):
         self.path.write_text(f"{SECRET}\n", encoding="utf-8")
 
     def options(self, *words: str) -> Options:
-        """The options of a command line."""
         options = Options()
         options.parseOptions(["--name", "a", *words])
         return options

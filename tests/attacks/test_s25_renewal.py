@@ -34,7 +34,6 @@ class RenewalCase(SiegeCase):
         self.team.run(2.0)
 
     def grant_of(self, public: bytes) -> bytes:
-        """The packed grant of a member."""
         found = self.team.houses[0].team.roll.granted(public)
         assert found is not None
         return found[1]
@@ -44,7 +43,6 @@ class RenewalCase(SiegeCase):
         return pass_of(self.team.signer.grant(own.public, "dog", roles, self.team.wall(), life))
 
     def read(self, shown: bytes, own: Identity = DOG) -> Member:
-        """What a pass says."""
         return member_of(self.team.signer.public, own.public, shown)
 
     def renew(self, shown: bytes, ago: float = 0.0, own: Identity = DOG, by: int = 1) -> bytes:
@@ -72,7 +70,6 @@ class RenewalCase(SiegeCase):
         return chained(self.keys[1], self.thief, (found[1], found[0]), came, name, int(self.team.wall()))
 
     def tell(self, statement: bytes) -> None:
-        """Let the operator tell the team."""
         self.outcome(self.team, self.team.tell(statement))
         self.team.run(2.0)
 

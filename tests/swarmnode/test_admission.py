@@ -77,11 +77,9 @@ class AdmissionTests(SynchronousTestCase):
         return found
 
     def joined(self, text: str, folder: str = "new", **more: Any) -> Any:
-        """What ``swarm join`` answers."""
         return self.done(join.main, text, "--folder", str(self.folder / folder), knocking=self.knock, **more)
 
     def names(self) -> list[str]:
-        """Whom ``swarm members`` shows."""
         return [each["name"] for each in self.done(members.main)["members"]]
 
     def test_init_makes_a_team(self) -> None:
@@ -108,8 +106,8 @@ class AdmissionTests(SynchronousTestCase):
         self.assertEqual((settings.node.host, settings.node.port), ("*", 8484))
         self.assertIn("web", settings.node.roles)
         self.assertEqual(settings.web.host, "0.0.0.0")
-        words = ("yard", "--operator", str(self.folder / "other"), "--folder", str(self.folder / "other-team"))
-        self.done(init.main, *words, "--at", "192.0.2.7:8484", "--member", "mine=operator,gateway")
+        others = ("yard", "--operator", str(self.folder / "other"), "--folder", str(self.folder / "other-team"))
+        self.done(init.main, *others, "--at", "192.0.2.7:8484", "--member", "mine=operator,gateway")
         node = Settings.load(str(self.folder / "other-team" / "mine.toml")).node
         self.assertEqual((node.host, node.known_nodes), ("*", (Address("192.0.2.7", 8484),)))
         self.assertEqual(MembershipFile(Path(node.membership)).membership.member.roles, ("operator", "gateway"))
@@ -345,7 +343,6 @@ class AdmissionTests(SynchronousTestCase):
 
 class TeamSettingsTests(SynchronousTestCase):
     def refusal(self, **node: str) -> str:
-        """Why a node is not made."""
         settings = Settings.from_mapping({"node": {"name": "a", **node}}, "a.toml")
         return str(self.assertRaises(BadSetting, assembled, settings, World().seams("a", 7000)))
 

@@ -69,7 +69,6 @@ class DeployTests(SynchronousTestCase):
         return self.shell.said
 
     def file(self, text: str) -> str:
-        """A file with a module."""
         path = self.folder / "module.py"
         path.write_text(text)
         return str(path)
@@ -81,7 +80,6 @@ class DeployTests(SynchronousTestCase):
         return told
 
     def messages(self, name: str) -> str:
-        """The last lines of a device."""
         device = self.team.services[name].assembly.node.presence.device
         return " | ".join(text for _, text in device.messages)
 

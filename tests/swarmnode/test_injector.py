@@ -21,11 +21,9 @@ class InjectorTests(SynchronousTestCase):
         self.addCleanup(self.stage.stop)
 
     def named(self, name: str) -> Any:
-        """The device of that name."""
         return next(device for device in self.stage.devices() if device.name == name)
 
     def asked(self, name: str) -> dict[str, Any]:
-        """What a device says of its faults."""
         told: dict[str, Any] = self.stage._called(self.named(name), ASKED)
         return told
 

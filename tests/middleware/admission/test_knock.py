@@ -49,7 +49,6 @@ def read(datagram: bytes, code: Code = CODE, secret: bytes = SECRET) -> Reply | 
 
 
 def knocked(wish: str = "dog") -> bytes:
-    """A lawful KNOCK."""
     return knock.knock(CODE.key, DOG, EPHEMERAL, wish, random.Random(1))
 
 

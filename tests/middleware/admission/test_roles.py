@@ -51,19 +51,15 @@ class RoleDoor(OpenDoor):
         self._refusals = refusals
 
     def may(self, public: bytes, method: str) -> bool:
-        """By the table."""
         return self._noted(may_call(self._known[public], method), public, method)
 
     def may_store(self, slot: Slot) -> bool:
-        """By the table."""
         return self._noted(may_store(self._known[slot.owner], slot), slot.owner, kind_of(slot))
 
     def may_stay(self, slot: Slot) -> bool:
-        """What may be written."""
         return may_store(self._known[slot.owner], slot)
 
     def authority(self, owner: bytes) -> Authority:
-        """By what the test says."""
         return Authority("", self._known[owner])
 
     def _noted(self, is_allowed: bool, public: bytes, what: str) -> bool:
@@ -73,7 +69,6 @@ class RoleDoor(OpenDoor):
 
 
 def slot(key: bytes, name: str = "x") -> Slot:
-    """A slot of somebody."""
     return Slot(key, Identity(bytes(32)).public, name)
 
 

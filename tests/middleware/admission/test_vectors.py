@@ -27,7 +27,6 @@ class Counted(random.Random):
     """Dice whose bytes count up, for the ephemeral keys and nonces of the vectors."""
 
     def randbytes(self, n: int) -> bytes:
-        """``n`` bytes from 0 on."""
         return bytes(range(n))
 
 

@@ -55,12 +55,10 @@ class House:
 
     @property
     def name(self) -> str:
-        """What the team calls it."""
         return self.team.door.me.name
 
     @property
     def public(self) -> bytes:
-        """Its key."""
         return self.kept.membership.identity.public
 
 
@@ -106,7 +104,6 @@ class Village(World):
         return self.move_in(self.paper(name, *which))
 
     def open(self, house: House) -> None:
-        """Begin a life of a node."""
         place = house.place
         house.team = Team(house.kept, self.store(place), self.wall, self.rng(place))
         network = self.board.network(*self.address(place))
@@ -130,7 +127,6 @@ class Village(World):
         house.node.join(known).addErrback(lambda failure: failure.trap(NotRunning))
 
     def close(self, house: House, is_sudden: bool = False) -> None:
-        """End a life of a node."""
         house.team.stop()
         if is_sudden:
             house.node.vanish()
@@ -169,19 +165,15 @@ class Village(World):
         return self.move_in(found[0])
 
     def members(self, house: int = 0) -> list[str]:
-        """Whom a house takes for members."""
         return [member.name for member in self.houses[house].team.members()]
 
     def address_of(self, house: House) -> Address:
-        """Where a house is."""
         return self.address(house.place)
 
     def contact(self, house: House) -> Contact:
-        """How to ask a house."""
         return Contact(house.public, self.address(house.place))
 
     def stop(self) -> None:
-        """End everything."""
         for house in self.houses:
             self.close(house)
 

@@ -79,7 +79,6 @@ class DeploymentTests(FleetCase):
         self.world.run(1.0)
 
     def version(self, number: int, held: Manifest | None = None, name: str = "best") -> tuple[Manifest, bytes]:
-        """A version of a good strategy."""
         source = SOURCE + b"# %d\n" % number
         return pushed(name, STRATEGY, source, held, number), source
 

@@ -29,7 +29,6 @@ OPERATOR = Identity(bytes([9]) * 32)
 
 
 def record_of(manifest: Manifest, value: bytes | None = None, name: str | None = None) -> Record:
-    """The operator's record."""
     content = manifest.packed() if value is None else value
     slot = manifest.name if name is None else name
     return Record(manifests_key(), slot, OPERATOR.public, 1, "team", 60.0, content).signed(OPERATOR)

@@ -34,24 +34,20 @@ class Scripted:
         self._ready: list[bytes] = []
 
     def send(self, message: bytes) -> None:
-        """Answer at once."""
         for question in self._splitter.feed(message):
             number, verb, _ = frame.unpack_question(question)
             self.asked.append(verb)
             self._ready += frame.Splitter(frame.MAX_ANSWER).feed(self._answer(number, verb))
 
     def receive(self, within_s: float) -> list[bytes]:
-        """What is ready."""
         ready, self._ready = self._ready, []
         return ready
 
     def end(self) -> None:
-        """Note it."""
         self.is_ended = True
 
 
 def well(number: int, content: Any) -> bytes:
-    """A good answer."""
     return frame.pack([number, True, content])
 
 

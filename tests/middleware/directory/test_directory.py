@@ -41,7 +41,6 @@ class Table:
         self.reads = 0
 
     def get(self, key: bytes, concern: str = "majority") -> Deferred[list[Record]]:
-        """The live records under ``key``."""
         self.reads += 1
         if key in self.silent:
             return fail(Unavailable(0, 5))
@@ -89,11 +88,9 @@ class Neighbour:
 
     @property
     def is_complete(self) -> bool:
-        """Whether all are known."""
         return not self.is_large
 
     def seen(self) -> list[Contact]:
-        """Those on this side of the cut."""
         return [n.contact for n in self.town.neighbours if n.table is self.table and n is not self]
 
     def contacts(self) -> list[Contact]:
@@ -105,7 +102,6 @@ class Neighbour:
         return near[int(8 * self.error) - 8 :] if self.error > 1.0 else near
 
     def get(self, key: bytes, concern: str = "majority") -> Deferred[list[Record]]:
-        """Read the table."""
         return self.table.get(key, concern)
 
     def put(self, key: bytes, name: str, value: bytes, lifetime: str, lease: float) -> Deferred[None]:
@@ -118,7 +114,6 @@ class Neighbour:
         return succeed(None)
 
     def release(self, key: bytes, name: str) -> None:
-        """Keep alive no more."""
         self.own.pop(Slot(key, self.identity.public, name))
 
     def say(self) -> None:

@@ -19,7 +19,6 @@ Places = dict[bytes, list[Record]]
 
 
 def owners(count: int, seed: int = 1) -> list[bytes]:
-    """So many random public keys."""
     dice = random.Random(seed)
     return [dice.randbytes(32) for _ in range(count)]
 

@@ -26,7 +26,6 @@ from middleware.entangled.network.network import Address
 
 
 def ids(count: int, seed: int = 1) -> list[bytes]:
-    """So many random ids."""
     dice = random.Random(seed)
     return [dice.randbytes(ID_BYTES) for _ in range(count)]
 

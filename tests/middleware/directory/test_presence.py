@@ -167,7 +167,6 @@ class PresenceTests(SynchronousTestCase):
         self.presence = Presence(DEVICE, lambda value: self.told.append(device_of(record(value))), self.later)
 
     def later(self, delay: float, work: Callable[[], None]) -> Any:
-        """Take note of a call."""
         self.calls.append((delay, work))
 
     def test_silent_before_it_appears(self) -> None:
