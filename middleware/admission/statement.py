@@ -130,7 +130,7 @@ class Invite(Entry):
 
 @dataclass(frozen=True)
 class Terms(Entry):
-    """The sealed terms of the invitation ``public`` (``middleware.admission.terms``), until ``not_after``."""
+    """The sealed terms of the invitation ``public`` (``middleware.admission.code``), until ``not_after``."""
 
     kind = "terms"
     public: bytes

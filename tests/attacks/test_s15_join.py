@@ -15,13 +15,12 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.admission import knock
 from middleware.admission.certificate import chained, proof
-from middleware.admission.code import Code, mark_of, read
+from middleware.admission.code import Code, TermsContent, mark_of, read, seal_terms
 from middleware.admission.knock import Knock, Signer, Welcome
 from middleware.admission.membership import Membership
 from middleware.admission.newcomer import Newcomer
 from middleware.admission.operator import Operator
 from middleware.admission.statement import Invite, Terms, opened, signed
-from middleware.admission.terms import TermsContent, seal_terms
 from middleware.entangled.errors import Forged
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.network import Address

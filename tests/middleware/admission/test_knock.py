@@ -14,9 +14,8 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.admission import knock
 from middleware.admission.certificate import ROOM, is_proof
-from middleware.admission.code import Code
+from middleware.admission.code import Code, TermsContent, seal_terms
 from middleware.admission.knock import Hint, Reply, Signer, Welcome
-from middleware.admission.terms import TermsContent, seal_terms
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import Forged, Malformed
 from middleware.entangled.network.network import Address

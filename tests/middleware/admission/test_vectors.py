@@ -11,10 +11,9 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.admission import knock
 from middleware.admission.certificate import chained, guest_pass, member_of, pass_of, proof, renewed
-from middleware.admission.code import Code
+from middleware.admission.code import Code, TermsContent, seal_terms
 from middleware.admission.roll import digest_of, packed_admission
 from middleware.admission.statement import YEAR, Grant, Invite, Revoke, Terms, sealed_secret, signed
-from middleware.admission.terms import TermsContent, seal_terms
 from middleware.entangled.contact import Contact
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.network import Address
