@@ -76,7 +76,6 @@ class Neighbour:
         self.roster = Roster()
         self.is_placed = True
         self.sequence = 0
-        self.error = 1.0
         self.own: dict[Slot, float] = {}
         self.chores = Background(town.clock)
         self.directory = Directory(cast(EntangledNode, self), self.chores)
@@ -94,12 +93,11 @@ class Neighbour:
         return [n.contact for n in self.town.neighbours if n.table is self.table and n is not self]
 
     def contacts(self) -> list[Contact]:
-        """The nearest, and some others; who errs knows fewer, or more that are not there any more."""
+        """The nearest ones; in a small team all."""
         seen = self.seen()
         if len(seen) < WHOLE:
             return seen
-        near = closest(seen, self.identity.node_id, max(8, int(8 * self.error)))
-        return near[int(8 * self.error) - 8 :] if self.error > 1.0 else near
+        return closest(seen, self.identity.node_id, 8)
 
     def get(self, key: bytes, concern: str = "majority") -> Deferred[list[Record]]:
         return self.table.get(key, concern)
@@ -234,14 +232,6 @@ class DirectoryTests(FleetCase):
         town.clock.advance(10 * REVIEW + 60.0)
         self.assertEqual({n.directory.depth for n in town.neighbours}, {0})
         self.assertEqual(town.table.keys(), {DEVICES: len(town.neighbours)})
-
-    def test_estimates_that_disagree(self) -> None:
-        """Where some know few of their neighbours and some many that left, all are listed all the same, by all."""
-        town = Town(3)
-        town.come(250, 0.1)
-        for neighbour in town.dice.sample(town.neighbours, 60):
-            neighbour.error = town.dice.choice((1.0, 1.5, 2.0))
-        self.all_stay(town, 4, 10, REVIEW)
 
     def test_partition_and_healing(self) -> None:
         """Both sides of a cut list themselves; when it heals, everybody lists all at once, though they stand apart."""
