@@ -22,7 +22,6 @@ from twisted.internet import reactor as running  # noqa: E402
 from twisted.internet.protocol import Protocol  # noqa: E402
 from twisted.internet.stdio import StandardIO  # noqa: E402
 
-from middleware.admission import roles  # noqa: E402
 from middleware.admission.membership import MembershipFile  # noqa: E402
 from middleware.admission.team import Team  # noqa: E402
 from middleware.entangled.contact import Contact  # noqa: E402
@@ -46,7 +45,7 @@ class Node(Protocol):
     def __init__(self, path: Path, known: list[Address], others: list[str]) -> None:
         kept, store = MembershipFile(path), MemoryStore()
         dice = random.SystemRandom()
-        self.team = Team(kept, store, time.time, dice, roles)
+        self.team = Team(kept, store, time.time, dice)
         self.network = UdpNetwork(reactor, "127.0.0.1", 0)
         self.node = EntangledNode(
             self.team.identity,

@@ -108,7 +108,7 @@ class SwarmNode(Service):
         self.deployed: Deployed = {}
         self.stop_deployed: Callable[[], None] = lambda: None
         self.halt = Halt()
-        self.directory = Directory(self.entangled, self._chores, self._quietly)
+        self.directory = Directory(self.entangled, self._chores)
         self.presence = Presence(self._named(device), self._announce, self._chores.later)
         self.streams = Streams(self.entangled.endpoint, clock)
         self.joined: Deferred[None] = Deferred()

@@ -188,10 +188,9 @@ def _closed_team(seams: Seams) -> Team | None:
     """The closed team that the node is a member of; a node of an open one loads none of this."""
     if seams.membership is None:
         return None
-    from middleware.admission import roles
     from middleware.admission.team import Team
 
-    return Team(seams.membership, seams.store, seams.wall, seams.rng, roles)
+    return Team(seams.membership, seams.store, seams.wall, seams.rng)
 
 
 def _camera_knob(driver: Filming) -> Knob:

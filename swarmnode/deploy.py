@@ -6,7 +6,6 @@ What is pushed is signed by that node, in whose slot it is stored: its key is th
 from __future__ import annotations
 
 import argparse
-import json
 import re
 import sys
 from collections.abc import Sequence
@@ -27,19 +26,15 @@ from middleware.deployment.manifest import (
     source_key,
 )
 from middleware.deployment.module import compiled
-from middleware.entangled.control.command import FAILED, WRONG, Ask, asked
-from middleware.entangled.control.place import NoControl
+from middleware.entangled.control.command import Ask, asked
 from middleware.entangled.control.word import printable
 from middleware.entangled.record import Record
 from middleware.errors import Undeployable
 from swarmnode.asker import Asker, Refusal
+from swarmnode.team.office import Answer, Desk, Wrong, run
 
 SOURCE = "source"
 """The slot of a source under its key."""
-
-
-class _Wrong(Exception):
-    """A command that no node need be asked about."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -71,35 +66,28 @@ def parser() -> argparse.ArgumentParser:
 
 def main(words: Sequence[str] | None = None, out: TextIO | None = None, ask: Ask = asked) -> int:
     """Run the command; returns 0, 1 where the node refused, 2 where the command is wrong."""
-    out = out or sys.stdout
-    wishes = parser().parse_args(words)
-    try:
-        answer, lines = {"push": _push, "rollback": _rollback, "status": _status, "keys": _keys}[wishes.verb](
-            wishes, ask
-        )
-    except (Refusal, NoControl, _Wrong) as problem:
-        sys.stderr.write(printable(f"swarm deploy: {problem}") + "\n")
-        return FAILED if isinstance(problem, Refusal) else WRONG
-    out.write(json.dumps(answer) + "\n" if wishes.json else "".join(f"{printable(line)}\n" for line in lines))
-    return 0
+    verbs = {"push": _push, "rollback": _rollback, "status": _status, "keys": _keys}
+
+    def work(wishes: argparse.Namespace, desk: Desk) -> Answer:
+        answer, lines = verbs[wishes.verb](wishes, desk.ask)
+        return answer, [printable(line) for line in lines]
+
+    return run(parser(), words, Desk(out or sys.stdout, ask), work)
 
 
-Told = tuple[Any, list[str]]
-
-
-def _push(wishes: argparse.Namespace, ask: Ask) -> Told:
+def _push(wishes: argparse.Namespace, ask: Ask) -> Answer:
     try:
         source = Path(wishes.file).read_bytes()
     except OSError as error:
-        raise _Wrong(f"{wishes.file} cannot be read: {error.strerror or error}") from error
+        raise Wrong(f"{wishes.file} cannot be read: {error.strerror or error}") from error
     if not re.fullmatch(NAME, wishes.name, re.ASCII):
-        raise _Wrong(f"--name must match {NAME}, is {wishes.name!r}")
+        raise Wrong(f"--name must match {NAME}, is {wishes.name!r}")
     if not 0 < len(source) <= MAX_SOURCE:
-        raise _Wrong(f"{wishes.file} has {len(source)} bytes; a module has 1 to {MAX_SOURCE}")
+        raise Wrong(f"{wishes.file} has {len(source)} bytes; a module has 1 to {MAX_SOURCE}")
     try:
         compiled(source, wishes.name)
     except Undeployable as error:
-        raise _Wrong(f"{wishes.file}: {error.problem}") from error
+        raise Wrong(f"{wishes.file}: {error.problem}") from error
     asker = Asker(wishes.node, ask)
     held = newest(each for each, _ in _manifests(asker) if each.name == wishes.name)
     manifest = pushed(wishes.name, wishes.kind, source, held, wishes.version)
@@ -114,7 +102,7 @@ def _push(wishes: argparse.Namespace, ask: Ask) -> Told:
     return _published(asker, manifest, "pushed")
 
 
-def _rollback(wishes: argparse.Namespace, ask: Ask) -> Told:
+def _rollback(wishes: argparse.Namespace, ask: Ask) -> Answer:
     asker = Asker(wishes.node, ask)
     manifests = [each for each, _ in _manifests(asker)]
     held = newest(each for each in manifests if each.name == wishes.name)
@@ -127,7 +115,7 @@ def _rollback(wishes: argparse.Namespace, ask: Ask) -> Told:
     return _published(asker, manifest, f"went back from version {held.version}:")
 
 
-def _status(wishes: argparse.Namespace, ask: Ask) -> Told:
+def _status(wishes: argparse.Namespace, ask: Ask) -> Answer:
     asker = Asker(wishes.node, ask)
     devices = asker.devices()
     names = {record.owner: device.name for device, record in devices}
@@ -145,7 +133,7 @@ def _status(wishes: argparse.Namespace, ask: Ask) -> Told:
     return rows, lines or ["nothing was pushed"]
 
 
-def _keys(wishes: argparse.Namespace, ask: Ask) -> Told:
+def _keys(wishes: argparse.Namespace, ask: Ask) -> Answer:
     keys = {device.name: record.owner.hex() for device, record in Asker(wishes.node, ask).devices()}
     width = max(map(len, keys), default=0)
     return keys, [f"{name:{width}}  {key}" for name, key in keys.items()]
@@ -156,7 +144,7 @@ def _manifests(asker: Asker) -> list[tuple[Manifest, Record]]:
     return [(manifest, record) for record in records if (manifest := manifest_of(record)) is not None]
 
 
-def _published(asker: Asker, manifest: Manifest, verb: str) -> Told:
+def _published(asker: Asker, manifest: Manifest, verb: str) -> Answer:
     replicas = asker.put(DEPLOYMENTS, manifest.name, manifest.packed())
     line = f"{verb} {manifest.kind} {manifest.name} {manifest.label}; {replicas} replicas have it"
     return {**_told(manifest), "replicas": replicas}, [line]

@@ -16,11 +16,9 @@ from functools import partial
 
 from agents.pushed import BehaviourKind
 from middleware.consensus.deployed import BEHAVIOUR, STRATEGY
-from middleware.deployment.channel import Channel
 from middleware.deployment.confinement import confine
-from middleware.deployment.frame import MAX_QUESTION, Splitter
-from middleware.deployment.host import Host, Kind, StrategyKind
-from middleware.deployment.twin import MemoryChannel
+from middleware.deployment.frame import MAX_QUESTION, Channel, Splitter
+from middleware.deployment.host import Host, Kind, MemoryChannel, StrategyKind
 
 READ_BYTES = 64 * 1024
 LIBRARIES = (
@@ -56,7 +54,7 @@ def wanted(source: bytes) -> list[str]:
     return sorted(known.union(*(LATER.get(name, ()) for name in known)))
 
 
-def _prepared(parent: int, kind: str, source: bytes) -> list[str]:
+def _prepared(parent: int, source: bytes) -> list[str]:
     for name in wanted(source):
         with suppress(Exception):  # the module's own import raises again
             importlib.import_module(name)

@@ -15,7 +15,7 @@ from middleware.entangled.network.network import Network
 
 if TYPE_CHECKING:
     from middleware.admission.membership import Kept
-    from middleware.deployment.channel import Channel
+    from middleware.deployment.frame import Channel
     from middleware.faults.injector import Process
 
 

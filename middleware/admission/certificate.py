@@ -223,13 +223,7 @@ def _renewal(operator: bytes, public: bytes, fields: list[Any]) -> Member:
 def _invited(operator: bytes, public: bytes, word: list[Any]) -> Member:
     """The member that came by a code, with no dates; the name has to be one that the invitation and the wish allow."""
     packed, wish, signature, name, admitter = word
-    invite = opened(operator, packed)
-    if not isinstance(invite, Invite):
-        raise Malformed("a chain begins with an invitation")
-    if wish != "":
-        named(wish)
-    if not is_proof(invite.public, public, wish, sized(signature, 64)):
-        raise Forged("the invitation does not stand for this key")
+    invite = _invitation(operator, public, packed, wish, signature)
     if not invite.allows(named(name), wish):
         raise Forged("a name that the invitation does not give")
     since = max(0, invite.not_before - SKEW)
@@ -237,17 +231,23 @@ def _invited(operator: bytes, public: bytes, word: list[Any]) -> Member:
     return Member(public, name, invite.roles, 0, 0, *origin, uses=invite.uses, since=since, life=invite.life)
 
 
-def _chain(operator: bytes, public: bytes, fields: list[Any]) -> Member:
-    packed, wish, signature, name, begin, end, admission, whole = fields
+def _invitation(operator: bytes, public: bytes, packed: Any, wish: Any, signature: Any) -> Invite:
+    """The invitation whose holder brings in the key ``public`` under the name ``wish``."""
     invite = opened(operator, packed)
     if not isinstance(invite, Invite):
         raise Malformed("a chain begins with an invitation")
-    moment(begin, max(0, invite.not_before - SKEW), invite.not_after)
-    moment(end, begin + 1, begin + invite.life)
     if wish != "":
         named(wish)
     if not is_proof(invite.public, public, wish, sized(signature, 64)):
         raise Forged("the invitation does not stand for this key")
+    return invite
+
+
+def _chain(operator: bytes, public: bytes, fields: list[Any]) -> Member:
+    packed, wish, signature, name, begin, end, admission, whole = fields
+    invite = _invitation(operator, public, packed, wish, signature)
+    moment(begin, max(0, invite.not_before - SKEW), invite.not_after)
+    moment(end, begin + 1, begin + invite.life)
     grant = _grant(operator, whole)
     # A bootstrap node that is renewed outlives its grant, which goes on to say what it may do until it is revoked.
     is_over = begin >= grant.not_after and grant.life < YEAR

@@ -1,6 +1,6 @@
 """Doorkeeper: the door of a closed team: who shows a pass of this team, and is not revoked, is let in.
 
-What each role may do is not decided here: the rules are handed in.
+What each role may do stands in ``roles``.
 """
 
 from __future__ import annotations
@@ -8,9 +8,9 @@ from __future__ import annotations
 import hashlib
 import random
 from collections import OrderedDict
-from collections.abc import Callable, Collection
-from typing import Protocol
+from collections.abc import Callable
 
+from middleware.admission import roles
 from middleware.admission.certificate import ROOM, Member, entries_of, member_by, member_of, pass_of
 from middleware.admission.membership import Membership
 from middleware.admission.roll import Roll
@@ -27,35 +27,6 @@ JUDGED_S = 1.0
 """Seconds for which the authority of an owner is remembered, unless the roll changes before."""
 LIVED = "admission/life"
 """The note of the number of the node's last life."""
-
-
-class Rules(Protocol):
-    """What each role may do."""
-
-    def may_call(self, roles: Collection[str], method: str) -> bool:
-        """Whether a member with these roles may call that method."""
-
-    def may_store(self, roles: Collection[str], slot: Slot, name: str) -> bool:
-        """Whether a member with these roles and that name may write that slot of its own."""
-
-    def lasts(self, slot: Slot) -> bool:
-        """Whether what is held in that slot stays when its owner is revoked."""
-
-
-class Anything:
-    """Rules by which every member may do everything."""
-
-    def may_call(self, roles: Collection[str], method: str) -> bool:
-        """It may."""
-        return True
-
-    def may_store(self, roles: Collection[str], slot: Slot, name: str) -> bool:
-        """It may."""
-        return True
-
-    def lasts(self, slot: Slot) -> bool:
-        """Nothing does."""
-        return False
 
 
 def begun(store: Store, wall: float, rng: random.Random) -> Life:
@@ -79,15 +50,12 @@ class Doorkeeper:
 
     room = ROOM
 
-    def __init__(
-        self, roll: Roll, membership: Callable[[], Membership], wall: Callable[[], float], life: Life, rules: Rules
-    ) -> None:
+    def __init__(self, roll: Roll, membership: Callable[[], Membership], wall: Callable[[], float], life: Life) -> None:
         self.life = life
         self.fingerprint = hashlib.blake2s(roll.operator, digest_size=8, person=b"team").digest()
         self._roll = roll
         self._membership = membership
         self._wall = wall
-        self._rules = rules
         self._me = membership().member
         self.list_entry: Callable[[bytes], object] = lambda packed: roll.add(packed, wall())
         self._passes: OrderedDict[bytes, Member] = OrderedDict()
@@ -134,7 +102,7 @@ class Doorkeeper:
     def may(self, public: bytes, method: str) -> bool:
         """Whether ``public`` is the key of a present member that may call ``method``."""
         authority = self.authority(public)
-        return not authority.refusal and self._rules.may_call(authority.roles, method)
+        return not authority.refusal and roles.may_call(authority.roles, method)
 
     def roles_of(self, public: bytes) -> frozenset[str]:
         """Return the roles that the holder of that key has now, none for a stranger or a revoked or expired member."""
@@ -174,11 +142,11 @@ class Doorkeeper:
     def may_store(self, slot: Slot) -> bool:
         """Whether the certificate of the owner of ``slot``, as it is at present, allows it to write there."""
         authority = self.authority(slot.owner)
-        return not authority.refusal and self._rules.may_store(authority.roles, slot, authority.name)
+        return not authority.refusal and roles.may_store(authority.roles, slot, authority.name)
 
     def may_stay(self, slot: Slot) -> bool:
         """Whether what is held in ``slot`` may be held on and shown."""
-        return self.may_store(slot) or (self.authority(slot.owner).refusal != FOREIGN and self._rules.lasts(slot))
+        return self.may_store(slot) or (self.authority(slot.owner).refusal != FOREIGN and roles.lasts(slot))
 
     def authority(self, owner: bytes) -> Authority:
         """Whether the certificate of an owner of records holds at present, its roles and its name."""

@@ -9,11 +9,11 @@ from __future__ import annotations
 import random
 from collections.abc import Callable, Iterable, Iterator
 
-from twisted.internet.defer import Deferred
 from twisted.logger import Logger
 from twisted.python.failure import Failure
 
-from middleware.admission.roll import DIGEST, Entry, Roll, digest_of
+from middleware.admission.roll import DIGEST, Roll, digest_of
+from middleware.admission.statement import Entry
 from middleware.entangled.background import Background
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import EntangledError, Full, RemoteError
@@ -101,7 +101,7 @@ class Gossip:
         others = [contact for contact in self._contacts() if contact.public not in but]
         for page in _pages(packed):
             for contact in self._rng.sample(others, min(SPREAD, len(others))):
-                self._quietly(self._endpoint.ask(contact, "roll.tell", page, changes=True))
+                self._endpoint.ask(contact, "roll.tell", page, changes=True).addErrback(self._untold)
 
     def _compare_with_one(self) -> None:
         self._roll.expire(self._wall())
@@ -136,12 +136,9 @@ class Gossip:
     def _answer_fetch(self, peer: Contact, wanted: list[object]) -> list[bytes]:
         return next(_pages(self._roll.packed(each for each in wanted[:PAGE] if isinstance(each, bytes))), [])
 
-    def _quietly(self, work: Deferred[object]) -> None:
-        def ended(failure: Failure) -> None:
-            if failure.check(EntangledError) is None:
-                self._log.failure("while telling the team who belongs to it", failure)
-
-        work.addErrback(ended)
+    def _untold(self, failure: Failure) -> None:
+        if failure.check(EntangledError) is None:
+            self._log.failure("while telling the team who belongs to it", failure)
 
 
 def _pages(packed: Iterable[bytes]) -> Iterator[list[bytes]]:

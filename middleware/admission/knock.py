@@ -27,11 +27,10 @@ from nacl.exceptions import CryptoError
 
 from middleware.admission import sealed
 from middleware.admission.certificate import BOOTSTRAP, ROOM, proof
-from middleware.admission.code import Code
+from middleware.admission.code import Code, TermsContent, open_terms
 from middleware.admission.errors import WHY
 from middleware.admission.roll import ID, invitation_id
 from middleware.admission.statement import SECRET_BYTES, Grant, moment, named, opened, sized
-from middleware.admission.terms import TermsContent, open_terms
 from middleware.entangled.contact import Contact, unpacked
 from middleware.entangled.errors import Forged, Malformed
 from middleware.entangled.identity import Identity, verified

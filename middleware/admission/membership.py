@@ -6,7 +6,7 @@ the team's secret is rotated or the operator grants something else.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -105,11 +105,6 @@ def unpacked(found: Mapping[str, Any]) -> Membership:
     return membership
 
 
-def with_settings(membership: Membership, settings: Mapping[str, str | int | float | bool]) -> Membership:
-    """The same membership in a team that wants these settings of each node."""
-    return replace(membership, settings=dict(settings))
-
-
 class MembershipFile:
     """The file of one member, as it was read; ``keep`` replaces it."""
 
@@ -145,4 +140,3 @@ def made(path: Path, membership: Membership) -> None:
 
 
 Kept = MembershipFile | MemoryMembership
-Keep = Callable[[Membership], None]

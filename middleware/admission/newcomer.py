@@ -14,11 +14,10 @@ from twisted.internet.interfaces import IDelayedCall, IReactorTime
 
 from middleware.admission import knock
 from middleware.admission.certificate import member_of
-from middleware.admission.code import Code
+from middleware.admission.code import Code, TermsContent
 from middleware.admission.errors import NotWelcome
 from middleware.admission.knock import Hint, Welcome
 from middleware.admission.membership import Membership
-from middleware.admission.terms import TermsContent
 from middleware.entangled.errors import NoAnswer, RemoteError
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.network import Address, Network
@@ -53,7 +52,6 @@ class Newcomer:
         self._public = Identity(seed).public
         self._network = network
         self._clock = clock
-        self._rng = rng
         self._ephemeral = rng.randbytes(32)
         shared = bindings.crypto_scalarmult_base(self._ephemeral)
         self._knock = knock.knock(self._key, self._public, shared, wish, rng)

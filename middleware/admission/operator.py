@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 from middleware.admission import code, keyfile
 from middleware.admission.certificate import pass_of
+from middleware.admission.code import TermsContent, seal_terms
 from middleware.admission.errors import BadKeyFile
 from middleware.admission.membership import Membership
 from middleware.admission.statement import (
@@ -31,7 +32,6 @@ from middleware.admission.statement import (
     signed,
     sized,
 )
-from middleware.admission.terms import TermsContent, seal_terms
 from middleware.entangled.errors import RemoteError
 from middleware.entangled.identity import Identity
 

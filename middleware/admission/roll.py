@@ -11,9 +11,9 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import msgpack
 
@@ -30,11 +30,11 @@ from middleware.admission.certificate import (
 )
 from middleware.admission.statement import (
     YEAR,
+    Entry,
     Grant,
     Invite,
     Revoke,
     Secret,
-    Statement,
     Terms,
     member_id,
     opened,
@@ -58,56 +58,52 @@ ID = 8
 
 
 @dataclass(frozen=True)
-class Admission:
-    """A newcomer that was let in, and the pass that it shows."""
+class SignedPass(Entry):
+    """The pass that a member shows, signed by a bootstrap node."""
 
     member: Member
     shown: bytes
 
     @property
     def slot(self) -> tuple[str, bytes]:
-        """What it is about."""
-        return "admission", self.member.public
-
-    @property
-    def rank(self) -> int:
-        """Which of two holds: the one of the higher rank."""
-        return self.member.not_before
+        """The kind of the entry and the member's key."""
+        return self.kind, self.member.public
 
     @property
     def until(self) -> int:
-        """Until when it is worth being remembered."""
+        """As long as the operator may want to renew it."""
         return remembered_until(self.member.not_after, self.member.life)
 
 
 @dataclass(frozen=True)
-class Renewal:
-    """A member whose certificate a bootstrap node renewed, and the pass that it shows.
+class Admission(SignedPass):
+    """A newcomer that was let in."""
+
+    kind = "admission"
+
+    @property
+    def rank(self) -> int:
+        """The later one holds."""
+        return self.member.not_before
+
+
+@dataclass(frozen=True)
+class Renewal(SignedPass):
+    """A member whose certificate a bootstrap node renewed.
 
     ``grant`` is what the operator granted it, and that as packed; None where it came by a code.
     """
 
-    member: Member
-    shown: bytes
+    kind = "renewal"
     grant: tuple[Grant, bytes] | None
-
-    @property
-    def slot(self) -> tuple[str, bytes]:
-        """What it is about."""
-        return "renewal", self.member.public
 
     @property
     def rank(self) -> int:
         """The one that ends later holds, so no bootstrap node can shorten what another one gave."""
         return self.member.not_after
 
-    @property
-    def until(self) -> int:
-        """Until when it is worth being remembered."""
-        return remembered_until(self.member.not_after, self.member.life)
 
-
-Entry = Statement | Admission | Renewal
+Kind = TypeVar("Kind", bound=Entry)
 
 
 class Held(NamedTuple):
@@ -183,9 +179,7 @@ class Roll:
         if key in self._held:
             return None
         entry = self._read(packed)
-        if entry.until <= now:
-            return None
-        if self._is_void(entry, now):
+        if entry.until <= now or self._is_void(entry, now):
             return None
         before = self._slots.get(entry.slot)
         if before is not None and (entry.rank, packed) <= (self._held[before].entry.rank, self._held[before].packed):
@@ -199,7 +193,7 @@ class Roll:
         if isinstance(entry, Revoke) or (isinstance(entry, Grant) and before is not None):
             self._drop_void(self._held, now)
         elif isinstance(entry, Grant):
-            self._drop_void([self._slots[slot] for slot in [("renewal", entry.public)] if slot in self._slots], now)
+            self._drop_void([self._slots[slot] for slot in [(Renewal.kind, entry.public)] if slot in self._slots], now)
         return entry
 
     def expire(self, now: float) -> int:
@@ -213,15 +207,11 @@ class Roll:
 
     def revoked(self, public: bytes) -> Revoke | None:
         """The revocation of a member's key, or of an invitation's."""
-        entry = self._at("revoke", public)
-        return entry if isinstance(entry, Revoke) else None
+        return self._at(Revoke, public)
 
     def granted(self, public: bytes) -> tuple[Grant, bytes] | None:
         """What the operator granted to the holder of ``public``, and that as packed."""
-        key = self._slots.get(("grant", public))
-        held = None if key is None else self._held[key]
-        found = (held.entry, held.packed) if held is not None and isinstance(held.entry, Grant) else None
-        renewal = self.renewal(public)
+        found, renewal = self._held_at(Grant, public), self.renewal(public)
         other = None if renewal is None else renewal.grant
         if found is None or (other is not None and found[0].not_before < other[0].not_before):
             return other
@@ -229,41 +219,36 @@ class Roll:
 
     def invited(self, name: bytes) -> tuple[Invite, bytes] | None:
         """The invitation with that id, and it as packed."""
-        key = self._slots.get(("invite", self._by_id.get(name, b"")))
-        held = None if key is None else self._held[key]
-        return (held.entry, held.packed) if held is not None and isinstance(held.entry, Invite) else None
+        return self._held_at(Invite, self._by_id.get(name, b""))
 
     def terms_of(self, invitation: bytes) -> bytes | None:
         """Return the sealed terms of the invitation with that public key; None where they are not known."""
-        entry = self._at("terms", invitation)
-        return entry.sealed if isinstance(entry, Terms) else None
+        entry = self._at(Terms, invitation)
+        return None if entry is None else entry.sealed
 
     def admitted(self, public: bytes) -> Admission | None:
         """How the holder of ``public`` was let in."""
-        entry = self._at("admission", public)
-        return entry if isinstance(entry, Admission) else None
+        return self._at(Admission, public)
 
     def renewal(self, public: bytes) -> Renewal | None:
         """The newest renewal of the certificate of ``public``."""
-        entry = self._at("renewal", public)
-        return entry if isinstance(entry, Renewal) else None
+        return self._at(Renewal, public)
 
     def secrets(self) -> list[Secret]:
         """The statements that carry the team's secrets, the newest first."""
-        found = [entry for entry in self._entries() if isinstance(entry, Secret)]
-        return sorted(found, key=lambda each: -each.number)
+        return sorted(self._all(Secret), key=lambda each: -each.number)
 
     def invites(self) -> list[Invite]:
         """All invitations that are remembered, the oldest first."""
-        return sorted((each for each in self._entries() if isinstance(each, Invite)), key=lambda each: each.not_before)
+        return sorted(self._all(Invite), key=lambda each: each.not_before)
 
     def revocations(self) -> list[Revoke]:
         """All revocations."""
-        return [each for each in self._entries() if isinstance(each, Revoke)]
+        return self._all(Revoke)
 
     def admissions(self) -> list[Admission]:
         """All that were let in by a bootstrap node."""
-        return [each for each in self._entries() if isinstance(each, Admission)]
+        return self._all(Admission)
 
     def refusal(self, member: Member, now: float) -> str:
         """Why a member is none any more: ``revoked``, ``expired`` or ``early``; empty where it is one."""
@@ -334,8 +319,8 @@ class Roll:
 
     def remembered(self, now: float) -> list[tuple[Member, str]]:
         """All that are or were members, by name, each with why it is none at present (empty: it is one)."""
-        publics = [each.member.public for each in self._entries() if isinstance(each, Admission | Renewal)]
-        publics += [each.public for each in self._entries() if isinstance(each, Grant)]
+        publics = [each.member.public for each in self._all(SignedPass)]
+        publics += [each.public for each in self._all(Grant)]
         known = [each for public in dict.fromkeys(publics) if (each := self.member(public, now)) is not None]
         return [(each, self.refusal(each, now)) for each in sorted(known, key=lambda each: (each.name, each.public))]
 
@@ -349,8 +334,8 @@ class Roll:
         One that the operator named after ``since`` does not count, nor one that ends within two ``STEP``: bootstrap
         nodes renew each other long before that, so it is gone.
         """
-        publics = {each.public for each in self._entries() if isinstance(each, Grant)}
-        publics |= {each.member.public for each in self._entries() if isinstance(each, Renewal)}
+        publics = {each.public for each in self._all(Grant)}
+        publics |= {each.member.public for each in self._all(Renewal)}
         for grant in map(self.granted, publics):
             if grant is None or grant[0].public == public or grant[0].not_before > since:
                 continue
@@ -382,7 +367,7 @@ class Roll:
     def _check_room(self, entry: Entry, packed: bytes, now: float) -> None:
         """Raise ``Full`` where there is no room for ``entry``; a part of the room is for the operator alone."""
         most, most_bytes = MAX_ENTRIES, MAX_BYTES
-        if isinstance(entry, Admission | Renewal):
+        if isinstance(entry, SignedPass):
             most, most_bytes = MAX_ENTRIES - RESERVED, MAX_BYTES - RESERVED_BYTES
             member = entry.member
             users = self._uses.get(member.invitation, Counter())
@@ -401,7 +386,7 @@ class Roll:
         Grants stay: with one that ended its key would fall back to what was said of it before.
         """
         for key, held in list(self._held.items()):
-            if isinstance(held.entry, Admission | Renewal) and held.entry.member.not_after <= now:
+            if isinstance(held.entry, SignedPass) and held.entry.member.not_after <= now:
                 self._let_go(key)
 
     def _counts(self, renewal: Member, now: float) -> bool:
@@ -420,12 +405,12 @@ class Roll:
 
     def _is_void(self, entry: Entry, now: float) -> bool:
         """Whether an admission or a renewal does not count, whatever moment it is."""
-        if not isinstance(entry, Admission | Renewal):
+        if not isinstance(entry, SignedPass):
             return False
         member = entry.member
         if self.refusal(member, now) == "revoked":
             return True
-        if isinstance(entry, Admission):
+        if not isinstance(entry, Renewal):
             return False
         grant, admission = self.granted(member.public), self.admitted(member.public)
         if grant is not None and grant[0].not_before > member.since:
@@ -438,7 +423,7 @@ class Roll:
     def _drop_void(self, keys: Iterable[bytes], now: float) -> None:
         """Let go of what a revocation or a later grant made void; whoever shows it is refused by that statement."""
         void = [key for key in keys if self._is_void(self._held[key].entry, now)]
-        members = [each.member for key in void if isinstance(each := self._held[key].entry, Admission | Renewal)]
+        members = [each.member for key in void if isinstance(each := self._held[key].entry, SignedPass)]
         for key in void:
             self._let_go(key)
         self.void = [each.public for each in members if self.refusal(each, now) == "revoked"]
@@ -455,19 +440,24 @@ class Roll:
 
     def _count_use(self, entry: Entry, step: int) -> None:
         """Count a key that came by an invitation: once, whether it is known by its admission, a renewal, or both."""
-        if isinstance(entry, Admission | Renewal) and entry.member.invitation:
+        if isinstance(entry, SignedPass) and entry.member.invitation:
             users = self._uses.setdefault(entry.member.invitation, Counter())
             users[entry.member.public] += step
             users += Counter()  # drops those of which nothing is left
             if not users:
                 del self._uses[entry.member.invitation]
 
-    def _at(self, kind: str, public: bytes) -> Entry | None:
-        key = self._slots.get((kind, public))
-        return None if key is None else self._held[key].entry
+    def _held_at(self, kind: type[Kind], public: bytes) -> tuple[Kind, bytes] | None:
+        key = self._slots.get((kind.kind, public))
+        held = None if key is None else self._held[key]
+        return (held.entry, held.packed) if held is not None and isinstance(held.entry, kind) else None
 
-    def _entries(self) -> Iterator[Entry]:
-        return (held.entry for held in self._held.values())
+    def _at(self, kind: type[Kind], public: bytes) -> Kind | None:
+        found = self._held_at(kind, public)
+        return None if found is None else found[0]
+
+    def _all(self, kind: type[Kind]) -> list[Kind]:
+        return [held.entry for held in self._held.values() if isinstance(held.entry, kind)]
 
     def _hold(self, key: bytes, held: Held) -> None:
         self._held[key] = held

@@ -13,7 +13,7 @@ import random
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import msgpack
 
@@ -50,20 +50,21 @@ _LAST = 2**40
 _PUBLIC, _SIGNATURE, _MARK = 32, 64, 16
 
 
-@dataclass(frozen=True)
-class Grant:
-    """The certificate of a member: who holds ``public`` is called ``name`` and may do what ``roles`` may."""
+class Entry:
+    """An entry of the membership list.
 
+    Of two entries of one ``slot`` the one of the higher ``rank`` holds; it is remembered ``until`` a moment.
+    """
+
+    kind: ClassVar[str]
     public: bytes
-    name: str
-    roles: tuple[str, ...]
     not_before: int
     not_after: int
 
     @property
     def slot(self) -> tuple[str, bytes]:
-        """What it is about; of two statements about the same thing the one of the higher ``rank`` holds."""
-        return "grant", self.public
+        """The kind of the entry and the key that it is about."""
+        return self.kind, self.public
 
     @property
     def rank(self) -> int:
@@ -72,7 +73,24 @@ class Grant:
 
     @property
     def until(self) -> int:
-        """Until when it is worth being remembered: as long as what was said before of that key could last."""
+        """As long as it lasts."""
+        return self.not_after
+
+
+@dataclass(frozen=True)
+class Grant(Entry):
+    """The certificate of a member: who holds ``public`` is called ``name`` and may do what ``roles`` may."""
+
+    kind = "grant"
+    public: bytes
+    name: str
+    roles: tuple[str, ...]
+    not_before: int
+    not_after: int
+
+    @property
+    def until(self) -> int:
+        """As long as what was said before of that key could last."""
         return max(self.not_after, self.not_before + MAX_LIFE)
 
     @property
@@ -82,13 +100,14 @@ class Grant:
 
 
 @dataclass(frozen=True)
-class Invite:
+class Invite(Entry):
     """An invitation: who holds the secret half of ``public`` may bring in ``uses`` newcomers.
 
     They get ``roles``, for ``life`` seconds from their admission.  A single one is called ``name``; several choose
     their own, or are called ``name-1`` and so on.
     """
 
+    kind = "invite"
     public: bytes
     name: str
     roles: tuple[str, ...]
@@ -98,18 +117,8 @@ class Invite:
     life: int
 
     @property
-    def slot(self) -> tuple[str, bytes]:
-        """What it is about."""
-        return "invite", self.public
-
-    @property
-    def rank(self) -> int:
-        """The later one holds."""
-        return self.not_before
-
-    @property
     def until(self) -> int:
-        """Until when it is worth being remembered."""
+        """A while longer, so that its code is refused by name."""
         return self.not_after + REMEMBERED
 
     def allows(self, name: str, wish: str) -> bool:
@@ -120,32 +129,23 @@ class Invite:
 
 
 @dataclass(frozen=True)
-class Terms:
-    """The sealed terms of the invitation ``public`` (``middleware.admission.terms``), until ``not_after``."""
+class Terms(Entry):
+    """The sealed terms of the invitation ``public`` (``middleware.admission.code``), until ``not_after``."""
 
+    kind = "terms"
     public: bytes
     sealed: bytes
     not_before: int
     not_after: int
 
     @property
-    def slot(self) -> tuple[str, bytes]:
-        """What it is about."""
-        return "terms", self.public
-
-    @property
-    def rank(self) -> int:
-        """The later one holds."""
-        return self.not_before
-
-    @property
     def until(self) -> int:
-        """Until when it is worth being remembered."""
+        """A while longer, so that its code is refused by name."""
         return self.not_after + REMEMBERED
 
 
 @dataclass(frozen=True)
-class Revoke:
+class Revoke(Entry):
     """The end of a member's key, or of an invitation's and with it of all that came by it; there is no way back.
 
     ``name`` is what people called it.  ``kept`` freezes what a bootstrap node did, whatever dates it signs: of the
@@ -153,6 +153,7 @@ class Revoke:
     ids (``renewal_id``) count.
     """
 
+    kind = "revoke"
     public: bytes
     name: str
     at: int
@@ -160,29 +161,20 @@ class Revoke:
     kept: tuple[bytes, ...] = ()
 
     @property
-    def slot(self) -> tuple[str, bytes]:
-        """What it is about."""
-        return "revoke", self.public
-
-    @property
     def rank(self) -> int:
         """The earlier one holds: nothing is taken back by saying it again."""
         return -self.at
 
-    @property
-    def until(self) -> int:
-        """Until when it is worth being remembered: as long as anything that it ends could last."""
-        return self.not_after
-
 
 @dataclass(frozen=True)
-class Secret:
+class Secret(Entry):
     """The team's secret of that ``number``, sealed for each member; the one before is accepted for ``grace`` seconds.
 
     ``sealed`` are pairs of a member's public key and what it alone can open.  By the ``mark`` who was let in meanwhile,
     and asks another member for the secret, knows it.
     """
 
+    kind = "secret"
     number: int
     at: int
     grace: int
@@ -192,18 +184,13 @@ class Secret:
 
     @property
     def slot(self) -> tuple[str, bytes]:
-        """What it is about."""
-        return "secret", self.number.to_bytes(8)
+        """The number takes the place of a key."""
+        return self.kind, self.number.to_bytes(8)
 
     @property
     def rank(self) -> int:
         """The later one holds."""
         return self.at
-
-    @property
-    def until(self) -> int:
-        """Until when it is worth being remembered."""
-        return self.not_after
 
     def opened(self, member: Identity) -> bytes | None:
         """The secret, or None where it was not sealed for ``member``."""

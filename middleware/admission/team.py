@@ -13,15 +13,15 @@ from twisted.logger import Logger
 
 from middleware.admission import knock
 from middleware.admission.certificate import Member, entries_of, guest_pass
-from middleware.admission.doorkeeper import Doorkeeper, Rules, begun
+from middleware.admission.doorkeeper import Doorkeeper, begun
 from middleware.admission.errors import WHY, BadKeyFile
 from middleware.admission.gossip import COMPARED, Gossip
 from middleware.admission.knock import Welcome
 from middleware.admission.membership import Kept, Membership
 from middleware.admission.reception import Reception
 from middleware.admission.renewal import Renewer
-from middleware.admission.roll import MAX_ENTRIES, Admission, Entry, Renewal, Roll, invitation_id
-from middleware.admission.statement import Grant, Invite, Revoke, Secret
+from middleware.admission.roll import MAX_ENTRIES, Admission, Renewal, Roll, invitation_id
+from middleware.admission.statement import Entry, Grant, Invite, Revoke, Secret
 from middleware.entangled.background import Background
 from middleware.entangled.contact import Contact
 from middleware.entangled.data.store import Store
@@ -44,12 +44,12 @@ MAX_GUESTS = 256
 class Team:
     """One node's closed team: made before the node, whose ``door`` it has, and then wired to it by ``attach``.
 
-    ``kept`` is the node's own place in the team; ``rules`` say what each role may do.
+    ``kept`` is the node's own place in the team.
     """
 
     _log = Logger()
 
-    def __init__(self, kept: Kept, store: Store, wall: Callable[[], float], rng: random.Random, rules: Rules) -> None:
+    def __init__(self, kept: Kept, store: Store, wall: Callable[[], float], rng: random.Random) -> None:
         self._kept = kept
         self._store = store
         self._wall = wall
@@ -57,7 +57,7 @@ class Team:
         self.identity = kept.membership.identity
         self.roll = Roll(kept.membership.operator)
         self._remember()
-        self.door = Doorkeeper(self.roll, lambda: self.membership, wall, begun(store, wall(), rng), rules)
+        self.door = Doorkeeper(self.roll, lambda: self.membership, wall, begun(store, wall(), rng))
         self._remember_guests()
         self._node: EntangledNode | None = None
         self._uses: Uses | None = None
@@ -191,7 +191,9 @@ class Team:
             self._sweep()
             self._part_with(entry.public)
         elif isinstance(entry, Secret):
-            self._heard_of(entry)
+            found = entry.opened(self.identity)
+            if found is not None:
+                self._take_over(entry, found)
         elif isinstance(entry, Grant):
             self._keep_pass()
             self._sweep()
@@ -267,11 +269,6 @@ class Team:
         for each in (public, *self.roll.void):
             if self._node.overlay.known(node_id(each)) is not None:
                 self._node.evict(each, REVOKED)
-
-    def _heard_of(self, entry: Secret) -> None:
-        found = entry.opened(self.identity)
-        if found is not None:
-            self._take_over(entry, found)
 
     def _take_over(self, entry: Secret, secret: bytes) -> None:
         self._log.info("the team has a new secret, number {number}", number=entry.number)

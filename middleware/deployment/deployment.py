@@ -19,7 +19,7 @@ from twisted.logger import Logger
 from middleware.admission.roles import OPERATOR
 from middleware.config.settings import DeploymentSettings
 from middleware.consensus.deployed import STRATEGY, Make
-from middleware.deployment.channel import Spawn
+from middleware.deployment.frame import Spawn
 from middleware.deployment.manifest import MAX_SOURCE, Manifest, digest_of, manifest_of, manifests_key, source_key
 from middleware.deployment.runner import PushedStrategy, Runner, State
 from middleware.deployment.shelf import Shelf
@@ -94,7 +94,6 @@ class Deployment:
         self._author_of = author_of
         self._spawn = spawn
         self._seconds = seconds
-        self._held: dict[str, Manifest] = {}
         self._wanted: dict[str, tuple[Manifest, Record]] = {}
         self._running: dict[str, tuple[Runner, Record]] = {}
         self._starting: dict[str, tuple[Runner, Record]] = {}
@@ -107,7 +106,7 @@ class Deployment:
     @property
     def held(self) -> Mapping[str, Manifest]:
         """The manifests of the modules that run here, by name."""
-        return self._held
+        return {name: runner.manifest for name, (runner, _) in self._running.items()}
 
     def open(self) -> None:
         """Load what was accepted in an earlier life, if it would be accepted now."""
@@ -164,7 +163,7 @@ class Deployment:
         reason = self._objection(record, manifest) or self._staleness(manifest)
         if manifest is None or reason:
             self._refuse(record, manifest, reason)
-        elif manifest != self._held.get(manifest.name):
+        elif manifest != self.held.get(manifest.name):
             wanted = self._wanted.get(manifest.name)
             if wanted is None or manifest.rank > wanted[0].rank or self._objection(wanted[1], wanted[0]):
                 self._wanted[manifest.name] = (manifest, record)
@@ -199,7 +198,7 @@ class Deployment:
 
     def _staleness(self, manifest: Manifest | None) -> str:
         """Why what is held here stays; empty where it does not, or is the very same."""
-        held = None if manifest is None else self._held.get(manifest.name)
+        held = None if manifest is None else self.held.get(manifest.name)
         if manifest is None or held is None or manifest == held:
             return ""
         if manifest.kind != held.kind:
@@ -290,7 +289,6 @@ class Deployment:
         self.modules[manifest.kind, manifest.name] = (
             (lambda: PushedStrategy(runner)) if is_strategy else runner.create  # what tasks of that name get
         )
-        self._held[manifest.name] = manifest
         self._refused.pop(manifest.name, None)
         if CONFINED not in runner.limits:
             held = ", ".join(runner.limits) or "none"
@@ -328,7 +326,7 @@ class Deployment:
         runner.stop(reason)
         self._starting.pop(manifest.name, None)
         if self._running.get(manifest.name, (None,))[0] is runner:
-            del self._running[manifest.name], self._held[manifest.name]
+            del self._running[manifest.name]
             self.modules.pop((manifest.kind, manifest.name), None)
             before = self._before.pop(manifest.name, None)
             if before is not None:

@@ -1,4 +1,4 @@
-"""Frame: the messages between a node and the process that runs a pushed module; pure.
+"""The messages between a node and the process that runs a pushed module, and the channel that carries them; pure.
 
 A question is ``[number, verb, arguments]``, its answer ``[number, is_well, content]``, each in msgpack behind its
 length in four bytes.  The node trusts nothing in an answer: its size is limited before it is read, and its number has
@@ -8,7 +8,8 @@ to belong to an open question.
 from __future__ import annotations
 
 import struct
-from typing import Any
+from collections.abc import Callable
+from typing import Any, Protocol
 
 import msgpack
 
@@ -82,3 +83,28 @@ def _three(message: bytes) -> tuple[int, Any, Any]:
     if not isinstance(fields, list) or len(fields) != 3 or type(fields[0]) is not int:
         raise BadFrame("has not three fields with a number first")
     return fields[0], fields[1], fields[2]
+
+
+class Gone(Exception):
+    """The process has ended, or said what no answer can be; the text says which."""
+
+
+class Channel(Protocol):
+    """The two pipes of a running process, as the node sees them; ``receive`` and ``send`` raise ``Gone``."""
+
+    def send(self, message: bytes) -> None:
+        """Send a message; the next ``receive`` sends the rest that the pipe does not take now."""
+
+    @property
+    def is_behind(self) -> bool:
+        """Whether something is left to be sent."""
+
+    def receive(self, within_s: float) -> list[bytes]:
+        """The received messages; if there is none yet, wait for one at most ``within_s`` seconds."""
+
+    def end(self) -> None:
+        """End the process at once; may be called again."""
+
+
+Spawn = Callable[[], Channel]
+"""Starts a process that has no module yet."""

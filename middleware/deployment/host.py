@@ -1,6 +1,6 @@
 """Host: the side of the module, in its own process: it loads one module and answers the node's questions.
 
-``confine`` is called with the module's kind and source before any of the source runs; it gives up the rights of the
+``confine`` is called with the module's source before any of the source runs; it gives up the rights of the
 process and says which limits hold from then on.  Each kind of module is served by a ``Kind``.
 """
 
@@ -14,7 +14,18 @@ from middleware.consensus.deployed import STRATEGY, Make
 from middleware.consensus.remote import answer as answer_of
 from middleware.consensus.strategy import reads_of
 from middleware.deployment import frame
-from middleware.deployment.frame import CALL, DROP, FIRST, LOAD, MAKE
+from middleware.deployment.frame import (
+    CALL,
+    DROP,
+    FIRST,
+    LOAD,
+    MAKE,
+    MAX_ANSWER,
+    MAX_QUESTION,
+    BadFrame,
+    Gone,
+    Splitter,
+)
 from middleware.deployment.manifest import Manifest
 from middleware.deployment.module import loaded
 from middleware.errors import Undeployable
@@ -22,7 +33,7 @@ from middleware.errors import Undeployable
 MAX_INSTANCES = 64
 MAX_REASON = 1000
 
-Confine = Callable[[str, bytes], Sequence[str]]
+Confine = Callable[[bytes], Sequence[str]]
 
 
 class Kind(Protocol):
@@ -76,19 +87,19 @@ class Host:
                 DROP: self._drop,
             }
             packed = frame.pack([number, True, verbs[verb](*arguments)])
-            if len(packed) <= frame.MAX_ANSWER:
+            if len(packed) <= MAX_ANSWER:
                 return packed
-            why = f"its answer has {len(packed)} bytes, more than {frame.MAX_ANSWER}"
+            why = f"its answer has {len(packed)} bytes, more than {MAX_ANSWER}"
         except Undeployable as error:
             why = error.problem
-        except frame.BadFrame as error:
+        except BadFrame as error:
             why = f"its answer {error}"
         except BaseException as error:  # a pushed module may raise anything
             why = "".join(traceback.format_exception_only(error)).strip()
         return frame.pack([number, False, why[:MAX_REASON].encode(errors="replace").decode()])
 
     def _load(self, name: str, kind: str, version: int, digest: str, size: int, source: bytes) -> object:
-        limits = list(self._confine(kind, source))
+        limits = list(self._confine(source))
         self._kind = self._kinds[kind]
         self._make = loaded(Manifest(name, kind, version, digest, size), source)
         facts: dict[str, Any] = {"limits": limits}
@@ -111,3 +122,36 @@ class Host:
     def _drop(self, place: int) -> object:
         self._things.pop(place, None)
         return None
+
+
+class MemoryChannel:
+    """The channel of a module that runs in this process, through the same messages; for simulators and tests."""
+
+    is_behind = False
+
+    def __init__(self, kinds: Mapping[str, Kind]) -> None:
+        self._host: Host | None = Host(kinds, lambda source: ["simulated"])
+        self._questions = Splitter(MAX_QUESTION)
+        self._answers = Splitter(MAX_ANSWER)
+        self._ready: list[bytes] = []
+
+    def send(self, message: bytes) -> None:
+        """Have the question answered at once."""
+        if self._host is None:
+            raise Gone("its process has ended")
+        try:
+            for question in self._questions.feed(message):
+                self._ready += self._answers.feed(self._host.answer(question))
+        except BadFrame as error:
+            raise Gone(f"its answer {error}") from error
+
+    def receive(self, within_s: float) -> list[bytes]:
+        """The answers since the last time."""
+        if self._host is None:
+            raise Gone("its process has ended")
+        ready, self._ready = self._ready, []
+        return ready
+
+    def end(self) -> None:
+        """Forget the module."""
+        self._host = None

@@ -12,8 +12,7 @@ import tempfile
 import time
 from contextlib import suppress
 
-from middleware.deployment.channel import Gone
-from middleware.deployment.frame import MAX_ANSWER, MAX_QUESTION, BadFrame, Splitter
+from middleware.deployment.frame import MAX_ANSWER, MAX_QUESTION, BadFrame, Gone, Splitter
 
 PIPE_BYTES = 1024 * 1024
 """Requested size of the pipe to the process, so that a picture fits into it."""

@@ -20,8 +20,7 @@ from middleware.consensus.guard import STRIKES, Lost, NoOpinion
 from middleware.consensus.remote import RemoteStrategy
 from middleware.consensus.strategy import READABLE
 from middleware.deployment import frame
-from middleware.deployment.channel import Channel, Gone, Spawn
-from middleware.deployment.frame import CALL, DROP, FIRST, LOAD, MAKE
+from middleware.deployment.frame import CALL, DROP, FIRST, LOAD, MAKE, Channel, Gone, Spawn
 from middleware.deployment.manifest import Manifest
 from middleware.errors import UnknownTask
 

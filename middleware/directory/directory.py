@@ -42,13 +42,12 @@ class Page(NamedTuple):
 
 
 class Directory:
-    """The directory as the node ``entangled`` sees it; ``quietly`` takes what may fail without anybody waiting."""
+    """The directory as the node ``entangled`` sees it."""
 
-    def __init__(self, entangled: EntangledNode, chores: Background, quietly: Callable[[Deferred[Any]], None]) -> None:
+    def __init__(self, entangled: EntangledNode, chores: Background) -> None:
         self.depth = 0
         self.entangled = entangled
         self.chores = chores
-        self._quietly = quietly
         self._own_id = entangled.identity.node_id
         self._stands: set[tuple[bytes, str]] = set()
         self._leaves: set[tuple[bytes, str]] = set()

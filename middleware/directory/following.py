@@ -34,12 +34,11 @@ class Following:
         self.records: list[Record] = []
         self._directory = directory
         self._changed = changed
-        self._keep = keep
         self._is_stopped = False
         self._is_split = False
         self._unseen: set[bytes] = set()
         self._watch: Watch | None = None
-        self._follow()
+        self._watch = directory.entangled.watch(DEVICES, self._told, keep)
 
     def stop(self) -> None:
         """End the subscription; nothing is told any more."""
@@ -49,20 +48,13 @@ class Following:
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
-    def _follow(self) -> None:
-        """Watch the one place."""
-        self._watch = self._directory.entangled.watch(DEVICES, self._told, self._keep)
-
     def _told(self, records: list[Record]) -> None:
         if self._directory.depth > 1 or any(MARK in (record.value or b"") for record in records):
-            self._split(records)
+            if not self._is_split:
+                self._is_split = True
+                self._directory.chores.fork(self._rounds())
         elif not self._is_split:
             self._tell(records)
-
-    def _split(self, records: list[Record]) -> None:
-        if not self._is_split:
-            self._is_split = True
-            self._directory.chores.fork(self._rounds())
 
     async def _rounds(self) -> None:
         """Read all places again and again, until the team is small again."""

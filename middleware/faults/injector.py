@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any, Protocol
 
@@ -22,7 +22,6 @@ from middleware.entangled.errors import Refused
 from middleware.entangled.network.network import Network
 from middleware.entangled.network.switchboard import CALM, Weather
 from middleware.errors import BadFault, UnknownTask
-from middleware.faults.battery import LowBattery
 from middleware.faults.kinds import ASKED, ASSIGN, CAUSE, KINDS, Fault, parse_fault
 from middleware.faults.network import FaultyNetwork
 from middleware.node import SwarmNode
@@ -30,6 +29,7 @@ from middleware.tasks.task import Task
 
 MakeTask = Callable[[str, str, float], Task]
 """A predefined task by its name, a new task id, and the wall clock."""
+LEVEL = "power.level"
 AFTER_ANSWERS = 0.5
 """Seconds from the answer to the fault: a node that is cut off or dead could not confirm the order.  Where datagrams
 get lost, it may have to send its answer several times."""
@@ -92,6 +92,35 @@ class SkewedClock:
     def __call__(self) -> float:
         """The seconds that it shows."""
         return self._wall() + self.ahead
+
+
+class LowBattery:
+    """Forward everything to ``driver``, but report at most ``level`` (0 to 1) as its charge; None: the real charge.
+
+    The robot still obeys commands; its agent has to give up the task.
+    """
+
+    def __init__(self, driver: Any) -> None:
+        self.level: float | None = None
+        self._driver = driver
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._driver, name)
+
+    def observe(self) -> Any:
+        """Return the newest observation with the limited level; None before the first."""
+        return self._limit(self._driver.observe())
+
+    def subscribe(self, seen: Callable[[Any], None]) -> Callable[[], None]:
+        """Call ``seen`` with each observation with the limited level; the result ends the subscription."""
+        end: Callable[[], None] = self._driver.subscribe(lambda observation: seen(self._limit(observation)))
+        return end
+
+    def _limit(self, seen: Any) -> Any:
+        level = None if seen is None else seen.values.get(LEVEL)
+        if self.level is None or not isinstance(level, float | int) or level <= self.level:
+            return seen
+        return replace(seen, values={**seen.values, LEVEL: self.level})
 
 
 class FaultInjector:

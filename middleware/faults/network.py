@@ -7,8 +7,6 @@ between simulated ones.  Initially it changes nothing.
 from __future__ import annotations
 
 import random
-from collections import Counter
-from collections.abc import Callable
 
 from twisted.internet.interfaces import IReactorTime
 
@@ -20,15 +18,13 @@ class FaultyNetwork:
     """``network`` with faults.
 
     ``weather`` applies to each datagram sent and to each one received, so to a request and its response twice.
-    ``is_deaf``: nothing is received; ``is_mute``: nothing is sent.  ``eaten`` counts the datagrams that were silenced,
-    lost and duplicated.
+    ``is_deaf``: nothing is received; ``is_mute``: nothing is sent.
     """
 
     def __init__(self, network: Network, clock: IReactorTime, rng: random.Random) -> None:
         self.weather = CALM
         self.is_deaf = False
         self.is_mute = False
-        self.eaten: Counter[str] = Counter()
         self._network = network
         self._clock = clock
         self._rng = rng
@@ -56,12 +52,8 @@ class FaultyNetwork:
 
     def send(self, datagram: bytes, to: Address) -> None:
         """Send what gets through."""
-        if self.is_mute:
-            self.eaten["silenced"] += 1
-        elif self.weather is CALM:
-            self._network.send(datagram, to)
-        else:
-            self._suffer(self._sent, datagram, to)
+        if not self.is_mute:
+            self._pass_on(self._sent, datagram, to)
 
     def close(self) -> None:
         """Close the port, what is on its way is lost; may be called twice."""
@@ -69,25 +61,16 @@ class FaultyNetwork:
         self._network.close()
 
     def _came(self, datagram: bytes, source: Address) -> None:
-        if self.is_deaf:
-            self.eaten["silenced"] += 1
-        elif self.weather is CALM:
-            self._heard(datagram, source)
-        else:
-            self._suffer(self._heard, datagram, source)
+        if not self.is_deaf:
+            self._pass_on(self._heard, datagram, source)
 
-    def _suffer(self, go_on: Receiver, datagram: bytes, address: Address) -> None:
-        delays = self.weather.delays(self._rng)
-        if len(delays) != 1:
-            self.eaten["duplicated" if delays else "lost"] += 1
-        for delay in delays:
-            self._after(delay, lambda: go_on(datagram, address))
-
-    def _after(self, delay: float, act: Callable[[], None]) -> None:
-        if delay > 0.0:
-            self._clock.callLater(delay, act)
-        else:
-            act()
+    def _pass_on(self, go_on: Receiver, datagram: bytes, address: Address) -> None:
+        """Pass a datagram on as the weather has it: now, late, twice or not at all."""
+        for delay in (0.0,) if self.weather is CALM else self.weather.delays(self._rng):
+            if delay > 0.0:
+                self._clock.callLater(delay, go_on, datagram, address)
+            else:
+                go_on(datagram, address)
 
     def _sent(self, datagram: bytes, to: Address) -> None:
         if self._receiver is not None and not self.is_mute:

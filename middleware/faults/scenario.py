@@ -6,16 +6,36 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from middleware.entangled.value import is_number, is_whole
+from msgspec import Meta
+
+from formats.convert import Invalid, Unit, convert_table
 from middleware.errors import BadFault, BadSetting
 from middleware.faults.kinds import Fault, parse_fault
 
 WHO_ACTS, ANY = "executing", "any"
 MAX_FAULTS, MAX_AT = 100, 3600.0
-KEYS = ("seed", "task", "fault")
-FAULT_KEYS = ("at", "device", "kind", "seconds", "amount")
+
+
+@dataclass(frozen=True)
+class _FaultTable:
+    """A table ``[[fault]]``; ``parse_fault`` checks the kind, the seconds and the amount."""
+
+    kind: Any = None
+    at: Annotated[float, Meta(ge=0.0, le=MAX_AT), Unit("seconds")] = 0.0
+    device: Annotated[str, Meta(min_length=1, examples=[WHO_ACTS])] = WHO_ACTS
+    seconds: Any = None
+    amount: Any = None
+
+
+@dataclass(frozen=True)
+class _File:
+    """The whole file."""
+
+    fault: Annotated[list[Any], Meta(min_length=1, max_length=MAX_FAULTS, description="1 to 100 tables [[fault]]")]
+    seed: Annotated[int, Meta(ge=0)] = 1
+    task: Annotated[str, Meta(examples=["turn-around"])] = ""
 
 
 @dataclass(frozen=True)
@@ -52,38 +72,20 @@ def loaded(path: Path) -> Scenario:
 
 def scenario_of(content: Mapping[str, Any], origin: str) -> Scenario:
     """The scenario that a file's content means; raises ``BadSetting``."""
-    _known(content, KEYS, origin, "")
-    seed, task, faults = content.get("seed", 1), content.get("task", ""), content.get("fault", [])
-    if not is_whole(seed):
-        raise BadSetting(origin, "seed", "must be a whole number from 0 on", "write seed = 7")
-    if not isinstance(task, str):
-        raise BadSetting(
-            origin, "task", "must be a name of the catalogue", 'write task = "turn-around", or leave it out'
-        )
-    if not isinstance(faults, list) or not 0 < len(faults) <= MAX_FAULTS:
-        raise BadSetting(origin, "[[fault]]", f"there must be 1 to {MAX_FAULTS}", "write a table [[fault]] for each")
-    steps = [_step(fault, origin, f"[[fault]] {number}") for number, fault in enumerate(faults, start=1)]
-    return Scenario(task, tuple(sorted(steps, key=lambda step: step.at)), seed)
-
-
-def _step(table: Any, origin: str, where: str) -> Step:
-    if not isinstance(table, Mapping):
-        raise BadSetting(origin, where, "must be a table", "write [[fault]] and its keys below")
-    _known(table, FAULT_KEYS, origin, where)
-    at, device = table.get("at", 0.0), table.get("device", WHO_ACTS)
-    if not is_number(at) or not 0 <= at <= MAX_AT:
-        raise BadSetting(origin, f"{where} at", f"must be 0 to {MAX_AT:g} s after the beginning", "write at = 1.5")
-    if not isinstance(device, str) or not device:
-        raise BadSetting(
-            origin, f"{where} device", "must be a text", f'write "{WHO_ACTS}", "{ANY}" or a device\'s name'
-        )
     try:
-        return Step(float(at), device, parse_fault(table.get("kind"), table.get("seconds"), table.get("amount")))
+        file = convert_table(content, _File)
+    except Invalid as error:
+        key = "[[fault]]" if error.key == "fault" else error.key
+        raise BadSetting(origin, key, error.problem, error.remedy) from None
+    steps = [_step(fault, origin, f"[[fault]] {number}") for number, fault in enumerate(file.fault, start=1)]
+    return Scenario(file.task, tuple(sorted(steps, key=lambda step: step.at)), file.seed)
+
+
+def _step(content: Any, origin: str, where: str) -> Step:
+    try:
+        table = convert_table(content, _FaultTable)
+        return Step(table.at, table.device, parse_fault(table.kind, table.seconds, table.amount))
+    except Invalid as error:
+        raise BadSetting(origin, f"{where} {error.key}".strip(), error.problem, error.remedy) from None
     except BadFault as error:
         raise BadSetting(origin, f"{where} {error.field}", error.problem, error.remedy) from error
-
-
-def _known(table: Mapping[str, Any], keys: tuple[str, ...], origin: str, where: str) -> None:
-    for key in table:
-        if key not in keys:
-            raise BadSetting(origin, f"{where} {key}".strip(), "is no such key", f"there are {', '.join(keys)}")

@@ -18,7 +18,7 @@ from middleware.config.settings import COMMAND_LINE, NODE_PORT, Settings
 from middleware.entangled.network.interface import is_loopback
 from middleware.entangled.network.network import EVERYWHERE
 from middleware.errors import BadSetting
-from swarmnode.team.office import ENDING, Desk, Wrong, key_folder, options, run
+from swarmnode.team.office import ENDING, Answer, Desk, Wrong, key_folder, options, run
 
 MEMBERSHIP, SETTINGS = ".membership", ".toml"
 SHARED = ("port", "lan", "store_rows", "store_bytes", "durable", "presence_lease")
@@ -46,7 +46,6 @@ class _Member:
 
 def main(words: Sequence[str] | None = None, desk: Desk | None = None) -> int:
     """Run the command; returns its exit code."""
-    desk = desk or Desk()
     init = options(
         "init", "Make a closed team: the operator's key, and the membership of its first node.", is_asked=False
     )
@@ -67,11 +66,10 @@ def main(words: Sequence[str] | None = None, desk: Desk | None = None) -> int:
         default=[],
         help="files for one more node at once, to be carried to it by hand; may be said again (device)",
     )
-    wishes = init.parse_args(words)
-    return run("init", lambda: _made(wishes, desk), wishes.json, desk.out)
+    return run(init, words, desk, _made)
 
 
-def _made(wishes: argparse.Namespace, desk: Desk) -> tuple[Any, list[str]]:
+def _made(wishes: argparse.Namespace, desk: Desk) -> Answer:
     operator = replace(operators.drawn(wishes.team, desk.rng), settings=team_settings(wishes.set))
     key = wishes.operator or key_folder() / f"{wishes.team}{ENDING}"
     team = dict(operator.settings)
@@ -90,7 +88,7 @@ def _made(wishes: argparse.Namespace, desk: Desk) -> tuple[Any, list[str]]:
     _make_folders(key.parent, wishes.folder)
     operators.made(key, operator)
     for path, membership in founded.items():
-        memberships.made(path, memberships.with_settings(membership, team))
+        memberships.made(path, replace(membership, settings=team))
     for path, text in texts.items():
         written(path, text)
     answer = {"team": wishes.team, "operator": str(key)}

@@ -2,39 +2,37 @@
 
 from __future__ import annotations
 
-import time
+import argparse
 from collections.abc import Sequence
 from typing import Any
 
 from middleware.admission.statement import Invite
-from swarmnode.team.office import Desk, Known, known, options, run
+from swarmnode.team.office import Answer, Desk, Known, day, known, options, run
 
 OPEN, USED, EXPIRED, REVOKED = "open", "used", "expired", "revoked"
 
 
 def main(words: Sequence[str] | None = None, desk: Desk | None = None) -> int:
     """Run the command; returns its exit code."""
-    desk = desk or Desk()
     invitations = options("invitations", "Print the invitations that can be used; end one by swarm revoke.", False)
     invitations.add_argument("--all", action="store_true", help="also those that are used, expired or revoked")
-    wishes = invitations.parse_args(words)
+    return run(invitations, words, desk, _listed)
 
-    def work() -> tuple[Any, list[str]]:
-        now = desk.wall()
-        found = known(wishes.node, desk)
-        rows = [_row(found, each, now) for each in found.roll.invites()]
-        rows = [row for row in rows if wishes.all or row["state"] == OPEN]
-        width = max((len(row["name"]) for row in rows), default=0)
-        lines = []
-        for row in rows:
-            until = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(row["until"]))
-            line = f"{row['name']:{width}}  {', '.join(row['roles'])}  {row['left']} of {row['uses']} left"
-            came = f"  came: {', '.join(row['came'])}" if row["came"] else ""
-            lines.append(f"{line}  until {until}  {row['state']}{came}")
-        end = "end one by swarm revoke NAME --invitation"
-        return {"team": found.team, "invitations": rows}, [*lines, end] if lines else ["no invitation can be used"]
 
-    return run("invitations", work, wishes.json, desk.out)
+def _listed(wishes: argparse.Namespace, desk: Desk) -> Answer:
+    now = desk.wall()
+    found = known(wishes.node, desk)
+    rows = [_row(found, each, now) for each in found.roll.invites()]
+    rows = [row for row in rows if wishes.all or row["state"] == OPEN]
+    width = max((len(row["name"]) for row in rows), default=0)
+    lines = []
+    for row in rows:
+        until = day(row["until"], has_time=True)
+        line = f"{row['name']:{width}}  {', '.join(row['roles'])}  {row['left']} of {row['uses']} left"
+        came = f"  came: {', '.join(row['came'])}" if row["came"] else ""
+        lines.append(f"{line}  until {until}  {row['state']}{came}")
+    end = "end one by swarm revoke NAME --invitation"
+    return {"team": found.team, "invitations": rows}, [*lines, end] if lines else ["no invitation can be used"]
 
 
 def _row(found: Known, invite: Invite, now: float) -> dict[str, Any]:

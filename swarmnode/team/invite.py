@@ -5,11 +5,10 @@ from __future__ import annotations
 import argparse
 import io
 from collections.abc import Sequence
-from typing import Any
 
 from middleware.admission.statement import MAX_USES, ROLES, YEAR
 from swarmnode.asker import Refusal
-from swarmnode.team.office import Desk, Wrong, known, operator_in, options, run, seconds, span, tell
+from swarmnode.team.office import Answer, Desk, Wrong, known, operator_in, options, run, seconds, span, tell
 
 DAY = 86_400.0
 INVITED = tuple(role for role in ROLES if role != "bootstrap")
@@ -17,7 +16,6 @@ INVITED = tuple(role for role in ROLES if role != "bootstrap")
 
 def main(words: Sequence[str] | None = None, desk: Desk | None = None) -> int:
     """Run the command; returns its exit code."""
-    desk = desk or Desk()
     invite = options("invite", "Make a code that lets a newcomer into the team.")
     invite.add_argument("name", metavar="NAME", help="what the newcomer is called")
     invite.add_argument("--role", choices=INVITED, action="append", help="what it may do; may be said again (device)")
@@ -31,11 +29,10 @@ def main(words: Sequence[str] | None = None, desk: Desk | None = None) -> int:
         metavar="TIME",
         help="how long it is a member (365d); a year or more is renewed",
     )
-    wishes = invite.parse_args(words)
-    return run("invite", lambda: _invited(wishes, desk), wishes.json, desk.out)
+    return run(invite, words, desk, _invited)
 
 
-def _invited(wishes: argparse.Namespace, desk: Desk) -> tuple[Any, list[str]]:
+def _invited(wishes: argparse.Namespace, desk: Desk) -> Answer:
     operator = operator_in(wishes.operator)
     roles = wishes.role or ["device"]
     try:

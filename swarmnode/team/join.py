@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import socket
 import sys
 from collections.abc import Callable, Sequence
@@ -29,7 +30,7 @@ from middleware.entangled.network.network import EVERYWHERE, Address
 from middleware.errors import BadSetting
 from swarmnode.asker import Refusal
 from swarmnode.team.init import SHARED, settings_text, written
-from swarmnode.team.office import Desk, Wrong, options, run, seconds
+from swarmnode.team.office import Answer, Desk, Wrong, options, run, seconds
 
 JOINING = "swarm-node joining 1"
 Knocking = Callable[[Code, bytes, str, Sequence[Address], float], Membership]
@@ -43,7 +44,6 @@ def main(
     around: Around | None = None,
 ) -> int:
     """Run the command; returns its exit code."""
-    desk = desk or Desk()
     join = options("join", "Become a member of a closed team, by a code of its operator.", False, is_asked=False)
     join.add_argument("code", metavar="CODE", help="as swarm invite shows it, with or without @HOST:PORT behind it")
     join.add_argument(
@@ -56,18 +56,14 @@ def main(
     join.add_argument("--folder", metavar="DIR", type=Path, default=Path("."), help="where the files go (here)")
     join.add_argument("--files", metavar="NAME", default="swarm", help="what they are called (swarm)")
     join.add_argument("--timeout", type=seconds, default=PATIENCE, metavar="TIME", help="how long to try (20s)")
-    wishes = join.parse_args(words)
-    return run(
-        "join",
-        lambda: _joined(wishes, desk, knocking or _knocking(wishes.tunnel), around or on_the_lan),
-        wishes.json,
-        desk.out,
-    )
+
+    def work(wishes: argparse.Namespace, desk: Desk) -> Answer:
+        return _joined(wishes, desk, knocking or _knocking(wishes.tunnel), around or on_the_lan)
+
+    return run(join, words, desk, work)
 
 
-def _joined(wishes: argparse.Namespace, desk: Desk, knocking: Knocking, around: Around) -> tuple[Any, list[str]]:
-    import re
-
+def _joined(wishes: argparse.Namespace, desk: Desk, knocking: Knocking, around: Around) -> Answer:
     text, _, behind = wishes.code.partition("@")
     try:
         code = codes.read(text)

@@ -2,64 +2,63 @@
 
 from __future__ import annotations
 
-import time
+import argparse
 from collections.abc import Sequence
 from typing import Any
 
 from middleware.entangled.network.url import VIRTUAL
-from swarmnode.team.office import Desk, known, options, run
+from swarmnode.team.office import Answer, Desk, day, known, options, run
 
 
 def main(words: Sequence[str] | None = None, desk: Desk | None = None) -> int:
     """Run the command; returns its exit code."""
-    desk = desk or Desk()
-    wishes = options("members", "Print who belongs to the team.", needs_key=False).parse_args(words)
+    members = options("members", "Print who belongs to the team.", needs_key=False)
+    return run(members, words, desk, _listed)
 
-    def work() -> tuple[Any, list[str]]:
-        now = desk.wall()
-        found = known(wishes.node, desk)
-        rows: list[dict[str, Any]] = [
-            {
-                "name": each.name,
-                "roles": list(each.roles),
-                "until": each.not_after,
-                "renews": each.is_renewable,
-                "at": found.here.get(each.public, ""),
-                "key": each.public.hex(),
-            }
-            for each in found.members(now)
-        ]
-        expired: list[dict[str, Any]] = [
-            {"name": each.name, "roles": list(each.roles), "until": each.not_after, "key": each.public.hex()}
-            for each in found.expired(now)
-        ]
-        used = [each.member.invitation for each in found.roll.admissions()]
-        open_: list[dict[str, Any]] = [
-            {"name": each.name, "roles": list(each.roles), "left": each.uses - used.count(each.public)}
-            | {"until": each.not_after, "key": each.public.hex()}
-            for each in found.roll.invites()
-            if now < each.not_after and found.roll.revoked(each.public) is None
-            if used.count(each.public) < each.uses
-        ]
-        revoked = [{"name": each.name, "at": each.at, "key": each.public.hex()} for each in found.roll.revocations()]
-        width = max((len(row["name"]) for row in [*rows, *expired, *open_]), default=0)
-        lines = [f"team {found.team}, secret number {found.secret}"]
-        for row in rows:
-            until = time.strftime("%Y-%m-%d", time.gmtime(row["until"]))
-            where = place(row["at"])
-            renewal = "renewed automatically" if row["renews"] else "not renewed"
-            lines.append(f"  {row['name']:{width}}  {', '.join(row['roles'])}  until {until}, {renewal}  {where}")
-        for row in expired:
-            until = time.strftime("%Y-%m-%d", time.gmtime(row["until"]))
-            lines.append(f"  {row['name']:{width}}  expired {until}; to let it in again: swarm renew {row['name']}")
-        for row in open_:
-            until = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(row["until"]))
-            lines.append(f"  {row['name']:{width}}  invited, {row['left']} left, until {until}")
-        lines += [f"  {row['name']:{width}}  revoked" for row in revoked]
-        about = {"members": rows, "expired": expired, "invitations": open_, "revoked": revoked}
-        return {"team": found.team, **about}, lines
 
-    return run("members", work, wishes.json, desk.out)
+def _listed(wishes: argparse.Namespace, desk: Desk) -> Answer:
+    now = desk.wall()
+    found = known(wishes.node, desk)
+    rows: list[dict[str, Any]] = [
+        {
+            "name": each.name,
+            "roles": list(each.roles),
+            "until": each.not_after,
+            "renews": each.is_renewable,
+            "at": found.here.get(each.public, ""),
+            "key": each.public.hex(),
+        }
+        for each in found.members(now)
+    ]
+    expired: list[dict[str, Any]] = [
+        {"name": each.name, "roles": list(each.roles), "until": each.not_after, "key": each.public.hex()}
+        for each in found.expired(now)
+    ]
+    used = [each.member.invitation for each in found.roll.admissions()]
+    open_: list[dict[str, Any]] = [
+        {"name": each.name, "roles": list(each.roles), "left": each.uses - used.count(each.public)}
+        | {"until": each.not_after, "key": each.public.hex()}
+        for each in found.roll.invites()
+        if now < each.not_after and found.roll.revoked(each.public) is None
+        if used.count(each.public) < each.uses
+    ]
+    revoked = [{"name": each.name, "at": each.at, "key": each.public.hex()} for each in found.roll.revocations()]
+    width = max((len(row["name"]) for row in [*rows, *expired, *open_]), default=0)
+    lines = [f"team {found.team}, secret number {found.secret}"]
+    for row in rows:
+        until = day(row["until"])
+        where = place(row["at"])
+        renewal = "renewed automatically" if row["renews"] else "not renewed"
+        lines.append(f"  {row['name']:{width}}  {', '.join(row['roles'])}  until {until}, {renewal}  {where}")
+    for row in expired:
+        until = day(row["until"])
+        lines.append(f"  {row['name']:{width}}  expired {until}; to let it in again: swarm renew {row['name']}")
+    for row in open_:
+        until = day(row["until"], has_time=True)
+        lines.append(f"  {row['name']:{width}}  invited, {row['left']} left, until {until}")
+    lines += [f"  {row['name']:{width}}  revoked" for row in revoked]
+    about = {"members": rows, "expired": expired, "invitations": open_, "revoked": revoked}
+    return {"team": found.team, **about}, lines
 
 
 def place(address: str) -> str:

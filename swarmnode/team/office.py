@@ -20,7 +20,6 @@ from middleware.admission.certificate import Member
 from middleware.admission.errors import BadKeyFile
 from middleware.admission.operator import Operator
 from middleware.admission.roll import Roll
-from middleware.admission.statement import Invite
 from middleware.entangled.control.command import FAILED, WRONG, Ask, asked
 from middleware.entangled.control.place import NoControl, found
 from middleware.entangled.control.word import printable
@@ -79,10 +78,6 @@ class Known:
         there = ", ".join(each.name for each in members) or "nobody"
         raise Refusal(f"no member is called {name!r}; there are {there}")
 
-    def invites(self, name: str) -> list[Invite]:
-        """The invitations that were made for that name."""
-        return [each for each in self.roll.invites() if each.name == name]
-
 
 def options(prog: str, purpose: str, needs_key: bool = True, is_asked: bool = True) -> argparse.ArgumentParser:
     """The beginning of each verb's command line; ``is_asked`` where a node of this machine is asked."""
@@ -97,15 +92,31 @@ def options(prog: str, purpose: str, needs_key: bool = True, is_asked: bool = Tr
     return whole
 
 
-def run(prog: str, work: Callable[[], tuple[Any, Sequence[str]]], is_json: bool, out: TextIO) -> int:
-    """Do the work of a verb: an answer for programs, and lines for people; returns the exit code."""
+Answer = tuple[Any, Sequence[str]]
+"""The answer of a verb: a value for programs, and lines for people."""
+
+
+def run(
+    parser: argparse.ArgumentParser,
+    words: Sequence[str] | None,
+    desk: Desk | None,
+    work: Callable[[argparse.Namespace, Desk], Answer],
+) -> int:
+    """Read the command line of a verb, do its work, and print the answer; returns the exit code."""
+    desk = desk or Desk()
+    wishes = parser.parse_args(words)
     try:
-        answer, lines = work()
+        answer, lines = work(wishes, desk)
     except (Refusal, NoControl, Wrong, BadKeyFile) as problem:
-        sys.stderr.write(printable(f"swarm {prog}: {problem}") + "\n")
+        sys.stderr.write(printable(f"{parser.prog}: {problem}") + "\n")
         return FAILED if isinstance(problem, Refusal) else WRONG
-    out.write(json.dumps(answer) + "\n" if is_json else "".join(f"{line}\n" for line in lines))
+    desk.out.write(json.dumps(answer) + "\n" if wishes.json else "".join(f"{line}\n" for line in lines))
     return 0
+
+
+def day(moment: float, has_time: bool = False) -> str:
+    """A moment of the wall clock, for people."""
+    return time.strftime("%Y-%m-%d %H:%M UTC" if has_time else "%Y-%m-%d", time.gmtime(moment))
 
 
 def key_folder() -> Path:

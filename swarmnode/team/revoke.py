@@ -2,44 +2,42 @@
 
 from __future__ import annotations
 
+import argparse
 import re
 from collections.abc import Sequence
-from typing import Any
 
 from middleware.admission.certificate import Member
 from swarmnode.asker import Refusal
-from swarmnode.team.office import Desk, Known, known, operator_in, options, run, tell
+from swarmnode.team.office import Answer, Desk, Known, known, operator_in, options, run, tell
 
 
 def main(words: Sequence[str] | None = None, desk: Desk | None = None) -> int:
     """Run the command; returns its exit code."""
-    desk = desk or Desk()
     revoke = options("revoke", "Put a member out of the team, or end an invitation and put out all that came by it.")
     revoke.add_argument("name", metavar="NAME", help="of a member, or of an invitation; or its key in hexadecimal")
     revoke.add_argument("--invitation", action="store_true", help="the invitation of that name, not the member")
     revoke.add_argument("--all", action="store_true", help="a bootstrap node: with all that it let in or renewed")
-    wishes = revoke.parse_args(words)
+    return run(revoke, words, desk, _revoked)
 
-    def work() -> tuple[Any, list[str]]:
-        operator = operator_in(wishes.operator)
-        found = known(wishes.node, desk, operator)
-        public, what, came = _meant(found, wishes.name, wishes.invitation, desk.wall())
-        kept = [] if wishes.all else _admitted_by(found, public, desk.wall())
-        renewals = [] if wishes.all else _renewed_by(found, public, desk.wall())
-        try:
-            keys = [each.public for each in kept]
-            statement = operator.revoke(public, wishes.name[:40], desk.wall(), keys, renewals)
-        except ValueError as error:
-            raise Refusal(f"{error}; say --all, and invite those that are to stay anew") from error
-        tell(wishes.node, desk, statement)
-        lines = [f"{what} {wishes.name} is revoked; in force at all that can be reached within 10 seconds"]
-        lines += [f"  with it: {name}" for name in came]
-        lines += [f"  stays, though {wishes.name} let it in: {each.name}" for each in kept]
-        lines.append("What it knew stays known to it: give the team a new secret by swarm rotate")
-        kept_names = [each.name for each in kept]
-        return {"revoked": public.hex(), "what": what, "with": came, "kept": kept_names}, lines
 
-    return run("revoke", work, wishes.json, desk.out)
+def _revoked(wishes: argparse.Namespace, desk: Desk) -> Answer:
+    operator = operator_in(wishes.operator)
+    found = known(wishes.node, desk, operator)
+    public, what, came = _meant(found, wishes.name, wishes.invitation, desk.wall())
+    kept = [] if wishes.all else _admitted_by(found, public, desk.wall())
+    renewals = [] if wishes.all else _renewed_by(found, public, desk.wall())
+    try:
+        keys = [each.public for each in kept]
+        statement = operator.revoke(public, wishes.name[:40], desk.wall(), keys, renewals)
+    except ValueError as error:
+        raise Refusal(f"{error}; say --all, and invite those that are to stay anew") from error
+    tell(wishes.node, desk, statement)
+    lines = [f"{what} {wishes.name} is revoked; in force at all that can be reached within 10 seconds"]
+    lines += [f"  with it: {name}" for name in came]
+    lines += [f"  stays, though {wishes.name} let it in: {each.name}" for each in kept]
+    lines.append("What it knew stays known to it: give the team a new secret by swarm rotate")
+    kept_names = [each.name for each in kept]
+    return {"revoked": public.hex(), "what": what, "with": came, "kept": kept_names}, lines
 
 
 def _admitted_by(found: Known, public: bytes, now: float) -> list[Member]:

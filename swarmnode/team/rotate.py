@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Sequence
-from typing import Any
 
 from middleware.admission.statement import MAX_SEALED
 from swarmnode.asker import Refusal
-from swarmnode.team.office import Desk, known, operator_in, options, run, seconds, span, tell
+from swarmnode.team.office import Answer, Desk, known, operator_in, options, run, seconds, span, tell
 
 GRACE = 7 * 86_400.0
 """Seconds for which the secret before is accepted, so that who was off meanwhile comes back.  Less is safer."""
@@ -15,27 +15,25 @@ GRACE = 7 * 86_400.0
 
 def main(words: Sequence[str] | None = None, desk: Desk | None = None) -> int:
     """Run the command; returns its exit code."""
-    desk = desk or Desk()
     rotate = options("rotate", "Give the team a new secret, as after a member was lost or revoked.")
     rotate.add_argument(
         "--grace", type=seconds, default=GRACE, metavar="TIME", help="how long the one before is accepted (7d)"
     )
-    wishes = rotate.parse_args(words)
+    return run(rotate, words, desk, _rotated)
 
-    def work() -> tuple[Any, list[str]]:
-        operator = operator_in(wishes.operator)
-        found = known(wishes.node, desk, operator)
-        members = found.members(desk.wall())
-        if not members:
-            raise Refusal("this team has no members that the node knows of")
-        number = found.secret + 1
-        keys = [each.public for each in members][:MAX_SEALED]
-        tell(wishes.node, desk, operator.rotate(number, keys, desk.wall(), wishes.grace, desk.rng))
-        names = [each.name for each in members]
-        lines = [f"secret number {number} is for {', '.join(names)}", _until(wishes.grace)]
-        return {"number": number, "members": names, "grace": wishes.grace}, lines
 
-    return run("rotate", work, wishes.json, desk.out)
+def _rotated(wishes: argparse.Namespace, desk: Desk) -> Answer:
+    operator = operator_in(wishes.operator)
+    found = known(wishes.node, desk, operator)
+    members = found.members(desk.wall())
+    if not members:
+        raise Refusal("this team has no members that the node knows of")
+    number = found.secret + 1
+    keys = [each.public for each in members][:MAX_SEALED]
+    tell(wishes.node, desk, operator.rotate(number, keys, desk.wall(), wishes.grace, desk.rng))
+    names = [each.name for each in members]
+    lines = [f"secret number {number} is for {', '.join(names)}", _until(wishes.grace)]
+    return {"number": number, "members": names, "grace": wishes.grace}, lines
 
 
 def _until(grace: float) -> str:

@@ -69,7 +69,6 @@ class Counts:
     wrong: list[str] = field(default_factory=list)
 
     def __str__(self) -> str:
-        """One line of the table."""
         return (
             f"{self.subject:<18} {self.methods:>5} calls, {self.methods_refused:>5} refused"
             f"   {self.records:>5} records, {self.records_refused:>5} refused"
@@ -144,7 +143,6 @@ class Trial:
         return self.counts
 
     def stop(self) -> None:
-        """End the team and its insiders."""
         self.insider.endpoint.stop()
         self.accomplice.endpoint.stop()
         self.team.stop()

@@ -8,13 +8,13 @@ import pickle
 import random
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
-from twisted.logger import formatEvent, globalLogPublisher
+from twisted.logger import formatEvent
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.record import hashed_key
 from middleware.entangled.wire.message import Answer, Question, Told, decoded, encoded
+from tests.attacks.siege import events_of
 from tests.fleet import FleetCase
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -158,8 +158,6 @@ def _last(node: ast.AST) -> str:
 
 
 class TreeTests(SynchronousTestCase):
-    """What the tree does not have cannot be called."""
-
     def test_nothing_in_the_tree_runs_content(self) -> None:
         """No module of a node evaluates, unpickles, formats by or loads anything that it was sent."""
         found = [fault for module, tree in trees() for fault in faults_of(module, tree)]
@@ -190,20 +188,10 @@ class TreeTests(SynchronousTestCase):
 
 
 class ContentTests(FleetCase):
-    """What would run where anything reads it as code, sent as every kind of content."""
-
     def setUp(self) -> None:
-        """Nothing has fired; what is logged is kept."""
         super().setUp()
         FIRED.clear()
-        self.logged: list[str] = []
-        observer: Any = self.note
-        globalLogPublisher.addObserver(observer)
-        self.addCleanup(globalLogPublisher.removeObserver, observer)
-
-    def note(self, event: dict[str, Any]) -> None:
-        """Keep what is logged, as people read it."""
-        self.logged.append(formatEvent(event))
+        self.events = events_of(self)
 
     def test_the_corpus_fires(self) -> None:
         """The corpus is no dud: read as what it is, it fires."""
@@ -245,7 +233,8 @@ class ContentTests(FleetCase):
             )
         self.assertEqual(heard, texts)
         self.assertEqual(FIRED, [])
-        self.assertFalse([line for line in self.logged if "<class" in line or "49" in line and "7*7" in line])
+        logged = [formatEvent(event) for event in self.events]
+        self.assertFalse([line for line in logged if "<class" in line or "49" in line and "7*7" in line])
 
     def test_any_bytes_as_methods(self) -> None:
         """A method that nobody exposed is refused by name, whatever it is called."""

@@ -31,7 +31,6 @@ def member(ground: Ground) -> Contact:
 
 
 def sealed(ground: Ground, plain: bytes) -> bytes:
-    """A datagram of that member."""
     return next(iter(ground.other._sessions.values())).seal(plain)
 
 
@@ -50,7 +49,6 @@ class Spoofing(RuleBasedStateMachine):
         self.before = self.ground.state()
 
     def teardown(self) -> None:
-        """Leave nothing."""
         if hasattr(self, "ground"):
             self.ground.stop()
 
@@ -61,12 +59,10 @@ class Spoofing(RuleBasedStateMachine):
 
     @rule(kind=st.sampled_from(KINDS), size=st.integers(0, 1460), source=st.sampled_from(PLACES))
     def anything(self, kind: int, size: int, source: Address) -> None:
-        """Random bytes of a kind."""
         self.fire(bytes([kind]) + self.dice.randbytes(size), source)
 
     @rule(index=st.integers(0, 39), source=st.sampled_from(PLACES))
     def recorded(self, index: int, source: Address) -> None:
-        """What came before, from anywhere."""
         self.fire(self.ground.recorded[index % len(self.ground.recorded)], source)
 
     @rule(index=st.integers(0, 39), bit=st.integers(0, 11199), source=st.sampled_from(PLACES))
@@ -105,8 +101,6 @@ class Spoofing(RuleBasedStateMachine):
 
 
 class SpoofingTests(SynchronousTestCase):
-    """Whoever knows no key."""
-
     def test_any_sequence(self) -> None:
         """No sequence of forged, bent, recorded and guessed datagrams changes what a node remembers."""
         run_state_machine_as_test(Spoofing, settings=SEQUENCES)
@@ -121,10 +115,7 @@ class SpoofingTests(SynchronousTestCase):
 
 
 class ElsewhereTests(SynchronousTestCase):
-    """Answers that come from elsewhere, or from the wrong one."""
-
     def setUp(self) -> None:
-        """A node with a session to another one."""
         self.ground = Ground()
         self.addCleanup(self.ground.stop)
         self.counters = self.ground.target.counters

@@ -13,8 +13,9 @@ from middleware.entangled.network.switchboard import SwitchboardNetwork
 from middleware.entangled.record import hashed_key
 from middleware.entangled.wire.door import Noted
 from middleware.entangled.wire.session import MAX_RESPONSES, MAX_UNCONFIRMED
-from tests.attacks.siege import ClosedTeam, SiegeCase, Tape, network_of
+from tests.attacks.siege import SiegeCase
 from tests.fuzz.ground import state_of
+from tests.middleware.admission.village import Tape, Village, network_of
 
 ELSEWHERE = Address("10.9.9.9", 99)
 HOUR = 3600.0
@@ -29,7 +30,7 @@ class ReplayCase(SiegeCase):
         self.tape = Tape()
         self.runs: list[int] = []
         self.sent: Counter[int] = Counter()
-        self.team = self.siege()
+        self.team = self.village()
         self.tape.tap(network_of(self.team.houses[0]))
         self.team.tape = self.tape
         self.expose()
@@ -47,7 +48,7 @@ class ReplayCase(SiegeCase):
 
         self.team.houses[0].node.endpoint.expose("add", add, changes=True)
 
-    def work(self, team: ClosedTeam) -> None:
+    def work(self, team: Village) -> None:
         """What a team does: write, read, watch, remove, call."""
         first, second = team.houses[1].node, team.houses[2].node
         key = hashed_key("task")
@@ -61,7 +62,7 @@ class ReplayCase(SiegeCase):
         for each in done:
             self.successResultOf(each)
 
-    def states(self, team: ClosedTeam) -> list[str]:
+    def states(self, team: Village) -> list[str]:
         """The hash of what each node remembers that lasts."""
         found = []
         for house in team.houses:
@@ -83,7 +84,7 @@ class ReplayCase(SiegeCase):
 
     def replay(
         self,
-        team: ClosedTeam,
+        team: Village,
         to: Callable[[int], SwitchboardNetwork] | None = None,
         source: Address | None = None,
     ) -> None:
@@ -102,11 +103,11 @@ class ReplayCase(SiegeCase):
         self.assertEqual(self.runs, ran)
         self.assertLessEqual(self.bytes_out(team) - bytes_out, received)
 
-    def bytes_out(self, team: ClosedTeam) -> int:
+    def bytes_out(self, team: Village) -> int:
         """Bytes that a team's nodes have sent since it was frozen."""
         return self.sent[id(team)]
 
-    def freeze(self, team: ClosedTeam) -> None:
+    def freeze(self, team: Village) -> None:
         """Let nothing that is sent arrive: an answer to a recording would be the work of the one who plays it."""
         for house in team.houses:
             network: Any = house.node._network
@@ -118,8 +119,6 @@ class ReplayCase(SiegeCase):
 
 
 class ReplayTests(ReplayCase):
-    """The tape, whole."""
-
     def test_the_tape_is_rich(self) -> None:
         """The recording has each kind of datagram that a team sends, and many of them."""
         kinds = {datagram[0] for _, datagram, _ in self.tape.heard}
@@ -128,29 +127,21 @@ class ReplayTests(ReplayCase):
         self.assertEqual(self.runs, [0, 1, 2, 3, 4])
 
     def test_at_once(self) -> None:
-        """Played to the same nodes at once, from where it came."""
+        """Played at once to the same nodes, from another address, where no session moves to, and to other nodes."""
         self.freeze(self.team)
         self.replay(self.team)
-
-    def test_from_elsewhere(self) -> None:
-        """Played at once from another address: no session moves there."""
-        self.freeze(self.team)
         self.replay(self.team, source=ELSEWHERE)
         for house in self.team.houses:
             sessions = house.node.endpoint._sessions.values()
             self.assertNotIn(ELSEWHERE, [session.contact.address for session in sessions])
+        count = len(self.team.houses)
+        self.replay(self.team, to=lambda place: network_of(self.team.houses[(place + 1) % count]))
 
     def test_an_hour_later(self) -> None:
         """Played after an hour, when no response is remembered any more."""
         self.team.run(HOUR)
         self.freeze(self.team)
         self.replay(self.team)
-
-    def test_to_others(self) -> None:
-        """Played to other members of the team than it was sent to."""
-        self.freeze(self.team)
-        count = len(self.team.houses)
-        self.replay(self.team, to=lambda place: network_of(self.team.houses[(place + 1) % count]))
 
     def test_after_a_restart(self) -> None:
         """Played to the next life of each node, which shares no session with the one before."""
@@ -167,7 +158,7 @@ class ReplayTests(ReplayCase):
 
     def test_to_another_team(self) -> None:
         """Played to another team, which answers nothing at all."""
-        other = self.siege(seed=2)
+        other = self.village(seed=2)
         for name in ("dog", "cat", "pig"):
             other.enlist(name)
         other.run(3.0)

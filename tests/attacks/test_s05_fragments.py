@@ -31,7 +31,6 @@ class CourierCase(SynchronousTestCase):
     """A courier, and members by their keys."""
 
     def setUp(self) -> None:
-        """A courier that delivers to a list."""
         self.clock = HeapClock()
         self.counters: Counter[str] = Counter()
         self.delivered: list[tuple[bytes, int]] = []
@@ -48,7 +47,6 @@ class CourierCase(SynchronousTestCase):
         self.addCleanup(self.courier.stop)
 
     def take(self, member: int, plain: bytes) -> None:
-        """Let a part of a member come in."""
         session: Any = OneSession(member.to_bytes(32, "little"))
         self.courier.on_part(session, plain)
 
@@ -64,8 +62,6 @@ class CourierCase(SynchronousTestCase):
 
 
 class FragmentTests(CourierCase):
-    """What one or many may pile up."""
-
     def test_never_completed(self) -> None:
         """One member has at most its own share in assembly, and after ten seconds nothing any more."""
         for number in range(2000):
@@ -145,8 +141,6 @@ class FragmentTests(CourierCase):
 
 
 class EndToEndTests(SynchronousTestCase):
-    """A member that sends parts by hand, and a node that goes on working."""
-
     def test_a_transfer_beside(self) -> None:
         """While a member fills its share with parcels that never end, another message of 64 KiB of its own passes."""
         ground = Ground()

@@ -6,17 +6,15 @@ import random
 from collections.abc import Callable
 from typing import Any
 
-from twisted.logger import LogLevel, globalLogPublisher
+from twisted.logger import LogLevel
 
 from middleware.admission import certificate, knock, reception
 from middleware.admission.code import drawn
 from middleware.admission.roll import invitation_id
-from middleware.entangled.contact import Contact
 from middleware.entangled.identity import Identity, exchange_key
 from middleware.entangled.network.network import Address
 from middleware.entangled.wire import answerer
 from middleware.entangled.wire import endpoint as wire
-from middleware.entangled.wire.endpoint import Endpoint
 from middleware.entangled.wire.greeting import MOST_RATE, QUIET_RATE
 from middleware.entangled.wire.hail import HAIL_BYTES, RATE, hail
 from middleware.entangled.wire.message import Question, encoded
@@ -30,7 +28,8 @@ from middleware.entangled.wire.session import (
     Hello,
     Invitation,
 )
-from tests.attacks.siege import SOURCE, ClosedTeam, SiegeCase, network_of
+from tests.attacks.siege import SOURCE, SiegeCase, events_of
+from tests.middleware.admission.village import Village, network_of
 
 PER_SECOND = 2000
 SECONDS = 3
@@ -42,13 +41,12 @@ class FloodCase(SiegeCase):
     def setUp(self) -> None:
         """Count exchanges of keys, signatures checked, bytes and log lines."""
         super().setUp()
-        self.team: ClosedTeam = self.siege()
+        self.team: Village = self.village()
         self.house = self.team.houses[0]
         port: Any = network_of(self.house)
         self.network = port
         self.exchanges: list[float] = []
         self.checked: list[float] = []
-        self.lines: list[str] = []
         self.sent: list[tuple[bytes, Address]] = []
         accept, is_proof, send = Acceptance, certificate.is_proof, self.network.send
 
@@ -67,14 +65,11 @@ class FloodCase(SiegeCase):
         self.patch(wire, "Acceptance", accepted)
         self.patch(reception, "is_proof", proved)
         port.send = sends
-        observer: Any = self.note
-        globalLogPublisher.addObserver(observer)
-        self.addCleanup(globalLogPublisher.removeObserver, observer)
+        self.events = events_of(self)
 
-    def note(self, event: dict[str, Any]) -> None:
-        """Keep what is logged."""
-        if event["log_level"] >= LogLevel.info:
-            self.lines.append(str(event.get("log_format")))
+    @property
+    def lines(self) -> list[str]:
+        return [str(each.get("log_format")) for each in self.events if each["log_level"] >= LogLevel.info]
 
     def flood(self, made: Callable[[int], bytes], seconds: int = SECONDS) -> int:
         """Send what ``made`` makes from a thousand addresses; the bytes that were sent by the flood."""
@@ -88,17 +83,18 @@ class FloodCase(SiegeCase):
                 self.team.run(100 / PER_SECOND)
         return total
 
+    def answers(self) -> list[bytes]:
+        """What was sent to the addresses of the flood."""
+        return [datagram for datagram, to in self.sent if to.port == 999]
+
 
 class FloodTests(FloodCase):
-    """What each flood costs."""
-
     def test_forged_handshakes(self) -> None:
         """INITs of a good form and a wrong mac cost a hash each: no keys are exchanged, nothing is sent or kept."""
         dice = random.Random(1)
-        before = len(self.sent)
         self.flood(lambda number: bytes([INIT]) + dice.randbytes(1300))
         self.assertEqual((len(self.exchanges), self.lines), (0, []))
-        self.assertEqual([to for _, to in self.sent[before:] if to.port == 999], [])
+        self.assertEqual(self.answers(), [])
 
     def handshakes(self) -> Callable[[int], bytes]:
         """INITs of who holds the team's secret (a member gone bad), with ever new ephemeral keys."""
@@ -118,8 +114,7 @@ class FloodTests(FloodCase):
         """From a member that floods without reading what comes back, as many keys are exchanged as one second has."""
         received = self.flood(self.handshakes())
         self.assertLessEqual(len(self.exchanges), QUIET_RATE * (SECONDS + 2))
-        back = sum(len(datagram) for datagram, to in self.sent if to.port == 999)
-        self.assertLessEqual(back, received)
+        self.assertLessEqual(sum(map(len, self.answers())), received)
         half = self.house.node.endpoint._half_open
         self.assertLessEqual(len(half._responses), MAX_RESPONSES)
         self.assertLessEqual(len(half._unconfirmed), MAX_UNCONFIRMED)
@@ -139,9 +134,8 @@ class FloodTests(FloodCase):
     def test_knocks(self) -> None:
         """KNOCKs that name no invitation cost a look into a table; few are answered and few lines are logged."""
         dice = random.Random(3)
-        before = len(self.sent)
         received = self.flood(lambda number: bytes([knock.KNOCK]) + dice.randbytes(knock.KNOCK_BYTES - 1))
-        answers = [datagram for datagram, to in self.sent[before:] if to.port == 999]
+        answers = self.answers()
         self.assertLessEqual(len(answers), reception.HINTS * (SECONDS + 1))
         self.assertLessEqual(sum(map(len, answers)), received)
         self.assertEqual((self.checked, len(self.exchanges)), ([], 0))
@@ -154,10 +148,9 @@ class FloodTests(FloodCase):
         self.assertTrue(code)
         dice = random.Random(4)
         head = bytes([knock.KNOCK]) + invitation_id(invite.public)
-        before = len(self.sent)
         self.flood(lambda number: head + dice.randbytes(knock.KNOCK_BYTES - len(head)), 1)
         self.assertEqual(self.checked, [])
-        self.assertEqual([to for _, to in self.sent[before:] if to.port == 999], [])
+        self.assertEqual(self.answers(), [])
 
     def test_knocks_of_who_has_the_code(self) -> None:
         """Of KNOCKs with a true code, each by another key, so many signatures are checked as one second has."""
@@ -171,17 +164,15 @@ class FloodTests(FloodCase):
         ]
         received = self.flood(lambda number: kept[number % 400], 2)
         self.assertLessEqual(len(self.checked), reception.RATE * 4)
-        back = sum(len(datagram) for datagram, to in self.sent if to.port == 999)
-        self.assertLessEqual(back, received)
+        self.assertLessEqual(sum(map(len, self.answers())), received)
         self.team.run(3.0)
         self.assertEqual(len(self.team.members()), 2)
         self.assertNotEqual(drawn(self.team.signer.public, dice).text, code.text)
 
     def test_hails(self) -> None:
         """Of HAILs twenty a second are answered, each with as much as came."""
-        before = len(self.sent)
         self.flood(lambda number: hail(number.to_bytes(16, "little")))
-        answers = [datagram for datagram, to in self.sent[before:] if to.port == 999]
+        answers = self.answers()
         self.assertLessEqual(len(answers), RATE * (SECONDS + 1))
         self.assertLessEqual({len(datagram) for datagram in answers}, {HAIL_BYTES})
 
@@ -204,18 +195,14 @@ class FloodTests(FloodCase):
         self.assertLessEqual(len(ran), answerer.QUESTIONS_AT_ONCE + answerer.QUESTIONS * seconds)
         self.assertGreater(len(ran), answerer.QUESTIONS_AT_ONCE)
         self.assertGreater(self.house.node.endpoint.counters["busy"], 2000)
-        self.assertIn(b"busy", b"".join(map(str.encode, self.failures(bad, contact))))
+        refused = self.outcome(self.team, bad.ask(contact, "device.settings"), 0.01)
+        self.assertEqual(getattr(refused, "code", ""), "busy")
         friend, _ = self.insider(self.team, "friend", at=SOURCE._replace(port=667))
         self.outcome(self.team, friend.ask(contact, "device.settings"))
         self.assertEqual(ran[-1], max(ran))
         self.team.run(10.0)
         self.outcome(self.team, bad.ask(contact, "device.settings"))
         self.assertGreater(ran[-1], began + seconds + 5.0)
-
-    def failures(self, bad: Endpoint, contact: Contact) -> list[str]:
-        """The code of what is refused just now."""
-        outcome = self.outcome(self.team, bad.ask(contact, "device.settings"), 0.01)
-        return [str(getattr(outcome, "code", ""))]
 
     def test_a_cookie_of_another(self) -> None:
         """A cookie pays for the address that it was given to, and for no other."""

@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from middleware.admission.membership import Membership
-from middleware.entangled.errors import NotAdmitted
 from middleware.entangled.record import hashed_key
-from tests.attacks.siege import SOURCE, ClosedTeam, SiegeCase, network_of
-from tests.middleware.admission.village import House
+from tests.attacks.siege import SOURCE, SiegeCase
+from tests.middleware.admission.village import House, Village, network_of
 
 IN_FORCE = 10.0
 
@@ -19,9 +18,8 @@ class RevocationCase(SiegeCase):
     members = 9
 
     def setUp(self) -> None:
-        """Everybody knows everybody."""
         super().setUp()
-        self.team: ClosedTeam = self.siege(bootstraps=2)
+        self.team: Village = self.village(bootstraps=2)
         for number in range(2, self.members):
             self.team.enlist(f"dog{number}", "device", "operator", "bootstrap")
         self.team.run(10.0)
@@ -44,9 +42,7 @@ class RevocationCase(SiegeCase):
 
     def refusals(self, bare: Any, among: list[House]) -> set[str]:
         """What hands that go on with the stolen identity are told."""
-        asked = [bare.ask(self.team.contact(house), "ping", bytes(8), changes=True) for house in among]
-        outcomes = [self.outcome(self.team, each, 0.5) for each in asked]
-        return {each.code if isinstance(each, NotAdmitted) else "LET IN" for each in outcomes}
+        return {self.refusal(self.team, bare.ask, house, 0.5) for house in among}
 
     def bare(self, at: int = 1, life: int = 2**62) -> Any:
         """Hands with the identity, the pass and the secret of the stolen store, on another machine, in a later life."""
@@ -56,8 +52,6 @@ class RevocationCase(SiegeCase):
 
 
 class TwentyTests(RevocationCase):
-    """A team of twenty."""
-
     members = 20
 
     def test_out_within_ten_seconds(self) -> None:
@@ -83,8 +77,6 @@ class TwentyTests(RevocationCase):
 
 
 class RevocationTests(RevocationCase):
-    """A smaller team."""
-
     def test_across_a_restart(self) -> None:
         """Nodes that were restarted since still refuse it, with nobody there to ask."""
         self.revoke()

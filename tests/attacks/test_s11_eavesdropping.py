@@ -11,7 +11,8 @@ from collections.abc import Iterable
 
 from middleware.entangled.identity import node_id
 from middleware.entangled.record import hashed_key
-from tests.attacks.siege import SiegeCase, Tape
+from tests.attacks.siege import SiegeCase
+from tests.middleware.admission.village import Tape, network_of
 
 WORDS = ("rosa-kennel-17", "fetch the crimson ball", "x=12.3456 y=-7.8910", "jumping over the hedge", "hedgehog")
 PLACE = b'{"x": 12.345678, "y": -7.891011}'
@@ -29,16 +30,13 @@ def found(stream: Iterable[bytes], needles: Iterable[bytes]) -> list[bytes]:
 
 
 class EavesdroppingTests(SiegeCase):
-    """An ear on every wire, from the first datagram on."""
-
     def setUp(self) -> None:
         """Joining by code, writing, reading, watching, calling, leaving, all of it on tape."""
         super().setUp()
-        self.team = self.siege()
+        self.team = self.village()
         self.tape = Tape()
         self.team.tape = self.tape
-        network = self.team.houses[0].node._network
-        self.tape.tap(network)  # type: ignore[arg-type]
+        self.tape.tap(network_of(self.team.houses[0]))
         self.dog = self.team.enlist(WORDS[0])
         self.cat = self.team.welcome("hedgehog")
         self.key = hashed_key("task")

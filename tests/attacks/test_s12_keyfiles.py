@@ -9,7 +9,7 @@ import stat
 from pathlib import Path
 from typing import Any
 
-from twisted.logger import formatEvent, globalLogPublisher
+from twisted.logger import formatEvent
 
 from middleware.admission import keyfile, membership, operator
 from middleware.admission.errors import BadKeyFile
@@ -17,14 +17,12 @@ from middleware.admission.membership import Membership, MembershipFile
 from middleware.admission.operator import Operator
 from middleware.entangled.data.sqlite import SqliteStore
 from middleware.entangled.identity import Identity
-from tests.attacks.siege import SOURCE, SiegeCase
+from tests.attacks.siege import SOURCE, SiegeCase, events_of
 from tests.middleware.admission.paper import NOW
 from tests.middleware.admission.paper import operator as drawn
 
 
 class FileTests(SiegeCase):
-    """The files."""
-
     def setUp(self) -> None:
         """A membership and an operator's key, each in its file."""
         super().setUp()
@@ -37,13 +35,16 @@ class FileTests(SiegeCase):
         operator.made(self.folder / "operator", self.signer)
 
     def test_made_for_the_owner_alone(self) -> None:
-        """New files have the mode 0600, whatever the process lets others read by default, and so have replaced ones."""
+        """New and replaced files, and those of the store, have the mode 0600, whatever the process lets others read."""
         before = os.umask(0)
         self.addCleanup(os.umask, before)
         membership.made(self.folder / "other", self.paper)
         found = MembershipFile(self.folder / "other")
         found.keep(self.paper.with_secret(2, bytes(32), 0))
-        for path in (*self.files, self.folder / "other"):
+        store = SqliteStore.open(self.folder / "store.db", 0.0)
+        store.note("x", b"y")
+        store.close()
+        for path in (*self.files, self.folder / "other", *self.folder.glob("store.db*")):
             self.assertEqual(stat.S_IMODE(path.stat().st_mode), 0o600, path)
 
     def test_readable_by_others(self) -> None:
@@ -57,13 +58,11 @@ class FileTests(SiegeCase):
             load(path)
 
     def test_no_file_at_all(self) -> None:
-        """A folder, a pipe, a link to nowhere and rubbish are refused by name, and no content of them is said."""
-        pipe = self.folder / "pipe"
+        """A folder, a link to nowhere and rubbish are refused by name, and no content of them is said."""
         (self.folder / "dir").mkdir()
         (self.folder / "nowhere").symlink_to(self.folder / "gone")
         (self.folder / "rubbish").write_bytes(b'{"seed": "topsecretseed"')
         (self.folder / "rubbish").chmod(0o600)
-        self.assertFalse(pipe.exists())
         for name in ("dir", "nowhere", "rubbish", "gone"):
             for load in self.files.values():
                 error = self.assertRaises(BadKeyFile, load, self.folder / name)
@@ -79,32 +78,12 @@ class FileTests(SiegeCase):
         self.assertNotIn(self.signer.seed.hex(), (self.folder / "membership").read_text())
         self.assertNotIn(self.signer.seed.hex(), str(keyfile.read(self.folder / "membership")))
 
-    def test_the_store_is_for_the_owner_alone(self) -> None:
-        """The file of records, and what the database keeps beside it, are mode 0600, too."""
-        before = os.umask(0)
-        self.addCleanup(os.umask, before)
-        store = SqliteStore.open(self.folder / "store.db", 0.0)
-        store.note("x", b"y")
-        store.close()
-        for path in self.folder.glob("store.db*"):
-            self.assertEqual(stat.S_IMODE(path.stat().st_mode), 0o600, path)
-
 
 class SaidTests(SiegeCase):
-    """What is logged, shown and told."""
-
     def setUp(self) -> None:
         """Everything that is logged is kept, with its fields."""
         super().setUp()
-        self.logged: list[str] = []
-        observer: Any = self.note
-        globalLogPublisher.addObserver(observer)
-        self.addCleanup(globalLogPublisher.removeObserver, observer)
-
-    def note(self, event: dict[str, Any]) -> None:
-        """Keep an event as text, and all its fields."""
-        self.logged.append(formatEvent(event))
-        self.logged.append(" ".join(f"{value!r} {value}" for name, value in event.items() if name != "log_logger"))
+        self.events = events_of(self)
 
     def secrets(self, team: Any) -> list[str]:
         """Every secret of a team, in the forms that a text may have."""
@@ -116,7 +95,7 @@ class SaidTests(SiegeCase):
 
     def test_nothing_in_logs(self) -> None:
         """A team joins, invites, admits, refuses, revokes, rotates and restarts, and no secret or code is logged."""
-        team = self.siege()
+        team = self.village()
         dog = team.welcome("dog")
         code = team.invite("cat")
         team.knock(code, timeout=3.0).addErrback(lambda failure: None)
@@ -131,14 +110,15 @@ class SaidTests(SiegeCase):
         team.close(team.houses[0])
         team.open(team.houses[0])
         team.run(5.0)
-        text = "\n".join(self.logged)
-        self.assertGreater(len(self.logged), 20)
+        fields = [f"{value!r} {value}" for each in self.events for name, value in each.items() if name != "log_logger"]
+        text = "\n".join([*map(formatEvent, self.events), *fields])
+        self.assertGreater(len(self.events), 10)
         self.assertIn("revoked", text)
         self.assertEqual([each for each in (*self.secrets(team), code) if each in text], [])
 
     def test_nothing_in_representations(self) -> None:
         """What stands for an identity, a membership, an operator or a welcome in a traceback shows no secret."""
-        team = self.siege()
+        team = self.village()
         house = team.houses[0]
         shown = [
             *(repr(each) + str(each) for each in (house.kept.membership, house.kept, team.signer, house.team)),
@@ -151,7 +131,7 @@ class SaidTests(SiegeCase):
 
     def test_nothing_is_told_to_members(self) -> None:
         """What any member may ask for holds neither another's seed nor the operator's key."""
-        team = self.siege()
+        team = self.village()
         team.enlist("dog")
         bare, _ = self.insider(team, "eye", "viewer")
         contact = team.contact(team.houses[0])

@@ -15,8 +15,8 @@ from middleware.entangled.space.tuplespace import TupleSpace
 from middleware.stop.halt import HALT, SLOT
 from middleware.stop.stop_set import Statement
 from middleware.tasks.task import TASKS
-from tests.attacks.siege import SOURCE, ClosedTeam, SiegeCase
-from tests.middleware.admission.village import House
+from tests.attacks.siege import SOURCE, SiegeCase
+from tests.middleware.admission.village import House, Village
 
 JUNK = 12_400
 PAGE = 60
@@ -33,9 +33,8 @@ class RecordCase(SiegeCase):
     """A team of four that are in touch."""
 
     def setUp(self) -> None:
-        """Everybody knows everybody."""
         super().setUp()
-        self.team: ClosedTeam = self.siege()
+        self.team: Village = self.village()
         for name in ("dog1", "dog2", "dog3"):
             self.team.enlist(name, DEVICE)
         self.team.run(10.0)
@@ -78,10 +77,7 @@ class RecordCase(SiegeCase):
 
 
 class InventedKeyTests(RecordCase):
-    """Records of an owner that is on no membership list."""
-
     def setUp(self) -> None:
-        """A viewer with a good pass."""
         super().setUp()
         self.invented = Identity(b"invented".ljust(32))
         self.records = self.forged(self.invented)
@@ -173,10 +169,7 @@ class InventedKeyTests(RecordCase):
 
 
 class RevokedKeyTests(RecordCase):
-    """Records of an operator that was revoked."""
-
     def setUp(self) -> None:
-        """An operator that has ordered something."""
         super().setUp()
         self.boss = self.team.enlist("boss", OPERATOR)
         self.team.enlist("dog4", DEVICE)
@@ -257,8 +250,6 @@ class RevokedKeyTests(RecordCase):
 
 
 class FloodTests(RecordCase):
-    """A member that may write, and does nothing else."""
-
     def test_it_fills_its_own_share_only(self) -> None:
         """One device that floods every store fills its own share of it, and everybody else goes on."""
         team = self.team
@@ -296,8 +287,6 @@ class FloodTests(RecordCase):
 
 
 class GuestTests(RecordCase):
-    """What a guest of a gateway may write reaches those that never met it."""
-
     def test_second_hand(self) -> None:
         """A node that joined after the guest left has its record, believes it, and still does after a restart."""
         team = self.team

@@ -15,18 +15,18 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.admission import knock
 from middleware.admission.certificate import chained, proof
-from middleware.admission.code import Code, mark_of, read
+from middleware.admission.code import Code, TermsContent, mark_of, read, seal_terms
 from middleware.admission.knock import Knock, Signer, Welcome
 from middleware.admission.membership import Membership
 from middleware.admission.newcomer import Newcomer
 from middleware.admission.operator import Operator
 from middleware.admission.statement import Invite, Terms, opened, signed
-from middleware.admission.terms import TermsContent, seal_terms
 from middleware.entangled.errors import Forged
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.network import Address
 from swarmnode.team.init import SHARED, settings_text
-from tests.attacks.siege import ClosedTeam, SiegeCase
+from tests.attacks.siege import SiegeCase
+from tests.middleware.admission.village import Village
 
 DOOR = Address("10.6.6.6", 666)
 LINE = st.text(st.characters(exclude_categories=("C", "Z")), min_size=1, max_size=40)
@@ -38,9 +38,8 @@ class JoinTests(SiegeCase):
     """A team with a code that is open, and a hostile member that knows all that a member knows."""
 
     def setUp(self) -> None:
-        """Make the team, the code, and the member."""
         super().setUp()
-        self.team: ClosedTeam = self.siege()
+        self.team: Village = self.village()
         self.code: Code = read(self.team.invite("dog"))
         self.invitation = self.code.key.public
         self.eye = self.team.enlist("eye", "viewer")
@@ -60,7 +59,8 @@ class JoinTests(SiegeCase):
 
         network.listen(received)
         self.addCleanup(network.close)
-        newcomer = Newcomer(self.code, NEWCOMER.seed, self.network(), self.team.clock, random.Random(8))
+        port = self.team.board.network("10.0.0.2", 9999)
+        newcomer = Newcomer(self.code, NEWCOMER.seed, port, self.team.clock, random.Random(8))
         joined: list[Membership] = []
         failed: list[Exception] = []
         work: Deferred[Any] = newcomer.join([DOOR, self.team.address_of(self.team.houses[0])], 12.0)
@@ -73,13 +73,15 @@ class JoinTests(SiegeCase):
         self.assertEqual(dict(membership.settings), {})
         self.assertEqual(membership.secrets[0][1], self.team.houses[0].kept.membership.secrets[0][1])
 
-    def network(self) -> Any:
-        """The newcomer's own port."""
-        return self.team.board.network("10.0.0.2", 9999)
+    def signer(self, identity: Identity, granted: Identity, role: str, terms: bytes = b"") -> Signer:
+        """A node that answers with the true operator's grant for the key of ``granted``, by the true or other terms."""
+        grant = self.team.signer.grant(granted.public, "eye", (role,), self.team.wall())
+        return Signer(identity, grant, terms or self.terms)
 
-    def grant(self, identity: Identity, *roles: str) -> bytes:
-        """The true operator's grant for a key."""
-        return self.team.signer.grant(identity.public, "eye", roles, self.team.wall())
+    def give(self, signer: Signer, shown: bytes) -> Answer:
+        """Answer each KNOCK with a pass and a secret that the operator never gave."""
+        given = Welcome(shown, ((9, b"x" * 32, 0),))
+        return lambda datagram, heard: knock.welcome(self.invitation, heard, given, signer, self.rng)
 
     def forge(self, heard: Knock, operator: Operator, terms: bytes) -> bytes:
         """Make a complete WELCOME by another operator: invitation, bootstrap node, pass and all."""
@@ -118,21 +120,17 @@ class JoinTests(SiegeCase):
 
     def test_secrets_of_a_member(self) -> None:
         """A member without the role bootstrap can give no secret and no pass in the true operator's name."""
-        identity = self.eye.team.identity
-        signer = Signer(identity, self.grant(identity, "viewer"), self.terms)
-        given = Welcome(self.eye.kept.membership.shown, ((9, b"x" * 32, 0),))
-        self.check_true_team(lambda datagram, heard: knock.welcome(self.invitation, heard, given, signer, self.rng))
+        signer = self.signer(self.eye.team.identity, self.eye.team.identity, "viewer")
+        self.check_true_team(self.give(signer, self.eye.kept.membership.shown))
 
     def test_a_grant_of_another_node(self) -> None:
         """The terms, a grant and the newcomer's own pass, which every member knows, do not let another key sign."""
-        boot = self.team.houses[0].team.identity
         self.team.knock(self.code.text, seed=NEWCOMER.seed)
         self.team.run(8.0)
         admission = self.eye.team.roll.admitted(NEWCOMER.public)
         assert admission is not None
-        signer = Signer(self.eye.team.identity, self.grant(boot, "bootstrap"), self.terms)
-        given = Welcome(admission.shown, ((9, b"x" * 32, 0),))
-        self.check_true_team(lambda datagram, heard: knock.welcome(self.invitation, heard, given, signer, self.rng))
+        signer = self.signer(self.eye.team.identity, self.team.houses[0].team.identity, "bootstrap")
+        self.check_true_team(self.give(signer, admission.shown))
 
     def test_terms_of_another_invitation(self) -> None:
         """Terms that the operator sealed for another code open with that code only."""
@@ -140,23 +138,20 @@ class JoinTests(SiegeCase):
         statement = opened(self.team.signer.public, other.terms)
         assert isinstance(statement, Terms)
         boot = self.team.houses[0].team.identity
-        signer = Signer(boot, self.grant(boot, "bootstrap"), statement.sealed)
-        given = Welcome(self.team.houses[0].kept.membership.shown, ((9, b"x" * 32, 0),))
-        self.check_true_team(lambda datagram, heard: knock.welcome(self.invitation, heard, given, signer, self.rng))
+        signer = self.signer(boot, boot, "bootstrap", statement.sealed)
+        self.check_true_team(self.give(signer, self.team.houses[0].kept.membership.shown))
 
     def test_an_old_answer(self) -> None:
         """The recorded answer to an earlier attempt, by the true bootstrap node, does not open for a later one."""
         boot = self.team.houses[0].team.identity
-        signer = Signer(boot, self.grant(boot, "bootstrap"), self.terms)
         old = Knock(NEWCOMER.public, bindings.crypto_scalarmult_base(b"o" * 32), "", b"")
-        given = Welcome(self.team.houses[0].kept.membership.shown, ((9, b"x" * 32, 0),))
-        recorded = knock.welcome(self.invitation, old, given, signer, self.rng)
+        answer = self.give(self.signer(boot, boot, "bootstrap"), self.team.houses[0].kept.membership.shown)
+        recorded = answer(b"", old)
         self.check_true_team(lambda datagram, heard: recorded)
 
     def test_a_forged_refusal(self) -> None:
         """A refusal that a member without the role bootstrap signs does not end the attempt."""
-        identity = self.eye.team.identity
-        signer = Signer(identity, self.grant(identity, "viewer"), self.terms)
+        signer = self.signer(self.eye.team.identity, self.eye.team.identity, "viewer")
         self.check_true_team(lambda datagram, heard: knock.refusal(self.invitation, heard, "used", signer, self.rng))
 
     def test_a_hint(self) -> None:
@@ -165,7 +160,7 @@ class JoinTests(SiegeCase):
 
     def test_an_invitation_without_terms(self) -> None:
         """A newcomer with a code of an older version is let in by nobody, and is told to ask for another code."""
-        village = self.siege(seed=3)
+        village = self.village(seed=3)
         old = village.signer.invite("dog", ("device",), 1, village.wall(), 3600.0, village.dice)
         village.tell(old.invite)
         village.run(1.0)
@@ -175,8 +170,6 @@ class JoinTests(SiegeCase):
 
 
 class SettingsTests(SynchronousTestCase):
-    """The settings that a newcomer gets."""
-
     @settings(max_examples=100, deadline=None, derandomize=True, database=None)
     @given(LINE, LINE)
     def test_no_text_becomes_structure(self, kind: str, membership: str) -> None:

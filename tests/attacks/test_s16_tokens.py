@@ -65,7 +65,6 @@ class PageCase(SynchronousTestCase):
     """A closed team of real nodes; each of ``webs`` serves a page."""
 
     def setUp(self) -> None:
-        """Sign in as the operator at vaio."""
         self.team = TokenTeam()
         self.addCleanup(self.team.stop)
         self.webs = {name: self.web(name, port) for port, name in enumerate(("vaio", "pi", "nuc", "eve"), 8080)}
@@ -85,15 +84,12 @@ class PageCase(SynchronousTestCase):
         return Web(signed, followed, node, settings)
 
     def now(self) -> float:
-        """The wall clock of all."""
         return self.team.clock.seconds()
 
     def run_for(self, seconds: float) -> None:
-        """Let time pass."""
         self.team.clock.advance(seconds)
 
     def signed(self, web: Web, proof: str = CODE, source: str = HOME) -> Token:
-        """A session at a web node."""
         return self.successResultOf(web.sessions.sign_in(proof, source, self.now()))
 
     def refused(self, web: Web, proof: str, source: str = HOME, later: float = 0.0) -> int:
@@ -118,7 +114,6 @@ class PageCase(SynchronousTestCase):
         self.run_for(IN_FORCE)
 
     def revoke(self, name: str) -> None:
-        """The operator revokes a member."""
         web = self.webs[name]
         self.tell(self.team.operator.revoke(web.node.entangled.identity.public, name, self.now()))
 
@@ -156,10 +151,7 @@ def old_token(secret: bytes, until: int, limit: int) -> str:
 
 
 class MintTests(PageCase):
-    """A viewer, who holds the team's secret as all members do."""
-
     def claim(self, seconds: float = 365 * 86_400.0) -> Claim:
-        """An operator, for a year."""
         end = int(self.now() + seconds)
         return Claim("ab" * 8, "eve", "operator", end, limit=end)
 
@@ -194,8 +186,6 @@ class MintTests(PageCase):
 
 
 class StandingTests(PageCase):
-    """Gateways that are gateways no more."""
-
     def test_revoked_gateway(self) -> None:
         """What a revoked gateway signed lets in nobody at once, without a restart, nor what was made of it since."""
         signed = self.signed(self.pi)
@@ -246,8 +236,6 @@ class StandingTests(PageCase):
 
 
 class FailoverTests(PageCase):
-    """A viewer who advertises a page, and waits for the browser."""
-
     def test_advertise_a_page(self) -> None:
         """A viewer's page is on nobody's list, its origin may ask nothing, and no token is made for it."""
         told = {page.node for page in self.pi.fallbacks.here()}
@@ -289,8 +277,6 @@ class FailoverTests(PageCase):
 
 
 class GuessTests(PageCase):
-    """Somebody who guesses the code from many addresses."""
-
     def test_guess_from_many_addresses(self) -> None:
         """Of ten thousand guesses, each from an address of its own, in an hour, few are looked at."""
         looked = 0
@@ -314,8 +300,6 @@ class GuessTests(PageCase):
 
 
 class LogTests(SynchronousTestCase):
-    """Somebody who reads the log."""
-
     def test_read_the_log(self) -> None:
         """The log says where the page is, and neither the code nor a link with it."""
         self.patch(os, "environ", {**os.environ, "XDG_RUNTIME_DIR": self.mktemp()})
@@ -327,8 +311,6 @@ class LogTests(SynchronousTestCase):
 
 
 class RebindingTests(SynchronousTestCase):
-    """A site on the LAN that points its own name at the web node."""
-
     def test_rebind_a_local_name(self) -> None:
         """A name of the LAN that is not the node's own is refused; its own and those of the settings serve."""
         board, state = Board(MemoryDesk(), OpenSessions()), state_of([], [], {}, node="vaio")
@@ -344,8 +326,6 @@ class RebindingTests(SynchronousTestCase):
 
 
 class TlsTests(PageCase):
-    """A member who wants to pass for the page before the phones that trust the team."""
-
     if find_spec("OpenSSL") is None or find_spec("cryptography") is None:
         skip = "TLS IS NOT TESTED: missing OpenSSL or cryptography (pip install 'swarm-node[tls]')"
 

@@ -16,13 +16,13 @@ from middleware.entangled.identity import Identity
 from middleware.entangled.record import Record, Slot
 from middleware.stop.halt import HALT, METHOD, NO_ROBOT, SLOT, STANDS, UNSAVED, Halt, answer_halt
 from middleware.stop.stop_set import ID_BYTES, MAX_NAMED, MAX_OF_SENDER, MAX_RELEASED, MAX_SENDERS
-from tests.attacks.siege import SOURCE, ClosedTeam, SiegeCase, Tape
-from tests.middleware.admission.village import House
+from tests.attacks.siege import SOURCE, SiegeCase
+from tests.middleware.admission.village import House, Tape, Village, network_of
 
 SEQUENCES, STEPS = 6, 25
 
 
-class HaltingTeam(ClosedTeam):
+class HaltingTeam(Village):
     """A closed team each of whose nodes answers ``device.halt``; ``halts`` are those of the present lives, by name."""
 
     def __init__(self, seed: int) -> None:
@@ -46,11 +46,9 @@ class HaltingTeam(ClosedTeam):
         node._chores.every(0.5, halt.refresh)
 
     def halt(self, house: House) -> Halt:
-        """What a node knows of the stops."""
         return self.halts[house.name]
 
     def is_on(self) -> dict[str, bool]:
-        """Which nodes stand."""
         return {name: halt.is_on for name, halt in self.halts.items()}
 
     def reopen(self, house: House) -> None:
@@ -63,11 +61,8 @@ class StopCase(SiegeCase):
     """A team of an operator ``ann``, a second operator ``bob`` and two robots."""
 
     def setUp(self) -> None:
-        """All have learnt that nothing is stopped."""
         super().setUp()
-        self.team = HaltingTeam(1)
-        self.addCleanup(self.left, self.team)
-        self.addCleanup(self.team.stop)
+        self.team = self.kept(HaltingTeam(1))
         self.ann = self.team.houses[0]
         self.bob = self.team.enlist("bob", OPERATOR)
         self.dogs = [self.team.enlist(name, DEVICE) for name in ("dog1", "dog2")]
@@ -79,21 +74,17 @@ class StopCase(SiegeCase):
         return self.said(self.team.halt(house).stop(house.name, self.contacts(others)))
 
     def release(self, house: House, stops: Sequence[bytes], others: Sequence[House] | None = None) -> dict[str, str]:
-        """An operator releases these stops."""
         return self.said(self.team.halt(house).release(stops, house.name, self.contacts(others)))
 
     def contacts(self, houses: Sequence[House] | None) -> list[Any]:
-        """How to ask these, or all."""
         return [self.team.contact(house) for house in (self.team.houses if houses is None else houses)]
 
     def said(self, asked: Deferred[dict[str, str]]) -> dict[str, str]:
-        """What each says, by name."""
         told = self.outcome(self.team, asked)
         names = {house.node.identity.node_id.hex(): house.name for house in self.team.houses}
         return {names[uuid]: words for uuid, words in told.items()}
 
     def stops(self, house: House) -> list[bytes]:
-        """The stops that a node obeys."""
         return list(self.team.halt(house).stops)
 
     def ask(self, bare: Any, house: House, *arguments: object) -> Any:
@@ -101,7 +92,6 @@ class StopCase(SiegeCase):
         return self.outcome(self.team, bare.ask(self.team.contact(house), METHOD, *arguments, changes=True), 0.2)
 
     def record(self, own: Identity, fields: object, sequence: int = 1) -> Record:
-        """A record of a stop or release."""
         return Record(HALT, SLOT, own.public, sequence, "team", 600.0, msgpack.packb(fields)).signed(own)
 
     def store(self, bare: Any, record: Record) -> None:
@@ -113,8 +103,6 @@ class StopCase(SiegeCase):
 
 
 class DisablingTests(StopCase):
-    """What could make a later stop impossible."""
-
     def test_no_number_disables_a_stop(self) -> None:
         """An operator's key that sends the greatest numbers, in calls and records, prevents no later stop."""
         bare, own = self.insider(self.team, "thief", OPERATOR)
@@ -165,8 +153,6 @@ class DisablingTests(StopCase):
 
 
 class RightsTests(StopCase):
-    """Who may stop, and who may release."""
-
     def test_only_who_may_order(self) -> None:
         """By call and by record, no role but operator and gateway stops the team or releases a stop."""
         self.stop(self.ann)
@@ -232,15 +218,13 @@ class RightsTests(StopCase):
 
 
 class ReplayTests(StopCase):
-    """What was true once."""
-
     def test_a_replayed_release_ends_no_later_stop(self) -> None:
         """Every datagram of a release is played again after the next stop, and the released record is stored again."""
         self.stop(self.ann)
         first = self.stops(self.dogs[0])
         tape = Tape()
         for house in self.team.houses:
-            tape.tap(house.node._network)  # type: ignore[arg-type]
+            tape.tap(network_of(house))
         self.release(self.bob, first)
         old = [record for record in self.ann.node.store.get(HALT) if record.name == SLOT]
         self.assertEqual(set(self.team.is_on().values()), {False})
@@ -269,8 +253,6 @@ class ReplayTests(StopCase):
 
 
 class LossTests(StopCase):
-    """A stop that was acknowledged is in force until its release."""
-
     def test_a_restart_of_all_releases_nothing(self) -> None:
         """All nodes end at once without a word and come back: all stand at once, before they have asked anybody."""
         self.assertEqual(self.stop(self.ann)["dog1"], STANDS)
@@ -353,8 +335,6 @@ class LossTests(StopCase):
 
 
 class SequenceTests(StopCase):
-    """Random sequences over whole nodes."""
-
     def test_stop_holds_on_whole_nodes(self) -> None:
         """Stops, releases, partitions, restarts, a viewer's messages: a stop is kept until a release names it."""
         bare, own = self.insider(self.team, "eye", VIEWER)

@@ -7,7 +7,6 @@ from typing import Any
 
 from twisted.internet.defer import Deferred
 
-from middleware.admission import roles
 from middleware.admission.team import Team
 from middleware.consensus.bidding.group import Group
 from middleware.consensus.lease.lease_codec import pack_members
@@ -20,15 +19,15 @@ from middleware.entangled.quorum.register import Kind, Reply
 from middleware.entangled.record import Record
 from middleware.node import SwarmNode
 from middleware.tasks.task import COMPLETED, RESULT, TASKS, Result, Task, group_key, tasks_of
-from tests.attacks.siege import SOURCE, ClosedTeam, SiegeCase
-from tests.middleware.admission.village import House
+from tests.attacks.siege import SOURCE, SiegeCase
+from tests.middleware.admission.village import House, Village
 
 TASK = Task("t1", "search", "Find it")
 HUGE = 2**62 - 2
 DEVICE_NAME = "dog1"
 
 
-class LeaseTeam(ClosedTeam):
+class LeaseTeam(Village):
     """A closed team of swarm nodes: a gateway and devices."""
 
     def __init__(self, seed: int = 1, bootstraps: int = 1) -> None:
@@ -39,9 +38,8 @@ class LeaseTeam(ClosedTeam):
         self.run(TASK.lease_ttl)
 
     def open(self, house: House) -> None:
-        """Begin a life of a swarm node."""
         place = house.place
-        house.team = Team(house.kept, self.store(place), self.wall, self.rng(place), roles)
+        house.team = Team(house.kept, self.store(place), self.wall, self.rng(place))
         name = house.team.door.me.name
         node = SwarmNode(
             Device("", name, capabilities={"camera": {"width": 208}}),
@@ -62,7 +60,6 @@ class LeaseTeam(ClosedTeam):
         node.startService()
 
     def close(self, house: House, is_sudden: bool = False) -> None:
-        """End a life of a swarm node."""
         self.nodes[house.place].stopService()
 
 
@@ -70,11 +67,8 @@ class LeaseCase(SiegeCase):
     """A team with a task, and a member with the role of a device that obeys no rule."""
 
     def setUp(self) -> None:
-        """Pin the council of a task."""
         super().setUp()
-        self.team = team = LeaseTeam()
-        self.addCleanup(self.left, team)
-        self.addCleanup(team.stop)
+        self.team = team = self.kept(LeaseTeam())
         self.task: Task = self.outcome(team, Deferred.fromCoroutine(team.nodes[0].submit(TASK)), 1.0)
         self.lessees: list[Lessee] = []
         self.bad, self.own = self.insider(team, "bad", "device")
@@ -109,7 +103,6 @@ class LeaseCase(SiegeCase):
         return found
 
     def store(self, *records: Record) -> list[Any]:
-        """Bring records to every node."""
         return self.attack("store", [record.packed() for record in records])
 
     def members(self) -> list[int]:
@@ -118,13 +111,10 @@ class LeaseCase(SiegeCase):
         return [known.index(member.public) for member in self.task.council]
 
     def outsiders(self) -> list[int]:
-        """The places of the others."""
         return [place for place in range(len(self.team.houses)) if place not in self.members()]
 
 
 class ReconfigurationTests(LeaseCase):
-    """A council that nobody elected."""
-
     def test_forged_council(self) -> None:
         """A council that one device invents is installed nowhere, and no second node wins the lease through it."""
         holder = self.held_by(self.members()[0])
@@ -181,8 +171,6 @@ class ReconfigurationTests(LeaseCase):
 
 
 class ClosingTests(LeaseCase):
-    """The end of a task that another device holds."""
-
     def test_device_closes(self) -> None:
         """A device that holds nothing ends no task: not as an operator, not under the token, not under a higher one."""
         holder = self.held_by(self.members()[0])
@@ -217,8 +205,6 @@ class ClosingTests(LeaseCase):
 
 
 class NumberTests(LeaseCase):
-    """Numbers after which there are no higher ones."""
-
     def test_highest_ballot(self) -> None:
         """After a device has asked under the highest ballots there are, others still win."""
         for counter in (HUGE, HUGE - 1, 2**61, 2**52, 2**40):
@@ -260,10 +246,7 @@ class NumberTests(LeaseCase):
 
 
 class TaskTests(LeaseCase):
-    """Records of tasks that a device may not write."""
-
     def record(self, key: bytes, name: str, value: bytes, owner: Identity | None = None) -> Record:
-        """A team record of the device."""
         own = owner or self.own
         return Record(key, name, own.public, 2**40, "team", 600.0, value).signed(own)
 
@@ -303,8 +286,6 @@ class TaskTests(LeaseCase):
 
 
 class NameTests(LeaseCase):
-    """The name of another device."""
-
     def test_name_of_another(self) -> None:
         """A device that announces itself under another's name, in the slot or in the value, is not shown under it."""
         device = Device(self.own.node_id.hex(), DEVICE_NAME, capabilities={"camera": {"width": 208}}, joined=9)
@@ -326,7 +307,6 @@ class NameTests(LeaseCase):
         self.assertEqual(twins, sorted(f"dog2-{node.uuid[:6]}" for node in self.twins()))
 
     def twins(self) -> list[SwarmNode]:
-        """The nodes of that name."""
         return [node for node in self.team.nodes if node.presence.device.name == "dog2"]
 
     def names(self, records: list[Record]) -> list[str]:

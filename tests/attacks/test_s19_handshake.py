@@ -19,9 +19,9 @@ from middleware.entangled.wire.door import MAX_LIVES, Life, Stamps
 from middleware.entangled.wire.endpoint import Endpoint
 from middleware.entangled.wire.message import Question, encoded
 from middleware.entangled.wire.session import INIT, RESPONSES_S, Credentials, Hello, Invitation
-from tests.attacks.siege import ClosedTeam, SiegeCase, Tape, network_of
+from tests.attacks.siege import SiegeCase
 from tests.fuzz.ground import state_of
-from tests.middleware.admission.village import House
+from tests.middleware.admission.village import House, Tape, Village, network_of
 from tests.middleware.test_endpoint import DELAY, EndpointCase
 
 VICTIM = Address("10.7.7.7", 77)
@@ -65,7 +65,7 @@ class RecordedQuestionTests(SiegeCase):
     def setUp(self) -> None:
         """Count what the node sends to whom, and note each method that runs without a session."""
         super().setUp()
-        self.team: ClosedTeam = self.siege()
+        self.team: Village = self.village()
         for name in ("cat", "pig", "cow", "hen", "fox", "owl"):
             self.team.enlist(name, "device", "operator", "gateway")
         self.house = self.team.houses[0]
@@ -178,12 +178,9 @@ class RecordedQuestionTests(SiegeCase):
 
 
 class TimestampTests(SiegeCase):
-    """A recorded INIT, sent again when its RESP is not remembered any more."""
-
     def setUp(self) -> None:
-        """Record what comes to the first node."""
         super().setUp()
-        self.team = self.siege()
+        self.team = self.village()
         self.house = self.team.houses[0]
         self.team.enlist("dog", "device")
         self.tape = Tape()
@@ -244,8 +241,6 @@ class TimestampTests(SiegeCase):
 
 
 class RoundTripTests(EndpointCase):
-    """What it costs that a change waits for the session."""
-
     def asked(self, method: str, *arguments: object, changes: bool) -> float:
         """The round trips that the first question to a peer takes."""
         identity = Identity(self.rng.randbytes(32))
@@ -292,11 +287,9 @@ class RoundTripTests(EndpointCase):
 
 
 class KeyLifeTests(SiegeCase):
-    """A member whose keys are stolen from memory."""
-
     def test_keys_are_replaced(self) -> None:
         """Sessions in use have new keys every two minutes, and no node holds keys that are older than three."""
-        team = self.siege()
+        team = self.village()
         for name in ("dog", "cat"):
             team.enlist(name)
         seen: set[bytes] = set()

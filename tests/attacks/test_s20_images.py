@@ -88,7 +88,6 @@ class BombCase(SynchronousTestCase):
     """Counts how often the decoder runs, and on how many bytes."""
 
     def setUp(self) -> None:
-        """Wrap the decoder."""
         self.decoded: list[tuple[int, ...]] = []
         decode = cv2.imdecode
 
@@ -102,8 +101,6 @@ class BombCase(SynchronousTestCase):
 
 
 class HeaderTests(BombCase):
-    """What is read before a decoder runs."""
-
     def test_no_bomb_is_decoded(self) -> None:
         """Detection and student programs decode none of the bombs; each is at most half a megabyte."""
         pyro = PyroCamera(8, 8)
@@ -197,8 +194,6 @@ class PooledClock(Clock):
         return self
 
     def callInThreadWithCallback(self, done: Callable[[bool, object], None], function: Callable[[], object]) -> None:  # noqa: N802 (Twisted's)
-        """Keep it."""
-
         def job() -> None:
             try:
                 result = function()
@@ -228,8 +223,6 @@ class StillDriver:
 
 
 class QueueTests(BombCase):
-    """Where pictures are decoded, and how many wait."""
-
     def test_reactor_decodes_nothing(self) -> None:
         """An agent that is shown 100 pictures has two decoded, the first and the newest, both in the thread pool."""
         for kind in ("find-target", "watch-target"):
@@ -265,8 +258,6 @@ class QueueTests(BombCase):
 
 
 class ThreadTests(TestCase):
-    """With the real reactor."""
-
     async def test_not_in_the_thread_of_the_reactor(self) -> None:
         """Where the clock is a reactor, pictures are searched in another thread, and what is found comes back to it."""
         threads: list[int] = []

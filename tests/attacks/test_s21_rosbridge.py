@@ -61,8 +61,6 @@ DEEP = {
 
 
 class MessageTests(SynchronousTestCase):
-    """What one message costs."""
-
     def peak(self, data: bytes) -> tuple[bool, int]:
         """Whether a message is taken, and the most memory that this needed."""
         tracemalloc.start()
@@ -127,8 +125,6 @@ class MessageTests(SynchronousTestCase):
 
 
 class FloodTests(SynchronousTestCase):
-    """A driver of a robot whose rosbridge sends what it likes."""
-
     def setUp(self) -> None:
         """Connect a driver to an emulated robot, and count the frames that are made."""
         self.clock = Clock()
@@ -159,13 +155,11 @@ class FloodTests(SynchronousTestCase):
         self.addCleanup(self.end)
 
     def end(self) -> None:
-        """Leave nothing on the clock."""
         self.driver.disconnect()
         self.robot.stop()
         self.pass_time(0.1)
 
     def pass_time(self, seconds: float) -> None:
-        """Turn the clock."""
         self.clock.pump([0.005] * round(seconds / 0.005))
 
     @property

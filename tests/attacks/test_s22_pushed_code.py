@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 import sys
-import tempfile
 from dataclasses import replace
-from pathlib import Path
 
+from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.admission.membership import MemoryMembership
@@ -18,7 +15,7 @@ from middleware.node import SwarmNode
 from middleware.tasks.task import Task
 from swarmnode.deploy import main
 from swarmnode.rehearsal import VirtualTeam
-from tests.swarmnode.shell import Shell
+from tests.swarmnode.shell import Shell, runtime_folder
 
 CANARY = "swarm_canary"
 SOURCE = f"""
@@ -48,12 +45,8 @@ class PushedCodeTests(SynchronousTestCase):
     """A closed team: the laptop is its first node, ``author`` pushes, and the dog lists the author's key."""
 
     def setUp(self) -> None:
-        """The team runs; nothing was pushed."""
-        self.folder = Path(tempfile.mkdtemp())
-        self.addCleanup(shutil.rmtree, self.folder)
-        self.patch(os, "environ", {**os.environ, "XDG_RUNTIME_DIR": str(self.folder)})
+        self.folder = runtime_folder(self, "author")
         self.addCleanup(sys.modules.pop, CANARY, None)
-        made("author").touch()
         self.team = VirtualTeam(11, dogs=())
         self.team._names += ("author", "second")
         self.addCleanup(self.team.stop)
@@ -102,14 +95,10 @@ class PushedCodeTests(SynchronousTestCase):
         self.team_told(self.team.services["vaio"].assembly.node.submit(task))
 
     def pose(self) -> tuple[float, ...]:
-        """Where the dog is."""
         (robot,) = [each for each in self.team.truth()["dogs"] if each["name"] == "dog1"]
         return tuple(round(robot[key], 4) for key in ("x", "y", "heading"))
 
     def team_told(self, work: object) -> object:
-        """The kind of a statement."""
-        from twisted.internet.defer import Deferred
-
         done = Deferred.fromCoroutine(work)  # type: ignore[arg-type,var-annotated]
         self.team.clock.advance(1.0)
         return self.successResultOf(done)

@@ -26,7 +26,6 @@ class ControlSocketTests(SynchronousTestCase):
     """Another user made the folder, or the socket, before the node did."""
 
     def setUp(self) -> None:
-        """A folder for sockets."""
         # Trial's own folders are deeper than the path of a socket may be.
         self.runtime = Path(tempfile.mkdtemp())
         self.addCleanup(shutil.rmtree, self.runtime)
@@ -38,7 +37,6 @@ class ControlSocketTests(SynchronousTestCase):
         self.patch(os, "getuid", lambda: self.me + 1)
 
     def listening(self, name: str) -> Path:
-        """A socket with a listener."""
         path = folder() / f"{name}.control"
         server = socket.socket(socket.AF_UNIX)
         self.addCleanup(server.close)
@@ -120,7 +118,6 @@ class ControlSocketTests(SynchronousTestCase):
                 self.user = user
 
             def getsockopt(self, level: int, option: int, size: int) -> bytes:
-                """Its process, user and group."""
                 return struct.pack("3i", 1, self.user, 1)
 
         check_peer(Connection(0), path)  # type: ignore[arg-type]
@@ -129,16 +126,12 @@ class ControlSocketTests(SynchronousTestCase):
 
 
 class TeamKeyTests(SynchronousTestCase):
-    """The secret of an open team, which the list of processes must not show."""
-
     def setUp(self) -> None:
-        """A file that holds it."""
         self.path = Path(self.mktemp())
         self.path.touch(mode=0o600)
         self.path.write_text(f"{SECRET}\n", encoding="utf-8")
 
     def options(self, *words: str) -> Options:
-        """The options of a command line."""
         options = Options()
         options.parseOptions(["--name", "a", *words])
         return options

@@ -15,11 +15,11 @@ from twisted.internet.defer import Deferred, succeed
 
 from middleware.admission import knock
 from middleware.admission.certificate import member_of, pass_of
+from middleware.admission.code import TermsContent, seal_terms
 from middleware.admission.knock import Knock, Reply, Signer, Welcome, opened_knock, opened_welcome
 from middleware.admission.reception import Reception
 from middleware.admission.roll import Roll, packed_admission
 from middleware.admission.statement import Invite, opened
-from middleware.admission.terms import TermsContent, seal_terms
 from middleware.entangled.errors import Full, RemoteError
 from middleware.entangled.identity import exchange_key
 from middleware.entangled.network.network import Address

@@ -15,7 +15,6 @@ from twisted.internet.defer import Deferred, inlineCallbacks
 from twisted.internet.task import deferLater
 from twisted.trial.unittest import SkipTest, TestCase
 
-from middleware.admission import roles
 from middleware.admission.membership import Membership, MemoryMembership
 from middleware.admission.operator import drawn
 from middleware.admission.team import Team
@@ -58,7 +57,7 @@ class EavesdroppingTests(TestCase):
         """A node of that membership, and when it has joined."""
         self.papers.append(paper)
         dice, store = random.SystemRandom(), MemoryStore()
-        team = Team(MemoryMembership(paper), store, time.time, dice, roles)
+        team = Team(MemoryMembership(paper), store, time.time, dice)
         network = UdpNetwork(reactor, "127.0.0.1", 0)
         node = EntangledNode(
             *(team.identity, team.secret, network, store, reactor, dice), wall=time.time, door=team.door

@@ -24,9 +24,11 @@ Main = Callable[..., int]
 PATIENCE = 5.0
 
 
-def socket_folder(case: SynchronousTestCase, node: str) -> Path:
-    """A folder for control sockets that ends with the test, with that of ``node``, to which nothing listens."""
-    # Trial's own folders are deeper than the path of a socket may be.
+def runtime_folder(case: SynchronousTestCase, node: str = "vaio") -> Path:
+    """A folder in which commands find the control socket of ``node``, until the test ends.
+
+    Trial's own folders are deeper than the path of a socket may be.
+    """
     folder = Path(tempfile.mkdtemp())
     case.addCleanup(shutil.rmtree, folder)
     case.patch(os, "environ", {**os.environ, "XDG_RUNTIME_DIR": str(folder)})

@@ -13,7 +13,7 @@ from middleware.frontend.client import TeamClient
 from swarmnode.asker import Asker
 from swarmnode.team.verb import TeamVerbs
 from tests.fleet import FleetCase, SwarmFleet
-from tests.swarmnode.shell import socket_folder
+from tests.swarmnode.shell import runtime_folder
 from webnode.ledger import state_from
 from webnode.state import Departed
 from webnode.team import TeamDesk
@@ -50,7 +50,7 @@ class SplitTests(FleetCase):
     def test_shell(self) -> None:
         """What ``swarm links``, ``chaos`` and ``deploy`` ask for is every device, in the order of joining."""
         fleet = self.apart()
-        socket_folder(self, "dog2")
+        runtime_folder(self, "dog2")
         verbs = TeamVerbs(NoVerbs(), fleet.nodes[2])
 
         def ask(path: Path, request: dict[str, Any]) -> Iterator[dict[str, Any]]:

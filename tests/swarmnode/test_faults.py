@@ -3,35 +3,27 @@
 from __future__ import annotations
 
 import io
-import os
-import shutil
-import tempfile
 from pathlib import Path
 from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.entangled.control.place import made
 from middleware.errors import BadSetting
 from middleware.faults.kinds import Fault
 from middleware.faults.scenario import loaded, scenario_of
 from swarmnode.faults import main
 from swarmnode.rehearsal import VirtualTeam
-from tests.swarmnode.shell import Shell
+from tests.swarmnode.shell import Shell, runtime_folder
 
 SCENARIOS = Path(__file__).parents[2] / "examples" / "scenarios"
 
 
 class ChaosTests(SynchronousTestCase):
     def setUp(self) -> None:
-        # Trial's own folders are deeper than the path of a socket may be.
-        self.folder = Path(tempfile.mkdtemp())
-        self.addCleanup(shutil.rmtree, self.folder)
-        self.patch(os, "environ", {**os.environ, "XDG_RUNTIME_DIR": str(self.folder)})
+        self.folder = runtime_folder(self)
 
     def team(self, faults: bool = True) -> None:
         """A team, and a shell beside its laptop."""
-        made("vaio").touch()
         self.virtual = VirtualTeam(4, faults=faults)
         self.addCleanup(self.virtual.stop)
         self.virtual.clock.advance(2.0)
@@ -55,13 +47,7 @@ class ChaosTests(SynchronousTestCase):
         self.assertRegex(first, r"^dog\d: radio for 4 s$")
         self.assertRegex(second, r"^dog\d: radio, dog\d took over [0-9a-f]{12} after [12]\.\d\d s$")
         self.assertEqual((code, self.shell.said), (0, ""))
-
-    def test_list(self) -> None:
-        """``list`` has a line for each device with what it can suffer."""
-        self.team()
-        code, output = self.chaos("list")
-        self.assertEqual(code, 0)
-        self.assertIn("dog1        kill, freeze, radio, one-way, delay, loss, skew, battery\n", output)
+        self.assertIn("dog1        kill, freeze, radio, one-way, delay, loss, skew, battery", self.chaos("list")[1])
 
     def test_not_allowed(self) -> None:
         """Devices that allow no faults say what to write into their settings."""
@@ -97,12 +83,9 @@ class ChaosTests(SynchronousTestCase):
         self.assertNotEqual(self.rehearsed("takeover.toml", "--seed", "8")[-1], first[-1])
 
     def test_bad_day(self) -> None:
-        """With loss and a wrong clock in the team, a mute and a frozen device are still replaced in time."""
+        """With loss, also of the answer to the order, and a wrong clock, two devices are still replaced in time."""
         lines = self.rehearsed("bad-day.toml")
         self.assertEqual(sum("took over" in line for line in lines), 2)
-
-    def test_answers_that_are_lost(self) -> None:
-        """Whoever is to fall silent has time to say so again to one that hears only four words of five."""
         for seed in ("12", "24"):  # where the first answer does not arrive
             self.rehearsed("bad-day.toml", "--seed", seed)
 

@@ -21,11 +21,9 @@ class InjectorTests(SynchronousTestCase):
         self.addCleanup(self.stage.stop)
 
     def named(self, name: str) -> Any:
-        """The device of that name."""
         return next(device for device in self.stage.devices() if device.name == name)
 
     def asked(self, name: str) -> dict[str, Any]:
-        """What a device says of its faults."""
         told: dict[str, Any] = self.stage._called(self.named(name), ASKED)
         return told
 
@@ -127,24 +125,6 @@ class TransitionTests(SynchronousTestCase):
                 left += after
             self.assertIn(State.OVER, reached)
         self.assertEqual({there for (source, _), there in TRANSITIONS.items() if source is State.OVER}, {State.OVER})
-
-
-class FrozenNodeTests(SynchronousTestCase):
-    def test_frozen_node_is_missed_and_comes_back(self) -> None:
-        """A dog whose node stands still is gone from the page within its presence lease, and back after the thaw."""
-        team = VirtualTeam(3, camera_fps=0.1)
-        self.addCleanup(team.stop)
-
-        def here() -> list[str]:
-            return [device["name"] for device in team.state()["devices"] if device["gone"] is None]
-
-        self.assertEqual(here(), ["vaio", "dog1", "dog2", "dog3"])
-        team.freeze("dog2")
-        team.clock.advance(4.0)
-        self.assertEqual(here(), ["vaio", "dog1", "dog3"])
-        team.thaw("dog2")
-        team.clock.advance(4.0)
-        self.assertEqual(here(), ["vaio", "dog1", "dog2", "dog3"])
 
 
 class ForbiddenTests(SynchronousTestCase):

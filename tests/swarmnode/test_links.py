@@ -16,7 +16,7 @@ from middleware.entangled.control.link import link
 from middleware.entangled.errors import Refused
 from swarmnode.links import main
 from swarmnode.rehearsal import VirtualTeam
-from tests.swarmnode.shell import Shell, socket_folder
+from tests.swarmnode.shell import Shell, runtime_folder
 
 FAR = {"id": "cd" * 20, "address": f"~{'cd' * 20}:1", "way": "carried", "by": "ef" * 20, "for": 150.0, "relayed": True}
 NEAR = {"id": "ef" * 20, "address": "192.168.1.9:8484", "way": "lan", "by": "", "for": 7500.0, "relayed": False}
@@ -26,7 +26,7 @@ class LinksTests(SynchronousTestCase):
     """Behaviour of the command."""
 
     def setUp(self) -> None:
-        socket_folder(self, "vaio")
+        runtime_folder(self, "vaio")
         self.links: Any = [{**NEAR, "times": [0.002] * 10}, {**FAR, "times": [0.08] * 9 + [None]}]
 
     def ask(self, path: Path, request: dict[str, Any]) -> Iterator[dict[str, Any]]:

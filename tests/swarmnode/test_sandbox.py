@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from swarmnode.sandbox import kinds, wanted
+from swarmnode.sandbox import wanted
 
 SOURCE = b"""
 from __future__ import annotations
@@ -48,7 +48,3 @@ class SandboxTests(SynchronousTestCase):
             b"import a" + b", a" * 90_000,
         ):
             self.assertEqual(wanted(source), [])
-
-    def test_every_kind_is_served(self) -> None:
-        """Each kind that can be pushed has a side in the process."""
-        self.assertEqual(sorted(kinds()), ["behaviour", "strategy"])

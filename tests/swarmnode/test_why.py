@@ -11,12 +11,12 @@ from middleware.tasks.task import Task
 from swarmnode.asker import Refusal
 from swarmnode.rehearsal import VirtualTeam
 from swarmnode.why import chosen, main
-from tests.swarmnode.shell import Shell, socket_folder
+from tests.swarmnode.shell import Shell, runtime_folder
 
 
 class WhyTests(SynchronousTestCase):
     def setUp(self) -> None:
-        socket_folder(self, "vaio")
+        runtime_folder(self, "vaio")
         self.team = VirtualTeam(4)
         self.addCleanup(self.team.stop)
         self.shell = Shell(self.team, self.team.services["vaio"].assembly.node)

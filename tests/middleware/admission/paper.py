@@ -26,7 +26,6 @@ def identity(name: str) -> Identity:
 
 
 def granted(signer: Operator, name: str, *roles: str) -> bytes:
-    """The grant of the one of that name."""
     return signer.grant(identity(name).public, name, roles or ("device",), NOW)
 
 
@@ -50,7 +49,6 @@ def admitted(
 
 
 def roll(signer: Operator, *packed: bytes, now: float = NOW) -> Roll:
-    """A roll that knows these."""
     made = Roll(signer.public)
     for each in packed:
         made.add(each, now)

@@ -14,8 +14,6 @@ from tests.middleware.admission.paper import operator
 
 
 class CodeTests(SynchronousTestCase):
-    """What is read out, and what is typed."""
-
     def setUp(self) -> None:
         self.code = code.drawn(operator().public, random.Random(1))
 

@@ -14,9 +14,8 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.admission import knock
 from middleware.admission.certificate import ROOM, is_proof
-from middleware.admission.code import Code
+from middleware.admission.code import Code, TermsContent, seal_terms
 from middleware.admission.knock import Hint, Reply, Signer, Welcome
-from middleware.admission.terms import TermsContent, seal_terms
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import Forged, Malformed
 from middleware.entangled.network.network import Address
@@ -49,13 +48,10 @@ def read(datagram: bytes, code: Code = CODE, secret: bytes = SECRET) -> Reply | 
 
 
 def knocked(wish: str = "dog") -> bytes:
-    """A lawful KNOCK."""
     return knock.knock(CODE.key, DOG, EPHEMERAL, wish, random.Random(1))
 
 
 class KnockTests(SynchronousTestCase):
-    """Both datagrams."""
-
     def test_knock_is_read_as_it_was_said(self) -> None:
         """A bootstrap node that knows the invitation reads the newcomer's key, wish and proof."""
         said = knocked()

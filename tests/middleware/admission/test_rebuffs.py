@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+from twisted.logger import capturedLogs, formatEvent
+
 from middleware.admission.errors import NotWelcome
 from middleware.entangled.wire.rebuff import Rebuff
 from tests.middleware.admission.village import House, VillageCase
 
 
 class RebuffTests(VillageCase):
-    """What ``rebuffs`` has after refusals."""
-
     def met(self, house: House, side: str) -> list[Rebuff]:
         """The refusals that a house met on one side."""
         now = house.node.endpoint.rebuffs.newest(1e9, 1e10)
@@ -32,9 +32,10 @@ class RebuffTests(VillageCase):
         """A used code stands with its holder's key; codes that nobody knows are one, however many there were."""
         village = self.village()
         code = village.invite()
-        first, second = village.knock(code), village.knock(code)
         others = [village.knock(self.village(seed=seed).invite(), timeout=3.0) for seed in (2, 3, 4)]
-        village.run(4.0)
+        with capturedLogs() as said:
+            first, second = village.knock(code), village.knock(code)
+            village.run(4.0)
         self.successResultOf(first)
         self.failureResultOf(second, NotWelcome)
         for each in others:
@@ -43,6 +44,7 @@ class RebuffTests(VillageCase):
         self.assertEqual(sorted(found), ["unknown", "used"])
         self.assertEqual((len(found["used"].who), found["unknown"].who), (32, b""))
         self.assertGreaterEqual(found["unknown"].count, 3)
+        self.assertEqual(sum("not let in by the invitation" in formatEvent(event) for event in said), 1)
 
     def test_copy_of_a_store(self) -> None:
         """A copy that was started later takes the place of the first, whose peers and itself say that it was so."""

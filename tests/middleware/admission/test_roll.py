@@ -31,8 +31,6 @@ ENTRIES = entries()
 
 
 class RollTests(SynchronousTestCase):
-    """What a node knows of its team."""
-
     def test_foreign_statements_are_refused(self) -> None:
         """What another team's operator signed, or nobody, never enters."""
         mine = Roll(OPERATOR.public)
@@ -88,23 +86,6 @@ class RollTests(SynchronousTestCase):
         mine = roll(OPERATOR, OPERATOR.revoke(DOG, "dog", NOW), OPERATOR.grant(DOG, "dog", ("device",), NOW + 9))
         self.assertEqual(mine.refusal(member, NOW + 9), "revoked")
         self.assertEqual(mine.members(NOW + 9), [])
-
-    def test_revoked_invitation(self) -> None:
-        """With an invitation all that came by it are revoked, and nobody else."""
-        mine = roll(OPERATOR, granted(OPERATOR, "vaio", "bootstrap"))
-        for seed, name in enumerate(("dog", "cat")):
-            shown = admitted(OPERATOR, name, seed=seed)
-            mine.add(packed_admission(identity(name).public, shown), NOW)
-        mine.add(OPERATOR.revoke(invited(OPERATOR, "dog", seed=0)[2].public, "dog", NOW), NOW)
-        self.assertEqual([each.name for each in mine.members(NOW)], ["cat", "vaio"])
-
-    def test_whom_a_revoked_bootstrap_lets_in(self) -> None:
-        """Of those that a revoked bootstrap node let in the ones that the operator keeps stay, whatever the dates."""
-        for kept, refusal in (((), "revoked"), ((DOG,), "")):
-            mine = roll(OPERATOR, OPERATOR.revoke(VAIO, "vaio", NOW + 10, kept))
-            for now in (NOW + 9, NOW + 10):
-                member = member_of(OPERATOR.public, DOG, admitted(OPERATOR, "dog", now=now))
-                self.assertEqual(mine.refusal(member, NOW + 20), refusal)
 
     def test_what_has_run_out_goes(self) -> None:
         """An invitation that ran out is remembered for a week, so that it is refused by name, and then forgotten."""

@@ -31,8 +31,6 @@ REVOKE = Revoke(DOG.public, "dog", NOW, NOW + MAX_LIFE)
 
 
 class StatementTests(SynchronousTestCase):
-    """Packing, signing, checking."""
-
     def setUp(self) -> None:
         self.operator = operator().identity
         self.secret = sealed_secret(b"s" * 32, 2, [DOG.public], NOW, 60, random.Random(1))

@@ -11,10 +11,9 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.admission import knock
 from middleware.admission.certificate import chained, guest_pass, member_of, pass_of, proof, renewed
-from middleware.admission.code import Code
+from middleware.admission.code import Code, TermsContent, seal_terms
 from middleware.admission.roll import digest_of, packed_admission
 from middleware.admission.statement import YEAR, Grant, Invite, Revoke, Terms, sealed_secret, signed
-from middleware.admission.terms import TermsContent, seal_terms
 from middleware.entangled.contact import Contact
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.network import Address
@@ -27,7 +26,6 @@ class Counted(random.Random):
     """Dice whose bytes count up, for the ephemeral keys and nonces of the vectors."""
 
     def randbytes(self, n: int) -> bytes:
-        """``n`` bytes from 0 on."""
         return bytes(range(n))
 
 
@@ -75,8 +73,6 @@ def made() -> dict[str, str]:
 
 
 class VectorTests(SynchronousTestCase):
-    """What is written down is what is made."""
-
     def test_made_again(self) -> None:
         """Code, statements, passes and both datagrams are made again byte for byte."""
         self.assertEqual(made(), json.loads(VECTORS.read_text(encoding="utf-8")))

@@ -1,28 +1,47 @@
-"""Village: whole nodes of a closed team on one turned clock and one switchboard."""
+"""Whole nodes of a closed team on one virtual clock and one switchboard."""
 
 from __future__ import annotations
 
 import random
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
 
 from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.admission.code import Code, read
-from middleware.admission.doorkeeper import Anything, Rules
 from middleware.admission.membership import Membership, MemoryMembership
 from middleware.admission.newcomer import Newcomer
 from middleware.admission.operator import Operator
 from middleware.admission.team import Team
 from middleware.entangled.contact import Contact
-from middleware.entangled.errors import NotRunning
+from middleware.entangled.errors import NotAdmitted, NotRunning
 from middleware.entangled.network.network import Address
-from middleware.entangled.network.switchboard import CALM, Weather
+from middleware.entangled.network.switchboard import CALM, SwitchboardNetwork, Weather
 from middleware.entangled.node import EntangledNode
 from tests.fleet import World
 from tests.middleware.admission.paper import NOW, operator
 
 FIRST = ("device", "operator", "gateway", "bootstrap")
+DAY = 86_400.0
+
+
+class Tape:
+    """Records what networks receive, in order, with its source."""
+
+    def __init__(self) -> None:
+        self.heard: list[tuple[SwitchboardNetwork, bytes, Address]] = []
+
+    def tap(self, network: SwitchboardNetwork) -> None:
+        """Record what an open network receives."""
+        receiver = network.receiver
+        assert receiver is not None
+
+        def heard(datagram: bytes, source: Address) -> None:
+            self.heard.append((network, datagram, source))
+            receiver(datagram, source)
+
+        network.receiver = heard
 
 
 class House:
@@ -36,19 +55,21 @@ class House:
 
     @property
     def name(self) -> str:
-        """What the team calls it."""
         return self.team.door.me.name
 
     @property
     def public(self) -> bytes:
-        """Its key."""
         return self.kept.membership.identity.public
 
 
 class Village(World):
-    """A closed team; ``signer`` is its operator, whose words are told to the first house unless another is named."""
+    """A closed team; ``signer`` is its operator, whose words are told to the first house unless another is named.
 
-    rules: Rules = Anything()
+    The wall clock is ahead of the virtual one by ``days``; ``tape`` records what nodes receive that are opened later.
+    """
+
+    days = 0.0
+    tape: Tape | None = None
 
     def __init__(self, seed: int = 1, weather: Weather = CALM, bootstraps: int = 1) -> None:
         super().__init__(seed, weather)
@@ -63,7 +84,7 @@ class Village(World):
 
     def wall(self) -> float:
         """The wall clock of every node."""
-        return NOW + self.clock.seconds()
+        return NOW + self.clock.seconds() + self.days * DAY
 
     def move_in(self, membership: Membership) -> House:
         """A node of that membership, which joins."""
@@ -73,10 +94,18 @@ class Village(World):
         self.run(0.5)
         return house
 
+    def paper(self, name: str, *which: str) -> Membership:
+        """The membership of a node to which the operator gave these roles."""
+        secret = self.houses[0].kept.membership.secrets[0][1]
+        return self.signer.founded(name, which or ("device",), self.wall(), self.dice, secret)
+
+    def enlist(self, name: str, *which: str) -> House:
+        """One more member, to which the operator gave these roles."""
+        return self.move_in(self.paper(name, *which))
+
     def open(self, house: House) -> None:
-        """Begin a life of a node."""
         place = house.place
-        house.team = Team(house.kept, self.store(place), self.wall, self.rng(place), self.rules)
+        house.team = Team(house.kept, self.store(place), self.wall, self.rng(place))
         network = self.board.network(*self.address(place))
         house.node = EntangledNode(
             house.team.identity,
@@ -91,12 +120,13 @@ class Village(World):
         house.team.attach(house.node, self.clock)
         house.node.start()
         house.team.start()
+        if self.tape is not None:
+            self.tape.tap(network_of(house))
         known = [self.address(0)] if place else []
         # Who is not let in may be closed before it is in.
         house.node.join(known).addErrback(lambda failure: failure.trap(NotRunning))
 
     def close(self, house: House, is_sudden: bool = False) -> None:
-        """End a life of a node."""
         house.team.stop()
         if is_sudden:
             house.node.vanish()
@@ -135,32 +165,55 @@ class Village(World):
         return self.move_in(found[0])
 
     def members(self, house: int = 0) -> list[str]:
-        """Whom a house takes for members."""
         return [member.name for member in self.houses[house].team.members()]
 
     def address_of(self, house: House) -> Address:
-        """Where a house is."""
         return self.address(house.place)
 
     def contact(self, house: House) -> Contact:
-        """How to ask a house."""
         return Contact(house.public, self.address(house.place))
 
     def stop(self) -> None:
-        """End everything."""
         for house in self.houses:
             self.close(house)
+
+
+AnyVillage = TypeVar("AnyVillage", bound=Village)
+
+
+def network_of(house: House) -> SwitchboardNetwork:
+    """The port of a house on the switchboard."""
+    network: Any = house.node._network
+    return network  # type: ignore[no-any-return]
 
 
 class VillageCase(SynchronousTestCase):
     """A test with a village; afterwards nothing may be left on its clock."""
 
-    def village(self, seed: int = 1, weather: Weather = CALM, bootstraps: int = 1) -> Village:
+    def village(self, seed: int = 1, bootstraps: int = 1) -> Village:
         """A village that is stopped when the test ends."""
-        village = Village(seed, weather, bootstraps)
+        return self.kept(Village(seed, bootstraps=bootstraps))
+
+    def kept(self, village: AnyVillage) -> AnyVillage:
+        """Have ``village`` stopped when the test ends."""
         self.addCleanup(self.left, village)
         self.addCleanup(village.stop)
         return village
+
+    def outcome(self, village: Village, asked: Deferred[Any], within: float = 2.0) -> Any:
+        """What came of a question: its answer, or the error."""
+        found: list[Any] = []
+        asked.addCallbacks(found.append, lambda failure: found.append(failure.value))
+        village.run(within)
+        return found[0] if found else None
+
+    def refusal(self, village: Village, ask: Callable[..., Deferred[Any]], house: House, within: float = 2.0) -> str:
+        """The code with which a house refuses the node whose ``ask`` that is; empty where it answers."""
+        answer = self.outcome(village, ask(village.contact(house), "ping", bytes(8), changes=True), within)
+        if isinstance(answer, NotAdmitted):
+            return str(answer.code)
+        self.assertIsInstance(answer, bytes)
+        return ""
 
     def left(self, village: Village) -> None:
         """Nothing but datagrams may be under way."""

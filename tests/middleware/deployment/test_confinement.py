@@ -42,20 +42,9 @@ class ConfinementTests(SynchronousTestCase):
 
     def test_dangerous_calls_are_none_of_them(self) -> None:
         """No call is listed that opens, connects, starts, traces or signals anything."""
-        for call in (
-            "open",
-            "openat",
-            "socket",
-            "connect",
-            "clone",
-            "fork",
-            "execve",
-            "ptrace",
-            "kill",
-            "bpf",
-            "ioctl",
-        ):
+        for call in ("open", "openat", "socket", "connect", "clone", "fork", "execve", "ptrace", "kill", "bpf"):
             self.assertNotIn(call, CALLS)
+        self.assertNotIn("ioctl", CALLS)
 
     def test_unknown_machine(self) -> None:
         """For a machine whose numbers are not known there is no filter."""

@@ -79,7 +79,6 @@ class DeploymentTests(FleetCase):
         self.world.run(1.0)
 
     def version(self, number: int, held: Manifest | None = None, name: str = "best") -> tuple[Manifest, bytes]:
-        """A version of a good strategy."""
         source = SOURCE + b"# %d\n" % number
         return pushed(name, STRATEGY, source, held, number), source
 
@@ -112,18 +111,16 @@ class DeploymentTests(FleetCase):
         self.assertIn("there are deployed:best", str(error))
         self.assertRaises(UnknownStrategy, strategy_for, "deployed:best")
 
-    def test_stranger_is_refused_by_key(self) -> None:
-        """A module of somebody who is no operator here is refused with the beginning of that key."""
+    def test_objections(self) -> None:
+        """A stranger's module, one that is not listed and one that is too large are refused before they are fetched."""
         manifest, source = self.version(1)
         self.push(manifest, source, self.stranger)
         self.assert_refused(f"comes from {self.stranger.entangled.identity.public.hex()[:8]}")
-
-    def test_unlisted_name_is_refused(self) -> None:
-        """A module that is not listed is refused by its name."""
-        manifest, source = self.version(1, name="worst")
-        self.push(manifest, source)
+        self.push(*self.version(1, name="worst"))
         self.assert_refused("refuses worst 1: is not among this node's modules")
-        self.assertEqual(self.dog.presence.device.deployed, {})
+        self.assertNotIn("worst", self.dog.presence.device.deployed)
+        self.push(replace(manifest, size=MAX_SOURCE + 1), source)
+        self.assert_refused(f"has {MAX_SOURCE + 1} bytes, more than {MAX_SOURCE}")
 
     def test_bad_signature_is_refused(self) -> None:
         """A record in the operator's name that the operator did not sign is refused, though a watcher is shown it."""
@@ -170,12 +167,6 @@ class DeploymentTests(FleetCase):
         self.assertEqual(self.running, 1)
         self.push(second, None)
         self.assert_refused("version 2 is older than the 1 held (2 was taken back)", runs=1)
-
-    def test_too_large_is_refused_unread(self) -> None:
-        """A manifest that announces more than a module may have is refused before its source is asked for."""
-        manifest, source = self.version(1)
-        self.push(replace(manifest, size=MAX_SOURCE + 1), source)
-        self.assert_refused(f"has {MAX_SOURCE + 1} bytes, more than {MAX_SOURCE}")
 
     def test_source_may_come_late(self) -> None:
         """A source that is not there yet, or is another than was signed, is asked for again until it comes."""

@@ -12,9 +12,8 @@ from middleware.consensus.deployed import BEHAVIOUR, STRATEGY
 from middleware.consensus.guard import STRIKES, Lost, NoOpinion
 from middleware.consensus.strategy import Report
 from middleware.deployment import frame
-from middleware.deployment.channel import Gone
 from middleware.deployment.manifest import pushed
-from middleware.deployment.runner import MAX_PENDING, PATIENCE_S, START_S, TRANSITIONS, PushedStrategy, Runner, State
+from middleware.deployment.runner import MAX_PENDING, PATIENCE_S, START_S, PushedStrategy, Runner, State
 from middleware.errors import UnknownTask
 from swarmnode.sandbox import simulated
 
@@ -35,24 +34,20 @@ class Scripted:
         self._ready: list[bytes] = []
 
     def send(self, message: bytes) -> None:
-        """Answer at once."""
         for question in self._splitter.feed(message):
             number, verb, _ = frame.unpack_question(question)
             self.asked.append(verb)
             self._ready += frame.Splitter(frame.MAX_ANSWER).feed(self._answer(number, verb))
 
     def receive(self, within_s: float) -> list[bytes]:
-        """What is ready."""
         ready, self._ready = self._ready, []
         return ready
 
     def end(self) -> None:
-        """Note it."""
         self.is_ended = True
 
 
 def well(number: int, content: Any) -> bytes:
-    """A good answer."""
     return frame.pack([number, True, content])
 
 
@@ -78,11 +73,6 @@ class RunnerTests(SynchronousTestCase):
     def good(self, number: int, verb: str) -> bytes:
         """Loads, and finds the same each time."""
         return well(number, {"limits": ["seccomp"], "reads": ["load"], "told": []} if verb != "call" else 7)
-
-    def test_every_state_is_in_the_table(self) -> None:
-        """Each state has its transitions, and nothing leads out of the last one."""
-        self.assertEqual(set(TRANSITIONS), set(State))
-        self.assertEqual(TRANSITIONS[State.OUT], frozenset())
 
     def test_ready_and_asked(self) -> None:
         """Once it has loaded it tells its limits and what it reads, and is asked."""
@@ -181,7 +171,7 @@ class RunnerTests(SynchronousTestCase):
         runner = self.runner(lambda number, verb: b"" if verb == "call" else self.good(number, verb), BEHAVIOUR)
         for _ in range(MAX_PENDING):
             runner.ask("call", [], lambda is_well, content: None)
-        self.assertRaises(Gone, runner.ask, "call", [], lambda is_well, content: None)
+        self.assertRaises(frame.Gone, runner.ask, "call", [], lambda is_well, content: None)
 
     def test_twin(self) -> None:
         """The twin in memory loads, decides and refuses as a process does."""

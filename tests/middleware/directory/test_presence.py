@@ -57,23 +57,16 @@ def content(**changes: object) -> dict[str, object]:
 
 class DeviceTests(SynchronousTestCase):
     def test_there_and_back(self) -> None:
-        """A device comes out of its record as it went in."""
+        """A device comes out of its record as it went in; fields that it does not use take no room."""
         self.assertEqual(device_of(record(DEVICE.packed())), DEVICE)
         placed = replace(DEVICE, pages=("http://10.0.0.1:8080",), position={"x": 1.0, "y": 2.5, "heading": -0.5})
         self.assertEqual(device_of(record(placed.packed())), placed)
         bare = {"uuid": DEVICE.uuid, "name": "dog", "of a later version": 1}
         self.assertEqual(device_of(record(bare)), Device(DEVICE.uuid, "dog"))
-
-    def test_unused_fields_cost_nothing(self) -> None:
-        """The record of a device that serves no page and names no place is no longer for it."""
         self.assertEqual({"pages", "position"} & set(msgpack.unpackb(DEVICE.packed())), set())
 
-    def test_nobody_announces_another(self) -> None:
-        """A device in the record of another node is none."""
-        self.assertIsNone(device_of(record(DEVICE.packed(), CAT)))
-
     def test_crafted(self) -> None:
-        """A record whose value has a wrong type, a wrong number or no name at all announces nothing."""
+        """A record of another node, or one with a wrong type, a wrong number or no name, announces nothing."""
         bad: dict[str, list[object]] = {
             "uuid": [None, 5, ""],
             "name": [5, None, b"dog"],
@@ -104,6 +97,7 @@ class DeviceTests(SynchronousTestCase):
                 except ValueError:
                     continue
                 self.assertIsNone(device_of(one), (name, value))
+        self.assertIsNone(device_of(record(DEVICE.packed(), CAT)))
         for value in (None, b"", b"\xc1", [1], 5, {}, {"name": "dog"}, b"\x91" * 600):
             self.assertIsNone(device_of(record(value)), value)
 
@@ -173,7 +167,6 @@ class PresenceTests(SynchronousTestCase):
         self.presence = Presence(DEVICE, lambda value: self.told.append(device_of(record(value))), self.later)
 
     def later(self, delay: float, work: Callable[[], None]) -> Any:
-        """Take note of a call."""
         self.calls.append((delay, work))
 
     def test_silent_before_it_appears(self) -> None:

@@ -1,4 +1,4 @@
-"""Tests of ``middleware.faults.battery``: a robot whose battery reads low on purpose."""
+"""Tests of ``middleware.faults.injector.LowBattery``: a robot whose battery reads low on purpose."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from drivers.link import MemoryConnector
 from drivers.reading import Observation
 from drivers.sim.driver import SimDriver
 from middleware.entangled.clock import HeapClock
-from middleware.faults.battery import LowBattery
+from middleware.faults.injector import LowBattery
 
 
 class _Robot(SimDriver):
@@ -35,7 +35,7 @@ class _Robot(SimDriver):
 
 class LowBatteryTests(SynchronousTestCase):
     def test_only_the_battery_reads_low(self) -> None:
-        """A drained robot tells of less charge, and of all else as before; healed, of the charge that it has."""
+        """A drained robot tells of less charge, where it tells of any, and of all else as before; later of its own."""
         robot = _Robot()
         driver = LowBattery(robot)
         seen: list[Any] = []
@@ -47,12 +47,7 @@ class LowBatteryTests(SynchronousTestCase):
             robot.heard(robot.shown)
             self.assertEqual(dict(observed.values), {"power.level": told, "odom.x": 2.0})
             self.assertEqual(seen[-1], observed)
-
-    def test_robot_without_a_gauge(self) -> None:
-        """A robot that tells of no charge is left as it is."""
-        robot = _Robot()
         robot.shown = Observation(1.0, 1.0, {"odom.x": 2.0})
-        driver = LowBattery(robot)
         driver.level = 0.01
         self.assertIs(driver.observe(), robot.shown)
 

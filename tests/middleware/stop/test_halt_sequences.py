@@ -15,8 +15,6 @@ BITING = 40
 
 
 class SequenceTests(SynchronousTestCase):
-    """What holds in every sequence."""
-
     def test_stop_holds(self) -> None:
         """Whatever happens, a robot that acknowledged a stop stands until a release names that very stop."""
         counts: Counter[str] = Counter()
