@@ -17,22 +17,16 @@ class RoundTripTests(SynchronousTestCase):
     """Behaviour of ``RoundTrip``."""
 
     def test_an_answer_to_the_second_try(self) -> None:
-        """It may belong to either, so nothing is measured; where nothing was, the way may be as long as it took."""
-        unknown, known = RoundTrip(), RoundTrip()
-        unknown.ambiguous(0.4)
-        self.assertEqual((unknown.wait, unknown.is_measured), (0.4, False))
+        """It may belong to either, so nothing is measured; the wait grows, up to what the answer took or the most."""
+        for seconds, wait in ((0.0, FIRST_GUESS * BACK_OFF), (0.4, 0.4), (60.0, LONGEST)):
+            unknown = RoundTrip()
+            unknown.ambiguous(seconds)
+            self.assertEqual((unknown.wait, unknown.is_measured), (wait, False))
+        known = RoundTrip()
         known.measured(0.02)
         wait = known.wait
         known.ambiguous(0.4)
         self.assertEqual(known.wait, wait * BACK_OFF)
-
-    def test_bounds(self) -> None:
-        """It grows in any case, and never beyond the longest wait."""
-        trip = RoundTrip()
-        trip.ambiguous(0.0)
-        self.assertEqual(trip.wait, FIRST_GUESS * BACK_OFF)
-        trip.ambiguous(60.0)
-        self.assertEqual(trip.wait, LONGEST)
 
 
 class LongWayTests(EndpointCase):
@@ -44,16 +38,13 @@ class LongWayTests(EndpointCase):
         self.equip(self.a)
         self.board.weather = Weather(FAR)
 
-    def inits(self) -> set[bytes]:
-        """The handshakes that arrived, each once however often it was sent."""
-        return {datagram for tap in self.taps.values() for datagram, _ in tap.kept if datagram[0] == INIT}
-
     def test_one_handshake_is_enough(self) -> None:
         """Whoever asks or asks back what waits for the session, no second handshake is begun meanwhile."""
         self.got(self.a.ask(self.to_b, "add", 1))
         self.got(self.b.ask(self.to_a, "add", 2))
         self.got(self.a.ask(self.to_b, "add", 3))
-        self.assertEqual((len(self.inits()), self.runs), (1, [1, 2, 3]))
+        inits = {datagram for tap in self.taps.values() for datagram, _ in tap.kept if datagram[0] == INIT}
+        self.assertEqual((len(inits), self.runs), (1, [1, 2, 3]))
 
     def test_who_was_asked_knows_the_way(self) -> None:
         """The confirmation of a session times the way for the one that was asked, which then asks back only once."""
@@ -62,11 +53,3 @@ class LongWayTests(EndpointCase):
         sent = self.board.counters["sent"]
         self.got(self.b.ask(self.to_a, "echo", 2))
         self.assertEqual(self.board.counters["sent"] - sent, 2)
-
-    def test_a_peer_that_restarted_is_met_anew(self) -> None:
-        """Where the other side has forgotten the session, a question is answered all the same."""
-        self.got(self.a.ask(self.to_b, "echo", 1))
-        self.b.stop()
-        self.b, self.to_b = self.endpoint(9, port=self.to_b.address.port, identity=2)
-        self.equip(self.b)
-        self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 2)), 2)

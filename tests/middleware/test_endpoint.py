@@ -19,7 +19,7 @@ from middleware.entangled.wire import method, peer
 from middleware.entangled.wire.endpoint import Endpoint
 from middleware.entangled.wire.message import MAX_MESSAGE
 from middleware.entangled.wire.peer import IN_TOUCH, SESSION_END_S
-from middleware.entangled.wire.session import DATA, INIT, INIT_LEAST, MAX_PLAIN, RESP, Invitation
+from middleware.entangled.wire.session import DATA, INIT, MAX_PLAIN, RESP, Invitation
 
 TEAM = b"k" * 32
 DELAY = 1 / 64  # sums of it are exact
@@ -128,35 +128,20 @@ class AskTests(EndpointCase):
         self.assertEqual(self.board.counters["sent"], 3)  # the third confirms the session
 
     def test_change_waits_for_the_session(self) -> None:
-        """A changing question takes two round trips at first, then one, and no INIT carries it."""
+        """A changing question takes two round trips at first, then one; no INIT runs it, whatever the asker says."""
         self.assertEqual(self.got(self.a.ask(self.to_b, "add", 1, changes=True), 4 * DELAY), 1)
         self.assertEqual(self.got(self.a.ask(self.to_b, "add", 2, changes=True), 2 * DELAY), 2)
         self.assertEqual(self.board.counters["sent"], 6)
-
-    def test_undeclared_change_is_not_run_by_a_handshake(self) -> None:
-        """What the answerer exposed as a change never runs from an INIT, whatever the asker says, and is answered."""
-        asked = self.a.ask(self.to_b, "add", 5)
+        other, _ = self.endpoint(3)
+        asked = other.ask(self.to_b, "add", 5)
         self.clock.advance(2 * DELAY)
-        self.assertEqual(self.runs, [])
-        self.assertEqual(self.got(asked), 5)
-        self.assertEqual(self.runs, [5])
-
-    def test_no_reply_is_larger_than_its_init(self) -> None:
-        """A RESP is never larger than the INIT; an answer that does not fit comes over the session."""
-        for seed, size in enumerate((1, 400, 500, 520, 1300), start=100):
-            a, _ = self.endpoint(seed)
-            self.b.expose("fill", lambda peer, count: bytes(count))
-            self.assertEqual(self.got(a.ask(self.to_b, "fill", size)), bytes(size))
-            response = self.kept(Contact(self.to_b.public, a.address), RESP)[0][0]
-            init = self.kept(self.to_b, INIT)[-1][0]
-            self.assertGreaterEqual(len(init), INIT_LEAST)
-            self.assertLessEqual(len(response), len(init))
+        self.assertEqual(self.runs, [1, 2])
+        self.assertEqual((self.got(asked), self.runs), (5, [1, 2, 5]))
 
     def test_long_questions(self) -> None:
-        """A question too long for an INIT waits for the session, one above the cap fails before anything is sent."""
-        self.failureResultOf(self.a.ask(self.to_b, "echo", bytes(MAX_MESSAGE)), TooLarge)
-        self.assertEqual(self.board.counters["sent"], 0)
+        """A question too long for an INIT waits for the session; what cannot be sent at all fails at once."""
         self.assertEqual(len(self.got(self.a.ask(self.to_b, "echo", bytes(1330)))), 1330)
+
         self.failureResultOf(self.a.ask(self.to_b, "echo", object()), TypeError)
         self.assertRaises(TooLarge, self.a.tell, self.to_b, "echo", bytes(MAX_PLAIN))
 
@@ -235,13 +220,6 @@ class AskTests(EndpointCase):
         self.clock.advance(1)
         self.assertEqual([self.successResultOf(one) for one in both], [3, 4])
 
-    def test_many_questions_share_one_handshake(self) -> None:
-        """Questions asked at once of a stranger open a single session."""
-        asked = [self.a.ask(self.to_b, "echo", number) for number in range(20)]
-        self.clock.advance(1)
-        self.assertEqual([self.successResultOf(one) for one in asked], list(range(20)))
-        self.assertEqual(len(self.kept(self.to_b, INIT)), 1)
-
     def test_contacts_are_reported_when_proved(self) -> None:
         """The asker reports the answerer when it answers, the answerer the asker when its session is confirmed."""
         seen: list[tuple[float, str, Contact]] = []
@@ -267,18 +245,6 @@ class TellTests(EndpointCase):
         self.clock.advance(1)
         self.assertEqual(self.runs, [0, 1, 2, 3, 4, 5])
         self.assertEqual((self.b.counters["unknown method"], self.b.counters["refused"]), (1, 1))
-
-    def test_tells_find_a_restarted_peer(self) -> None:
-        """Somebody who only tells notices within seconds that the peer was restarted."""
-        self.a.tell(self.to_b, "add", 0)
-        self.clock.advance(1)
-        self.b.stop()
-        self.b, self.to_b = self.endpoint(3, port=self.to_b.address.port, identity=2)
-        self.equip(self.b)
-        for _ in range(10):
-            self.a.tell(self.to_b, "add", 1)
-            self.clock.advance(1)
-        self.assertGreater(len(self.runs), 4)
 
     def test_tells_that_cannot_arrive_are_counted(self) -> None:
         """What is told to nobody is dropped and counted, and the queue is bounded."""
@@ -336,21 +302,24 @@ class WeatherTests(EndpointCase):
         self.assertGreater(len(answers), 270)
 
     def test_restarted_peer_answers_again(self) -> None:
-        """A peer that lost its sessions answers the next question, changing or not, within half a second."""
+        """A peer that lost its sessions, or came back elsewhere, answers the next question within half a second."""
         self.got(self.a.ask(self.to_b, "echo", 1))
-        for seed, name in ((3, "echo"), (4, "add")):
+        for seed, name, port in (
+            (3, "echo", self.to_b.address.port),
+            (4, "add", self.to_b.address.port),
+            (5, "add", 0),
+        ):
             self.board.kill(self.to_b.address)
-            self.b, self.to_b = self.endpoint(seed, port=self.to_b.address.port, identity=2)
+            self.b, self.to_b = self.endpoint(seed, port=port, identity=2)
             self.equip(self.b)
             self.assertEqual(self.got(self.a.ask(self.to_b, name, seed, changes=name == "add"), 0.5), seed)
-
-    def test_restart_at_another_address(self) -> None:
-        """A peer that comes back elsewhere is found at the address that the asker was given."""
-        self.got(self.a.ask(self.to_b, "echo", 1))
         self.board.kill(self.to_b.address)
-        self.b, self.to_b = self.endpoint(5, identity=2)
+        self.b, self.to_b = self.endpoint(6, port=self.to_b.address.port, identity=2)
         self.equip(self.b)
-        self.assertEqual(self.got(self.a.ask(self.to_b, "add", 7, changes=True)), 7)
+        for number in range(10):  # whoever only tells notices it, too
+            self.a.tell(self.to_b, "add", 10 + number)
+            self.clock.advance(1)
+        self.assertIn(19, self.runs)
 
     def test_address_follows_the_key(self) -> None:
         """Answers go where a peer's newest datagram came from, and a replay from elsewhere moves nothing."""
@@ -376,15 +345,6 @@ class WeatherTests(EndpointCase):
             self.test_questions_get_through_heavy_loss()
             digests.add(self.board.digest())
         self.assertEqual(len(digests), 1)
-
-    def test_old_session_is_renewed(self) -> None:
-        """After an hour the next question opens a new session beside the old one and is answered all the same."""
-        self.got(self.a.ask(self.to_b, "echo", 1))
-        for hours in (1.05, 3.0):
-            self.clock.advance(hours * 3600)
-            before = len(self.kept(self.to_b, INIT))
-            self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 2)), 2)
-            self.assertEqual(len(self.kept(self.to_b, INIT)), before + 1)
 
     def test_nobody_is_asked_on_a_session_that_may_be_gone(self) -> None:
         """In a wide network a question after a long silence takes one round trip, though the other side let go."""
@@ -430,13 +390,17 @@ class WeatherTests(EndpointCase):
         self.assertIn(sum(inits), (5, 6, 7))
 
     def test_session_that_cannot_be_renewed_is_dropped(self) -> None:
-        """Where the peer is silent nothing is sent any more under keys that have come to their end."""
-        self.got(self.a.ask(self.to_b, "echo", 1))
-        self.board.cut(self.to_a.address, self.to_b.address)
-        for _ in range(200):
-            self.a.tell(self.to_b, "echo", 1)
-            self.clock.advance(1.0)
-        self.assertEqual(self.a._sessions, {})
+        """Where the peer is silent nothing is sent any more under keys that came to their end, by age or by use."""
+        for tells, seconds in ((200, 1.0), (30, 0.0)):
+            self.got(self.a.ask(self.to_b, "echo", 1))
+            self.board.cut(self.to_a.address, self.to_b.address)
+            for _ in range(tells):
+                self.a.tell(self.to_b, "echo", 1)
+                self.clock.advance(seconds)
+            self.assertEqual(self.a._peers.known(self.to_b.public).sessions, ())  # type: ignore[union-attr]
+            self.patch(peer, "SESSION_DATAGRAMS", 5)
+            self.board.heal()
+            self.clock.advance(10.0)
 
     def test_worn_session_is_renewed(self) -> None:
         """After its number of datagrams a session gets a successor, and after twice as many nothing is sent on it."""
@@ -449,15 +413,6 @@ class WeatherTests(EndpointCase):
         handshakes = len(self.kept(self.to_a, INIT)) + len(self.kept(self.to_b, INIT))
         self.assertIn(handshakes, range(4, 11))
         self.assertLessEqual(worn, 41)
-
-    def test_worn_session_without_successor_is_dropped(self) -> None:
-        """A session that is worn twice over is not used any more, even where nobody answers the handshake."""
-        self.patch(peer, "SESSION_DATAGRAMS", 5)
-        self.got(self.a.ask(self.to_b, "echo", 1))
-        self.board.cut(self.to_a.address, self.to_b.address)
-        for _ in range(30):
-            self.a.tell(self.to_b, "echo", 1)
-        self.assertEqual(self.a._peers.known(self.to_b.public).sessions, ())  # type: ignore[union-attr]
 
 
 class AttackTests(EndpointCase):
@@ -506,19 +461,6 @@ class AttackTests(EndpointCase):
             self.assertEqual(sent, 1 if datagram[0] == INIT else 0)
         self.assertEqual((self.runs, seen), ([1], []))
         self.assertEqual((self.b.counters["replayed"], self.b.counters["repeated"]), (2, 1))
-
-    def test_replay_to_a_restarted_node(self) -> None:
-        """A whole recording, played to the restarted node, makes no contact and runs no change."""
-        self.got(self.a.ask(self.to_b, "add", 1, changes=True))
-        recording = list(self.taps[self.to_b.address].kept)
-        self.b.stop()
-        self.b, self.to_b = self.endpoint(3, port=self.to_b.address.port, identity=2)
-        self.equip(self.b)
-        seen: list[Contact] = []
-        self.b.on_contact.add(seen.append)
-        for datagram, source in recording:
-            self.send_raw(datagram, source)
-        self.assertEqual((self.runs, seen), ([1], []))
 
     def test_response_counts_only_from_where_it_was_asked(self) -> None:
         """A RESP that comes from another address, or twice, opens nothing."""
@@ -601,13 +543,3 @@ class AttackTests(EndpointCase):
         self.assertEqual(self.runs, [0, 1, 2])
         self.clock.advance(40)
         self.assertEqual(self.got(self.a.ask(self.to_b, "add", 9, changes=True)), 9)
-
-    def test_random_bytes(self) -> None:
-        """Ten thousand random datagrams raise nothing and are answered by nothing."""
-        before = self.board.counters["sent"]
-        for number in range(10_000):
-            kind = bytes([0x11 + number % 6])
-            self.taps[self.to_b.address].receiver(kind + self.rng.randbytes(self.rng.randrange(700)), self.to_a.address)
-        self.taps[self.to_b.address].receiver(b"", self.to_a.address)
-        self.assertEqual(self.board.counters["sent"], before)
-        self.assertEqual(sum(self.b.counters.values()), 10_001)

@@ -18,15 +18,14 @@ class HailTests(EndpointCase):
     """Behaviour of ``Endpoint.hail`` and of what answers it."""
 
     def test_who_is_there(self) -> None:
-        """An echo tells the team's fingerprint, the version, the clock, and from where the hail was seen."""
+        """An echo, of another team too, has the team's fingerprint, version and clock, and where the hail came from."""
         self.b.echoer.wall = lambda: 1_700_000_000.25
         self.b.echoer._fingerprint = lambda: Gate.fingerprint
         found = self.got(self.a.hail(self.to_b.address), 2 * DELAY)
         self.assertEqual(found[1:], Echo(b"", VERSION, b"the team", 1_700_000_000.25, self.to_a.address)[1:])
 
-    def test_another_team(self) -> None:
-        """A node of another team echoes too, with no name of its own where it is an open one."""
         _, to_other = self.endpoint(3, team=b"o" * 32)
+
         found = self.got(self.a.hail(to_other.address))
         self.assertEqual((found.fingerprint, found.wall), (bytes(8), 0.0))
 

@@ -25,13 +25,6 @@ CROWD = closest([contact(i) for i in range(40)], TARGET, 40)
 
 
 class LookupTest(SynchronousTestCase):
-    def test_nobody_to_ask(self) -> None:
-        """A search that knows nobody is over before it begins."""
-        lookup = Lookup(TARGET, 8, 3, [])
-        self.assertEqual(lookup.next(), [])
-        self.assertTrue(lookup.is_finished)
-        self.assertEqual(lookup.closest(), [])
-
     def test_asks_the_closest_first(self) -> None:
         """At most alpha are asked at the same time, the closest first, and nobody twice."""
         lookup = Lookup(TARGET, 8, 3, reversed(CROWD[:8]))
@@ -72,38 +65,31 @@ class LookupTest(SynchronousTestCase):
         self.assertEqual(lookup.closest(), CROWD[1:3])
 
     def test_all_fail(self) -> None:
-        """A search in which everybody fails is over, and found nobody."""
-        lookup = Lookup(TARGET, 8, 3, CROWD[:2])
-        for known in lookup.next():
-            lookup.failed(known)
-        self.assertTrue(lookup.is_finished)
-        self.assertEqual(lookup.closest(), [])
+        """A search that knows nobody, or in which everybody fails, is over, and found nobody."""
+        for seeds in ([], CROWD[:2]):
+            lookup = Lookup(TARGET, 8, 3, seeds)
+            for known in lookup.next():
+                lookup.failed(known)
+            self.assertTrue(lookup.is_finished)
+            self.assertEqual((lookup.next(), lookup.closest()), ([], []))
 
     def test_slow_frees_its_place(self) -> None:
-        """A slow contact lets others be asked, one beyond the k closest included, but the search waits for it."""
-        lookup = Lookup(TARGET, 2, 2, CROWD[:4])
-        self.assertEqual(lookup.next(), CROWD[:2])
-        lookup.slow(CROWD[0])
-        lookup.slow(CROWD[0])
-        self.assertEqual(lookup.next(), [CROWD[2]])
-        lookup.answered(CROWD[1], [])
-        lookup.answered(CROWD[2], [])
-        self.assertFalse(lookup.is_finished)
-        lookup.answered(CROWD[0], [])
-        self.assertTrue(lookup.is_finished)
-        self.assertEqual(lookup.closest(), CROWD[:2])
-
-    def test_slow_then_lost(self) -> None:
-        """Where the slow one is lost in the end, the one asked in its stead makes the search complete at once."""
-        lookup = Lookup(TARGET, 2, 2, CROWD[:4])
-        lookup.next()
-        lookup.slow(CROWD[0])
-        lookup.next()
-        lookup.answered(CROWD[1], [])
-        lookup.answered(CROWD[2], [])
-        lookup.failed(CROWD[0])
-        self.assertTrue(lookup.is_finished)
-        self.assertEqual(lookup.closest(), CROWD[1:3])
+        """A slow contact lets others be asked, but the search waits for it; where it is lost, they take its place."""
+        for is_lost in (False, True):
+            lookup = Lookup(TARGET, 2, 2, CROWD[:4])
+            self.assertEqual(lookup.next(), CROWD[:2])
+            lookup.slow(CROWD[0])
+            lookup.slow(CROWD[0])
+            self.assertEqual(lookup.next(), [CROWD[2]])
+            lookup.answered(CROWD[1], [])
+            lookup.answered(CROWD[2], [])
+            self.assertFalse(lookup.is_finished)
+            if is_lost:
+                lookup.failed(CROWD[0])
+            else:
+                lookup.answered(CROWD[0], [])
+            self.assertTrue(lookup.is_finished)
+            self.assertEqual(lookup.closest(), CROWD[1:3] if is_lost else CROWD[:2])
 
     def test_late_answer_counts(self) -> None:
         """An answer that comes after all was lost hope of is believed."""

@@ -56,7 +56,7 @@ class StreamsTests(SynchronousTestCase):
         self.viewer._answer_part(self.to_publisher, CAMERA, sequence, number, count, part, age_ms)
 
     def test_frames_arrive_whole(self) -> None:
-        """A frame of many parts arrives as it was, at every watcher, until each of them stops."""
+        """A frame of many parts arrives as it was, at every watcher, until it stops; no timer is left."""
         others: list[int] = []
         stop = self.viewer.look(self.to_publisher, CAMERA, self.see)
         stop_other = self.viewer.look(self.to_publisher, CAMERA, lambda sequence, frame, age: others.append(sequence))
@@ -70,6 +70,12 @@ class StreamsTests(SynchronousTestCase):
         self.clock.advance(0.1)
         stop_other()
         self.assertEqual((self.frames, others), ([(1, frame)], [1, 2]))
+        self.viewer.look(self.to_publisher, CAMERA, self.see)
+        self.clock.advance(0.1)
+        self.tearDown()
+        self.publisher.offer(CAMERA, 3, b"x")
+        self.clock.advance(0.1)
+        self.assertEqual(self.clock.getDelayedCalls(), [])
 
     def test_age_counts_from_the_camera(self) -> None:
         """A frame's age is what it was when it was sent, and its time on the way, though no clock is compared."""
@@ -85,11 +91,15 @@ class StreamsTests(SynchronousTestCase):
         self.assertLess(abs(self.ages[1] - 0.801), 0.0005)
 
     def test_nothing_is_sent_unseen(self) -> None:
-        """While nobody looks nothing is sent, and soon after the last look ended neither."""
+        """While nobody looks nothing is sent, soon after the last look neither; nor are empty and too large frames."""
         self.assertFalse(self.publisher.is_wanted(CAMERA))
         stop = self.viewer.look(self.to_publisher, CAMERA, self.see)
         self.clock.advance(10.0)
         self.assertTrue(self.publisher.is_wanted(CAMERA))
+        for frame in (bytes(MAX_PARTS * PART_BYTES + 1), b""):
+            self.publisher.offer(CAMERA, 1, frame)
+        self.clock.advance(0.1)
+        self.assertEqual(self.frames, [])
         stop()
         self.clock.advance(OPEN_TTL + 0.1)
         sent = self.board.counters["sent"]
@@ -130,15 +140,6 @@ class StreamsTests(SynchronousTestCase):
         self.viewer._answer_part(self.to_publisher, "other", 1, 0, 1, b"x")
         self.assertEqual(self.frames, [])
 
-    def test_too_large_a_frame(self) -> None:
-        """A frame of more parts than there may be is not sent; an empty one neither."""
-        self.viewer.look(self.to_publisher, CAMERA, self.see)
-        self.clock.advance(0.1)
-        for frame in (bytes(MAX_PARTS * PART_BYTES + 1), b""):
-            self.publisher.offer(CAMERA, 1, frame)
-        self.clock.advance(0.1)
-        self.assertEqual(self.frames, [])
-
     def test_viewers_are_bounded(self) -> None:
         """There is an end to viewers and names, whoever looks may go on looking, and places come free again."""
         peers = [Contact(bytes([n]) * 32, self.at(9)) for n in range(MAX_VIEWERS + 1)]
@@ -150,14 +151,3 @@ class StreamsTests(SynchronousTestCase):
         self.clock.advance(OPEN_TTL + 0.1)
         self.assertTrue(self.publisher._answer_open(peers[-1], CAMERA))
         self.assertTrue(self.publisher.is_wanted(CAMERA))
-
-    def test_stop(self) -> None:
-        """After the stop nothing is left on the clock, and a frame that still comes is not sent."""
-        self.viewer.look(self.to_publisher, CAMERA, self.see)
-        self.clock.advance(0.1)
-        for endpoint, streams in self.ends:
-            streams.stop()
-            endpoint.stop()
-        self.publisher.offer(CAMERA, 1, b"x")
-        self.clock.advance(0.1)
-        self.assertEqual(self.clock.getDelayedCalls(), [])
