@@ -7,8 +7,7 @@ import random
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.network.switchboard import Weather
-from middleware.entangled.wire.congestion import RoundTrip
-from middleware.entangled.wire.loss import MOST_AT_ONCE, MOST_TRIES, RARE, Loss
+from middleware.entangled.wire.congestion import MOST_AT_ONCE, MOST_TRIES, RARE, Loss, RoundTrip
 from middleware.entangled.wire.peer import MAX_TRIES
 from tests.middleware.test_endpoint import DELAY, EndpointCase
 
@@ -98,15 +97,6 @@ class RoughWeatherTests(EndpointCase):
         self.clock.advance(3.0)
         answers = [one.addErrback(lambda failure: None) for one in asked]
         self.assertGreaterEqual(sum(self.successResultOf(one) == 1 for one in answers), 97)  # with four tries each 94
-
-    def test_no_try_comes_before_an_answer_would(self) -> None:
-        """On a long path the tries of an exchange are never closer to each other than a round trip."""
-        self.board.weather = Weather(0.2)
-        for number in range(20):
-            self.got(self.a.ask(self.to_b, "echo", number))
-        self.a.peers.loss.share = 0.5
-        peer = self.a.peers.peer(self.to_b)
-        self.assertGreaterEqual(self.a.peers.spacing(peer.round_trip, 1, 1.0), 0.39)
 
     def test_few_tries_are_in_vain(self) -> None:
         """Where round trips differ, no more than one answer in eight is overtaken by the next try."""

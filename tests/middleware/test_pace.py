@@ -6,7 +6,7 @@ import random
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.entangled.kademlia.pace import FIRST, GONE, LEAST, MOST, Pace
+from middleware.entangled.kademlia.sounding import FIRST, GONE, LEAST, MOST, Pace
 
 
 class PaceTests(SynchronousTestCase):
@@ -22,13 +22,6 @@ class PaceTests(SynchronousTestCase):
         for _ in range(100):
             self.pace.lost()
         self.assertEqual(self.pace.wait, LEAST)
-
-    def test_a_loss_counts_at_once(self) -> None:
-        """When half of a network died, four losses in a row bring the rarest pace to the half of a minute."""
-        self.pace.wait = MOST
-        for _ in range(4):
-            self.pace.lost()
-        self.assertLess(self.pace.wait, 30.0)
 
     def test_it_follows_what_is_seen(self) -> None:
         """With sessions of any usual length it settles where about one in twenty of those asked is gone."""

@@ -16,6 +16,7 @@ from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
 
 from middleware.entangled.background import Background
+from middleware.entangled.bounded import keep
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.kademlia.membership import Membership
 from middleware.entangled.kademlia.overlay import Overlay
@@ -182,9 +183,7 @@ class Discovery:
                 return
             self._callers.append(self._clock.seconds())
         self.counters["heard"] += 1
-        if len(self._heard) >= MAX_HEARD:
-            del self._heard[next(iter(self._heard))]
-        self._heard[digest] = None
+        keep(self._heard, digest, None, MAX_HEARD)
         if self._pending >= MAX_PENDING:
             self.counters["crowded"] += 1
             return

@@ -15,6 +15,7 @@ from twisted.internet.interfaces import IReactorTime
 from twisted.logger import Logger
 from twisted.python.failure import Failure as Trouble
 
+from middleware.entangled.bounded import keep
 from middleware.entangled.contact import Contact
 from middleware.entangled.token_bucket import TokenBucket
 from middleware.entangled.wire.courier import Courier
@@ -174,9 +175,7 @@ class Answerer:
         self._courier.forget(public, Key(False, message.id))
         entry = self._ledger.entry(public, message.id)
         if entry is None:
-            self._cancelled[public, message.id] = None
-            if len(self._cancelled) > MAX_CANCELLED:
-                del self._cancelled[next(iter(self._cancelled))]
+            keep(self._cancelled, (public, message.id), None, MAX_CANCELLED)
         elif entry.work is not None:
             self._counters["cancelled"] += 1
             self._stop(entry)
@@ -261,13 +260,8 @@ class Answerer:
 
     def _is_within(self, public: bytes) -> bool:
         """Whether a peer may ask one thing more now."""
-        asking = self._asking
-        bucket = asking.pop(public, None)
-        if bucket is None:
-            bucket = TokenBucket(QUESTIONS, QUESTIONS_AT_ONCE)
-            if len(asking) >= MAX_ASKING:
-                del asking[next(iter(asking))]
-        asking[public] = bucket
+        bucket = self._asking.get(public) or TokenBucket(QUESTIONS, QUESTIONS_AT_ONCE)
+        keep(self._asking, public, bucket, MAX_ASKING)
         return bucket.take(self._clock.seconds())
 
     def _called(self, method: Method, peer: Contact, arguments: tuple[object, ...], deadline: float) -> object:

@@ -14,6 +14,7 @@ from twisted.internet import defer
 from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IDelayedCall, IReactorTime
 
+from middleware.entangled.background import cancel
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import Crowded, NoAnswer, TooLarge
 from middleware.entangled.network.network import Address
@@ -31,7 +32,7 @@ from middleware.entangled.wire.message import (
     encoded,
 )
 from middleware.entangled.wire.method import ErrorCodes
-from middleware.entangled.wire.peer import OPENING_S, Opening, Peer, Peers, cancel
+from middleware.entangled.wire.peer import OPENING_S, Opening, Peer, Peers
 from middleware.entangled.wire.session import MAX_PLAIN, Session
 
 PATIENCE = 1.5

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 
 from twisted.internet.interfaces import IDelayedCall, IReactorTime
 
+from middleware.entangled.background import cancel
+from middleware.entangled.bounded import keep
 from middleware.entangled.errors import Malformed
 from middleware.entangled.wire.flow import IDLE_S, Flow, Parcel
 from middleware.entangled.wire.message import (
@@ -23,7 +25,6 @@ from middleware.entangled.wire.message import (
     part_of,
     receipt_of,
 )
-from middleware.entangled.wire.peer import cancel
 from middleware.entangled.wire.session import Session
 
 # Going out: eight of the largest to one peer, so that a burst of writes is not refused; 16 MiB in all.
@@ -251,9 +252,7 @@ class Courier:
         if assembly.is_whole:
             self._forget(where)
             if not key.is_answer:
-                self._ended[where] = None
-                if len(self._ended) > MAX_ENDED:
-                    del self._ended[next(iter(self._ended))]
+                keep(self._ended, where, None, MAX_ENDED)
             self._send(public, packed_receipt(key, True, 0, part.number, assembly.here))
             self._deliver(session, key, assembly.message())
             return
@@ -277,10 +276,7 @@ class Courier:
     def _give_up(self, where: tuple[bytes, Key], now: float) -> None:
         self._counters["abandoned"] += 1
         self._forget(where)
-        self._tardy.pop(where[0], None)
-        self._tardy[where[0]] = now
-        if len(self._tardy) > MAX_TARDY:
-            del self._tardy[next(iter(self._tardy))]
+        keep(self._tardy, where[0], now, MAX_TARDY)
 
     def _new_flow(self, public: bytes) -> Flow:
         if len(self._flows) >= MAX_FLOWS:

@@ -16,6 +16,7 @@ from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
 from twisted.logger import Logger
 
+from middleware.entangled.bounded import keep
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import Forged, Malformed, NotAdmitted, NotRunning
 from middleware.entangled.identity import Identity
@@ -613,9 +614,7 @@ class Endpoint:
         if self._is_news(contact.public, code, True):
             self._log.warn("{text}", text=text, code=code)
         self._part(contact.public, text, code)
-        if len(self.refusals) >= MAX_REFUSALS:
-            del self.refusals[next(iter(self.refusals))]
-        self.refusals[contact.public] = contact, code
+        keep(self.refusals, contact.public, (contact, code), MAX_REFUSALS)
         self.on_refused(contact, code)
 
     def _part(self, public: bytes, text: str, code: str) -> None:

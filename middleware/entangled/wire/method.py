@@ -21,10 +21,10 @@ from twisted.internet.defer import CancelledError, Deferred
 from twisted.internet.interfaces import IDelayedCall
 from twisted.python.failure import Failure as Trouble
 
+from middleware.entangled.background import cancel
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import Refused
 from middleware.entangled.wire.message import BAD_ARGUMENTS, CANCELLED, Failure, is_code
-from middleware.entangled.wire.peer import cancel
 from middleware.entangled.wire.session import Session
 
 KEPT_S = 30.0

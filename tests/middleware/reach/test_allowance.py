@@ -5,7 +5,7 @@ from __future__ import annotations
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.clock import HeapClock
-from middleware.entangled.reach.allowance import INTRODUCTIONS, MEETS, MEETS_AT_ONCE, Allowance
+from middleware.entangled.reach.introducer import INTRODUCTIONS, MEETS, MEETS_AT_ONCE, Allowance
 
 ASKER, OTHER, STRANGER = b"a" * 32, b"o" * 32, b"s" * 32
 

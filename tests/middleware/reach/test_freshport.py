@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from middleware.entangled.reach.freshport import MAX_FRESH, SHUT_S
-from middleware.entangled.reach.way import HELD_S
+from middleware.entangled.reach.way import HELD_S, MAX_FRESH, SHUT_S
 from tests.middleware.reach.ground import GroundCase
 
 

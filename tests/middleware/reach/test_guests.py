@@ -5,12 +5,12 @@ from __future__ import annotations
 import random
 from typing import Any
 
-from middleware.entangled.contact import Contact, unpacked
+from middleware.entangled.contact import Contact
 from middleware.entangled.errors import Refused
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.network import Address, relayed
 from middleware.entangled.network.switchboard import Weather
-from middleware.entangled.reach.allowance import MEETS, MEETS_AT_ONCE
+from middleware.entangled.reach.introducer import MEETS, MEETS_AT_ONCE
 from middleware.entangled.reach.known import MAX_KNOWN
 from middleware.entangled.wire.peer import KNOCKS, MAX_DOORS
 from tests.middleware.reach.ground import GroundCase
@@ -121,13 +121,6 @@ class HostileTests(GroundCase):
         assert contact is not None
         self.assertEqual(self.g.call(c, contact)[0], 7)
 
-    def test_ways_of_others(self) -> None:
-        """An address that means something only to who says it arrives as the way that others carry."""
-        public = self.b.identity.public
-        for host in ("~wss-0123456789ab", relayed(bytes(20)).host, "~"):
-            contact = unpacked([public, host, 1])
-            self.assertEqual(contact, Contact(public, relayed(self.b.identity.node_id)))
-
     def test_nobody_to_ask(self) -> None:
         """A carried way that nobody knows fails as any silence does, and leaves nothing behind."""
         stranger = Identity(b"s" * 32)
@@ -138,13 +131,6 @@ class HostileTests(GroundCase):
         self.assertIn("no answer", str(self.g.call(self.a, odd)[0]))
         self.g.run(6.0)
         self.assertEqual(len(self.a.endpoint.peers._openings), 0)
-
-    def test_own_address(self) -> None:
-        """A node learns from a peer how it looks from outside."""
-        c = self.g.at("c", "full")
-        self.g.run(1.0)
-        self.assertEqual(c.reach.outside.seen_as(self.g.nodes["pub"].contact), Address(self.g.routers["c"].host, 7000))
-        self.assertEqual(self.a.reach.outside.addresses, [self.a.contact.address])
 
     def test_noise_inside_sessions(self) -> None:
         """Whatever a member puts behind the first bytes of carrying and mirrors, nothing is raised."""

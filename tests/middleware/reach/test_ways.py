@@ -77,23 +77,18 @@ class WeatherTests(GroundCase):
         self.assertLessEqual(len(late), 2, late)
 
     def test_leaky_routers(self) -> None:
-        """Routers that early knocks spoil are reached within 5 s, punched from fresh ports."""
+        """Routers that early knocks spoil are reached within 5 s, punched from fresh ports, however far one of them."""
         for one, other in (("leaky", "leaky"), ("leaky", "port"), ("port", "leaky")):
-            ground = self.ground()
-            way, seconds = ways(ground, one, other)
-            self.assertLess(seconds, 5.0, f"{one} and {other}")
-            ground.run(5.0)
-            a, b = ground.nodes["a2"], ground.nodes["b2"]
-            self.assertEqual((one, other, ground.way(a, b)), (one, other, "direct"))
-
-    def test_staggered_start(self) -> None:
-        """One a quarter of a second farther away, so that knocks come early: reached within 5 s all the same."""
-        for one, other in (("leaky", "leaky"), ("leaky", "port"), ("port", "leaky")):
-            ground = self.ground()
-            ground.site("b", other)
-            ground.board.router_weather[ground.routers["b"]] = Weather(delay_s=0.25)
-            _, seconds = ways(ground, one, other)
-            self.assertLess(seconds, 5.0, f"{one} and {other}")
+            for delay_s in (0.015, 0.25):
+                ground = self.ground()
+                ground.site("b", other)
+                ground.board.router_weather[ground.routers["b"]] = Weather(delay_s)
+                _, seconds = ways(ground, one, other)
+                self.assertLess(seconds, 5.0, f"{one} and {other}")
+                ground.run(5.0)
+                if delay_s < 0.1:
+                    way = ground.way(ground.nodes["a2"], ground.nodes["b2"])
+                    self.assertEqual((one, other, way), (one, other, "direct"))
 
     def test_late_words(self) -> None:
         """One side hears half a second late of the other: reached at once by who carries, and directly later on."""
@@ -112,19 +107,6 @@ class WeatherTests(GroundCase):
                     ground.run(1.0)
                     ways_seen.add(ground.way(ground.nodes["a2"], ground.nodes["b2"]))
                 self.assertEqual((one, other, late, ways_seen), (one, other, late, {"direct"}))
-
-    def test_neighbours_behind_one_router(self) -> None:
-        """Two nodes behind one router that has no hairpin find each other by their own addresses."""
-        for kind in ("full", "port", "sym"):
-            ground = self.ground()
-            a = ground.at("a", kind, 2)
-            ground.run(2.0)
-            b = ground.at("a", kind, 3)
-            ground.run(1.5)
-            for one, other in ((a, b), (b, a)):
-                peer = one.endpoint.peers.known(other.identity.public)
-                assert peer is not None and peer.session is not None
-                self.assertEqual(peer.session.contact.address, other.contact.address)
 
     def test_routers_within_a_private_net(self) -> None:
         """Routers whose outside is a private net too, of the same first bytes as the inside, are punched as others."""
@@ -229,9 +211,15 @@ class CarriedTests(GroundCase):
         return a, b
 
     def test_direct_as_soon_as_it_can_be(self) -> None:
-        """When the routers get better, a carried pair goes direct by itself, and nothing is carried any more."""
+        """A carried pair can say much to each other, and goes direct by itself when its routers get better."""
         ground = self.ground()
         a, b = self.carried(ground)
+        session = a.endpoint.peers.session(b.identity.public)
+        assert session is not None
+        large, got = random.Random(1).randbytes(20_000), list[Any]()
+        a.call(session.contact, "echo", large).addBoth(got.append)
+        ground.run(5.0)
+        self.assertEqual(got, [large])
         for router in ground.routers.values():
             router.kind = "port"
         ground.run(70.0)
@@ -255,18 +243,6 @@ class CarriedTests(GroundCase):
             while ground.call(a, to_b)[0] != 7:
                 self.assertLess(ground.clock.seconds() - began, 5.0)
             self.assertLess(ground.clock.seconds() - began, 5.0)
-
-    def test_parcels_are_carried(self) -> None:
-        """What fills whole datagrams is carried as well: 20 kB come back as they went."""
-        ground = self.ground()
-        a, b = self.carried(ground)
-        peer = a.endpoint.peers.known(b.identity.public)
-        assert peer is not None and peer.session is not None
-        large = random.Random(1).randbytes(20_000)
-        got: list[Any] = []
-        a.call(peer.session.contact, "echo", large).addBoth(got.append)
-        ground.run(5.0)
-        self.assertEqual(got, [large])
 
     def test_who_hears_of_it_reaches_it(self) -> None:
         """A carried peer that others are told of is reached by them: directly where they can be seen, else carried."""
