@@ -6,7 +6,7 @@ import random
 
 from middleware.entangled.errors import Malformed, NoAnswer, NotRunning
 from middleware.entangled.network.network import Address
-from middleware.entangled.wire.hail import ECHO, HAIL, HAIL_BYTES, RATE, VERSION, Echo, Hailer, echo, echo_of, hail
+from middleware.entangled.wire.hail import ECHO, HAIL, VERSION, Echo, Hailer, echo, echo_of, hail
 from tests.middleware.gate import Gate
 from tests.middleware.test_endpoint import DELAY, EndpointCase
 
@@ -38,17 +38,6 @@ class HailTests(EndpointCase):
         self.a.stop()
         self.failureResultOf(pending, NotRunning)
         self.failureResultOf(self.a.hail(HOME), NotRunning)
-
-    def test_no_amplifier(self) -> None:
-        """An echo is as long as its hail, and a flood of hails gets a few echoes in a second only."""
-        answers: list[bytes] = []
-        stranger = self.board.network("10.0.0.1", 1)
-        stranger.listen(lambda datagram, source: answers.append(datagram))
-        for _ in range(1000):
-            self.taps[self.to_b.address].receiver(hail(TOKEN), HOME)
-        self.clock.advance(0.5)
-        self.assertEqual({(len(answer), answer[0]) for answer in answers}, {(HAIL_BYTES, ECHO)})
-        self.assertEqual((len(answers), self.b.counters["crowded"]), (RATE, 1000 - RATE))
 
     def test_what_is_none(self) -> None:
         """Hails and echoes of a wrong length or for no question are counted and answered by nothing."""

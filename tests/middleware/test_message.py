@@ -84,40 +84,19 @@ class MessageTests(SynchronousTestCase):
         self.assertEqual(found, by_the_table(kind, fields))
 
     def test_refuses_what_is_out_of_shape(self) -> None:
-        """Wrong ids, names, kinds and lengths, deep nesting, extensions, huge claims and odd map keys are refused."""
+        """Deep nesting, extensions, huge claims, odd map keys and what is no message are refused."""
         deep: object = 1
         deep_maps: object = 1
         for _ in range(40):
             deep, deep_maps = [deep], {"in": deep_maps}
         shapes: list[object] = [
             [],
-            [0],
             5,
             None,
-            [False, 1, "m", [], 9],
-            [1.0, 1, "m"],
-            [0, -1, 0, "m", [], 9],
-            [0, True, 0, "m", [], 9],
-            [0, 1, 0, "", []],
-            [0, 1, 0, "m" * 65, []],
-            [0, 1, 0, b"m", [], 9],
-            [0, 1, 0, "m", {}, 9],
-            [0, 1, 0, "m", []],
-            [0, 1, 0, "m", [], -1],
-            [0, 1, 0, "m", [], 2**32],
-            [0, 1, 0, "m", [], True],
+            [0, 1, 0, "m" * 65, [], 9],
             [0, 1, 0, "m", [], 1, 1],
-            [0, 1, 2, "m", [], 1],
-            [0, 1, -1, "m", [], 1],
-            [0, 1, True, "m", [], 1],
-            [0, 1, "m", [], 1],
             [1, 1, deep],
             [1, 1, deep_maps],
-            [1, 1.5, 2],
-            [2, 1, 256, "x"],
-            [2, 1, 1, "x" * 301],
-            [2, 1, 1, b"x"],
-            [4, "m", [], 9],
             [1, 1, msgpack.ExtType(5, b"x")],
             [1, 1, msgpack.ExtType(5, b"")],
             [1, 1, msgpack.Timestamp(1)],

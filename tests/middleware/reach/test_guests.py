@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import random
 from typing import Any
 
 from middleware.entangled.contact import Contact
@@ -10,9 +9,6 @@ from middleware.entangled.errors import Refused
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.network import Address, relayed
 from middleware.entangled.network.switchboard import Weather
-from middleware.entangled.reach.introducer import MEETS, MEETS_AT_ONCE
-from middleware.entangled.reach.known import MAX_KNOWN
-from middleware.entangled.wire.peer import KNOCKS, MAX_DOORS
 from tests.middleware.reach.ground import GroundCase
 
 INTRODUCE, MEET = "reach.introduce", "reach.meet"
@@ -84,31 +80,6 @@ class HostileTests(GroundCase):
         self.assertEqual(self.flushLoggedErrors(), [])
         self.assertEqual(self.asked("echo", 3), 3)
 
-    def test_knocking_for_others_is_bounded(self) -> None:
-        """One who introduces strangers without end makes a node knock at a few addresses, some times a second."""
-        sent = self.g.board.counters["unheard"]
-        rng = random.Random(1)
-        for _ in range(200):
-            hosts = [[f"203.0.114.{rng.randrange(1, 255)}", 7000] for _ in range(50)]
-            stranger = Identity(rng.randbytes(32)).public
-            self.a.call(self.g.met_at(self.b), MEET, stranger, hosts, 0, changes=True).addErrback(lambda failure: None)
-            self.g.run(0.005)
-        self.g.run(30.0)
-        reach = self.b.reach
-        for table in (
-            reach._known,
-            reach.acquaintances,
-            reach._carriers,
-            reach._upgrades,
-            reach._allowance,
-            reach.outside._seen,
-        ):
-            self.assertLessEqual(len(table), MAX_KNOWN)
-        knocks = self.g.board.counters["unheard"] - sent
-        self.assertLess(knocks, (MEETS_AT_ONCE + 30 * MEETS) * MAX_DOORS * 2 * KNOCKS)
-        self.assertGreater(knocks, 0)
-        self.assertEqual(len(self.b.endpoint.peers._openings), 0)
-
     def test_liars_are_outdone(self) -> None:
         """An introducer that makes up addresses keeps nobody from those that the others tell."""
         made_up = [[f"203.0.114.{n}", 7000] for n in range(20)]
@@ -131,19 +102,6 @@ class HostileTests(GroundCase):
         self.assertIn("no answer", str(self.g.call(self.a, odd)[0]))
         self.g.run(6.0)
         self.assertEqual(len(self.a.endpoint.peers._openings), 0)
-
-    def test_noise_inside_sessions(self) -> None:
-        """Whatever a member puts behind the first bytes of carrying and mirrors, nothing is raised."""
-        peer = self.a.endpoint.peers.known(self.b.identity.public)
-        assert peer is not None and peer.session is not None
-        rng = random.Random(7)
-        for kind in (0x03, 0x05, 0x06, 0x07):
-            for length in range(80):
-                self.a.endpoint.send_inside(peer.session, bytes([kind]) + rng.randbytes(length))
-                self.g.run(0.01)
-        self.g.run(5.0)
-        self.assertEqual(self.flushLoggedErrors(), [])
-        self.assertEqual(self.asked("echo", 3), 3)
 
     def test_outside(self) -> None:
         """Behind a symmetric router two peers see two ports, behind others one and the same."""
