@@ -12,10 +12,6 @@ from middleware.entangled.wire.message import NO_LIMIT_MS, Cancel, Question, age
 from tests.middleware.test_endpoint import DELAY, EndpointCase
 
 
-class Occupied(Exception):
-    """The dog has another bone."""
-
-
 class CallTests(EndpointCase):
     """Behaviour of ``Answerer``."""
 
@@ -60,8 +56,8 @@ class CallTests(EndpointCase):
         return deadline - self.clock.seconds()
 
     def occupied(self, peer: Contact) -> None:
-        """Fail in a way of one's own."""
-        raise Occupied("with a bone")
+        """Refuse."""
+        raise Refused("with a bone", self.code)
 
     def test_cancelling_reaches_the_method(self) -> None:
         """Cancelling what ``ask`` returned cancels the Deferred or coroutine of the method, one way's delay later."""
@@ -117,15 +113,11 @@ class CallTests(EndpointCase):
         self.taps[self.to_b.address].receiver(session.seal(late), self.to_a.address)
         self.assertEqual((self.runs, self.b.counters["late"]), ([], 2))
 
-    def test_typed_errors(self) -> None:
-        """An exception whose code both sides know arrives as itself, else as ``Refused``; codes are unambiguous."""
-        self.b.expose_error(Occupied, "dog.occupied")
-        asked = self.a.ask(self.to_b, "busy")
-        self.clock.advance(1)
-        error = self.failureResultOf(asked, Refused).value
-        self.assertEqual((str(error), error.code), ("with a bone", "dog.occupied"))
-        self.a.expose_error(Occupied, "dog.occupied")
-        self.assertEqual(self.failed(self.a.ask(self.to_b, "busy"), Occupied), "with a bone")
-        self.a.expose_error(Occupied, "dog.occupied")
-        for code in ("dog.occupied", "bad-arguments", "", "x" * 65, "ä", "a\nb"):
-            self.assertRaises(ValueError, self.a.expose_error, KeyError, code)
+    def test_refusals_have_a_code(self) -> None:
+        """A refusal arrives with its code and its text; one with a code that cannot be sent, as a plain refusal."""
+        for code, arrives in (("dog.busy", "dog.busy"), ("", "refused"), ("x" * 65, "refused"), ("a\nb", "refused")):
+            self.code = code
+            asked = self.a.ask(self.to_b, "busy")
+            self.clock.advance(1)
+            error = self.failureResultOf(asked, Refused).value
+            self.assertEqual((str(error), error.code), ("with a bone", arrives))

@@ -26,14 +26,15 @@ class KindTests(SynchronousTestCase):
 
     def test_annotations(self) -> None:
         """Plain types are checked, as types and as names, unions included; any other annotation admits all."""
-        for annotation, lawful, wrong in (
+        rows: list[tuple[object, tuple[object, ...], tuple[object, ...]]] = [
             ("dict[str, list[int | None]] | None", ({}, None), (1, [])),
             ("list[object]|float", ([], 1, 1.5), ("x", {})),
             (bytes | None, (b"x", None), ("x", 1)),
             ("int", (1,), (True, 1.0)),
             ("Any", (1, "x"), ()),
             ("Nobody", (1, "x"), ()),
-        ):
+        ]
+        for annotation, lawful, wrong in rows:
 
             def answer(peer: object, one: Any) -> None: ...
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 from twisted.internet.interfaces import IReactorTime
 
 from middleware.entangled.bounded import keep
@@ -26,8 +24,6 @@ MAX_FRESH = 16
 SHUT_S = 60.0
 """Seconds after which a fresh port is closed where no session goes by it."""
 
-Way = Literal["none", "direct", "carried"]
-
 
 class Ways:
     """The ways to peers with which there are, or were, sessions."""
@@ -43,13 +39,6 @@ class Ways:
         self._passages: dict[bytes, tuple[Kind, float]] = {}
         self._introduced_at: dict[bytes, float] = {}
         self._holes: dict[bytes, None] = {}
-
-    def way(self, contact: Contact) -> Way:
-        """How a peer is reached now: directly, by those who carry, or not at all so far."""
-        session = self._peers.session(contact.public)
-        if session is None:
-            return "none"
-        return "carried" if is_relayed(session.contact.address) else "direct"
 
     def passage(self, contact: Contact) -> Passage:
         """How a peer is reached now, by whom, and since when."""

@@ -36,7 +36,7 @@ from middleware.entangled.wire.message import (
     Told,
     encoded,
 )
-from middleware.entangled.wire.method import Entry, ErrorCodes, Ledger, Method
+from middleware.entangled.wire.method import Entry, Ledger, Method, failure_of
 from middleware.entangled.wire.session import MAX_PLAIN, Session
 
 MAX_CANCELLED = 1024
@@ -62,7 +62,6 @@ class Answerer:
         clock: IReactorTime,
         send: Callable[[Session, bytes], None],
         courier: Courier,
-        codes: ErrorCodes,
         counters: Counter[str],
         may: Callable[[bytes, str], bool],
         refused: Callable[[Contact, str], None],
@@ -73,7 +72,6 @@ class Answerer:
         self._clock = clock
         self._send = send
         self._courier = courier
-        self._codes = codes
         self._counters = counters
         self._ledger = Ledger()
         self._cancelled: dict[tuple[bytes, int], None] = {}
@@ -275,7 +273,7 @@ class Answerer:
     def _worded(self, method: Method, number: int, result: object) -> bytes:
         """The bytes that tell the asker the result of a method, good or bad."""
         if isinstance(result, Trouble):
-            known = self._codes.failure(number, result)
+            known = failure_of(number, result)
             if known is not None:
                 return encoded(known)
             self._log.failure("{method} failed for a peer", failure=result, method=method.name)
@@ -291,7 +289,7 @@ class Answerer:
         return answer
 
     def _told_no(self, method: Method, trouble: Trouble) -> None:
-        if self._codes.failure(0, trouble) is not None:
+        if failure_of(0, trouble) is not None:
             self._counters["refused"] += 1
         else:
             self._log.failure("{method} failed for a peer", failure=trouble, method=method.name)

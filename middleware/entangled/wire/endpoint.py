@@ -55,7 +55,7 @@ from middleware.entangled.wire.message import (
     Told,
     decoded,
 )
-from middleware.entangled.wire.method import ErrorCodes, Method
+from middleware.entangled.wire.method import Method
 from middleware.entangled.wire.peer import Peers
 from middleware.entangled.wire.rebuff import Rebuffs, Side
 from middleware.entangled.wire.session import (
@@ -125,7 +125,6 @@ class Endpoint:
         self._rng = rng
         self._identity = identity
         self._own = Credentials.of(identity, team_key)
-        self._codes = ErrorCodes()
         self._lives = Lives()
         self._stamps = Stamps()
         self._noted = Noted()
@@ -139,8 +138,8 @@ class Endpoint:
             lambda number, public: self._asker.progressed(number, public),
             self.counters,
         )
-        self._answerer = Answerer(clock, self._send, self._courier, self._codes, self.counters, door.may, self._may_not)
-        self._asker = Asker(clock, rng, self._peers, self._courier, self._send, self._codes, self.counters)
+        self._answerer = Answerer(clock, self._send, self._courier, self.counters, door.may, self._may_not)
+        self._asker = Asker(clock, rng, self._peers, self._courier, self._send, self.counters)
         self._greeter = Greeter(identity.public, self._peers, network, clock, rng, self.counters)
         self._cookies = Cookies(self._own.cookie_key, rng)
         self.echoer = Echoer(self.post, clock, lambda: door.fingerprint)
@@ -229,7 +228,7 @@ class Endpoint:
         """Let peers call ``answer(peer, *arguments)`` under ``name``.
 
         It returns something that msgpack can hold (``MAX_MESSAGE`` at most), a Deferred or a coroutine of it, or raises
-        ``Refused`` or an exception that both sides named by ``expose_error``: the asker gets it with its text.
+        ``Refused``: the asker gets it with its code and its text.
         Arguments that do not fit the function's parameters and plain annotations are refused before it runs; other
         exceptions are logged, and the asker gets ``Refused("internal error")``.  It runs only in an established
         session, and with ``changes`` at most once for each question; a repeated one is given the answer of the first.
@@ -243,14 +242,6 @@ class Endpoint:
         keyword-only parameter ``deadline`` gets that moment, in seconds of this node's clock (infinite where none).
         """
         self._answerer.methods[name] = Method(name, answer, changes, idempotent, early)
-
-    def expose_error(self, kind: type[Exception], code: str) -> None:
-        """Let exceptions of ``kind`` cross the wire, both ways, under ``code``, made again from their text alone.
-
-        What has no name here arrives as ``Refused`` with its ``code``.  Raises ``ValueError`` for a code that is taken
-        or cannot be one.
-        """
-        self._codes.add(kind, code)
 
     def route_inside(self, kind: int, receiver: Inside) -> None:
         """Hand what peers send in confirmed sessions with this first byte to ``receiver``.
@@ -287,9 +278,9 @@ class Endpoint:
         something: such a question waits for the session, others ride in the handshake.  For one that ``is_light`` no
         session is opened beside the one that there is, however silent the peer.
 
-        Fails with ``NoAnswer``, ``Refused`` (the peer's text), an exception named by ``expose_error``, ``TooLarge``,
-        ``Crowded``, ``NotAdmitted``, ``NotRunning``, or with the ``TypeError`` of arguments that msgpack cannot hold.
-        When it is cancelled, the peer is told and cancels its work.
+        Fails with ``NoAnswer``, ``Refused`` (the peer's code and text), ``TooLarge``, ``Crowded``, ``NotAdmitted``,
+        ``NotRunning``, or with the ``TypeError`` of arguments that msgpack cannot hold.  When it is
+        cancelled, the peer is told and cancels its work.
         """
         if not self.is_running:
             return defer.fail(NotRunning("the endpoint is not running; start it first"))
