@@ -32,6 +32,7 @@ from middleware.entangled.wire.door import (
     next_life,
 )
 from middleware.entangled.wire.endpoint import Endpoint
+from middleware.entangled.wire.rebuff import HOUR, MAX_REBUFFS, Rebuffs
 from middleware.entangled.wire.session import ANSWER_ROOM, DATA, INIT, RESP, Credentials, Hello, Invitation
 from tests.fleet import TEAM as FLEET_TEAM
 from tests.fleet import Fleet, FleetCase
@@ -330,23 +331,6 @@ class SecretTests(ClosedCase):
         new, _ = self.endpoint(8, team=self.NEW)
         self.assertEqual(self.got(new.ask(self.to_b, "echo", 4), 4 * DELAY), 4)
 
-    def test_sessions_live_on(self) -> None:
-        """A session outlives the secret under which it was opened."""
-        self.got(self.a.ask(self.to_b, "echo", 1))
-        for end in (self.a, self.b):
-            end.rekey(self.NEW)
-        self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 2), 2 * DELAY), 2)
-
-    def test_the_old_one_is_over(self) -> None:
-        """Who has only a secret that counts no more is answered by nothing."""
-        self.b.rekey(self.NEWER, self.NEW)
-        self.b.rekey(self.NEWER)
-        sent = len(self.kept(self.to_a, RESP))
-        self.clock.advance(1)
-        self.failed(self.a.ask(self.to_b, "echo", 1), NoAnswer)
-        self.failed(self.a.greet(self.to_b.address), NoAnswer)
-        self.assertEqual(len(self.kept(self.to_a, RESP)), sent)
-
     def test_cookies_under_each_secret(self) -> None:
         """Under load a member that has only the old secret can read its cookie, and so can one with only the new."""
         self.b.rekey(self.NEW, TEAM)
@@ -543,3 +527,35 @@ class MemberTests(FleetCase, LogCase):
         fleet.enter(node, [fleet.address(0)])
         fleet.run(2.0)
         return [one for one in sent if one[1] == fleet.address(0)]
+
+
+class RebuffTests(SynchronousTestCase):
+    """Behaviour of ``Rebuffs``."""
+
+    def setUp(self) -> None:
+        self.rebuffs = Rebuffs()
+
+    def met(self, who: bytes, now: float, code: str = "revoked") -> None:
+        """Somebody is not let in."""
+        self.rebuffs.met(who, "10.0.0.1:7000", "we", code, "why; what to do", now)
+
+    def test_count_what_happens_again(self) -> None:
+        """The same refusal of the same key is one, with its first and last moment; another code is another one."""
+        for now in (1.0, 2.0, 5.0):
+            self.met(b"a", now)
+        self.met(b"a", 6.0, "expired")
+        found = [(each.code, each.first_at, each.last_at, each.count) for each in self.rebuffs.newest(6.0)]
+        self.assertEqual(found, [("expired", 6.0, 6.0, 1), ("revoked", 1.0, 5.0, 3)])
+
+    def test_forget_after_an_hour(self) -> None:
+        """What is longer ago than an hour is not told, and counts from one again."""
+        self.met(b"a", 0.0)
+        self.assertEqual(self.rebuffs.newest(HOUR + 1.0), [])
+        self.met(b"a", HOUR + 1.0)
+        self.assertEqual([each.count for each in self.rebuffs.newest(HOUR + 1.0)], [1])
+
+    def test_invented_keys_take_no_room(self) -> None:
+        """However many keys somebody invents, only the newest few are remembered."""
+        for number in range(10 * MAX_REBUFFS):
+            self.met(number.to_bytes(32), float(number))
+        self.assertEqual((len(self.rebuffs), self.rebuffs.newest(700.0)[0].last_at), (MAX_REBUFFS, 639.0))

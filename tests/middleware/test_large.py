@@ -7,6 +7,7 @@ from collections import Counter
 from typing import Any
 
 from twisted.internet.defer import Deferred
+from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.contact import Contact
 from middleware.entangled.identity import ID_BYTES
@@ -14,7 +15,7 @@ from middleware.entangled.kademlia import membership, overlay, roster
 from middleware.entangled.kademlia.distance import closest
 from middleware.entangled.kademlia.membership import LARGE_FOR
 from middleware.entangled.kademlia.overlay import MOST_HEDGE, K
-from middleware.entangled.kademlia.sounding import FIRST, NEAR_SILENCE, SESSION_S
+from middleware.entangled.kademlia.sounding import FIRST, GONE, LEAST, MOST, NEAR_SILENCE, SESSION_S, Pace
 from middleware.entangled.network.network import Address
 from middleware.entangled.network.switchboard import CALM, SwitchboardNetwork, Weather
 from middleware.entangled.node import EntangledNode
@@ -275,3 +276,32 @@ class LargeTests(FleetCase):
         held = sum(bool(n.store.get(key)) for n in live if n.contact in holders)
         self.assertGreaterEqual(held, K - 1)
         self.assertIsInstance(fleet.nodes[6].find_node(key), Deferred)
+
+
+class PaceTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.pace = Pace()
+
+    def test_within_bounds(self) -> None:
+        """Where nobody goes contacts are asked ever more rarely, where all go ever more often, both within bounds."""
+        self.assertEqual(self.pace.wait, FIRST)
+        for _ in range(100):
+            self.pace.answered()
+        self.assertEqual(self.pace.wait, MOST)
+        for _ in range(100):
+            self.pace.lost()
+        self.assertEqual(self.pace.wait, LEAST)
+
+    def test_it_follows_what_is_seen(self) -> None:
+        """With sessions of any usual length it settles where about one in twenty of those asked is gone."""
+        dice = random.Random(1)
+        for stay in (600.0, 1500.0, 4000.0):
+            gone = asked = 0
+            for _ in range(20_000):
+                if dice.random() < 1 - 2.718 ** (-self.pace.wait / stay):
+                    self.pace.lost()
+                    gone += 1
+                else:
+                    self.pace.answered()
+                asked += 1
+            self.assertApproximates(gone / asked, GONE, 0.02)

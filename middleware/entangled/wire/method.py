@@ -233,9 +233,9 @@ class Ledger:
 
     def settle(self, public: bytes, oldest: int, now: float) -> None:
         """Forget what ended of the questions of a peer before ``oldest``: it has those answers, or gave them up."""
-        if public not in self._accounts and not self._has_place():
-            return  # it is turned away in a moment
         account = self._account(public, now)
+        if account is None:
+            return  # it is turned away in a moment
         life = oldest >> LIFE_BITS
         before = account.settled.get(life)
         if before is None and len(account.settled) >= MAX_LIVES:
@@ -249,10 +249,8 @@ class Ledger:
 
     def begin(self, public: bytes, question: int, session: Session | None, now: float, is_bulky: bool) -> Entry | None:
         """Enter a question that is about to run; None where there is no room."""
-        if public not in self._accounts and not self._has_place():
-            return None
         account = self._account(public, now)
-        if self._count >= MAX_ENTRIES or len(account.running) + len(account.ended) >= MAX_PER_PEER:
+        if account is None or self._count >= MAX_ENTRIES or len(account.running) + len(account.ended) >= MAX_PER_PEER:
             return None
         entry = account.running[question] = Entry(session, is_bulky)
         self._count += 1
@@ -300,12 +298,17 @@ class Ledger:
             del self._accounts[found]
         return found is not None
 
-    def _account(self, public: bytes, now: float) -> _Account:
-        """The account of a peer, without what is over; the one that was silent for longest goes, if that is long."""
-        account = self._accounts.get(public)
+    def _account(self, public: bytes, now: float) -> _Account | None:
+        """The account of a peer, without what is over; None where there is no room for another one.
+
+        The one that was silent for longest goes, if that is long.
+        """
+        account = self._accounts.pop(public, None)
         if account is None:
-            account = self._accounts[public] = _Account()
-        self._accounts[public] = self._accounts.pop(public)  # whoever was silent for longest stands first
+            if not self._has_place():
+                return None
+            account = _Account()
+        self._accounts[public] = account  # whoever was silent for longest stands first
         account.heard_at = now
         self._expire(account, now)
         oldest_public, oldest = next(iter(self._accounts.items()))

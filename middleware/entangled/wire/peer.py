@@ -551,10 +551,7 @@ class Peers:
     def _prepare_help(self, opening: Opening, address: Address) -> None:
         if self.is_far(address):
             wait = 0.0 if is_relayed(address) else HELP_S
-            opening.helper = self._clock.callLater(wait, self._call_for_help, opening)
-
-    def _call_for_help(self, opening: Opening) -> None:
-        self.on_silence(opening)
+            opening.helper = self._clock.callLater(wait, self.on_silence, opening)
 
     def _is_lively_and_direct(self, session: Session) -> bool:
         is_lively = self._clock.seconds() - session.heard_at < LIVELY_S

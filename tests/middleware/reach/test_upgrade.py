@@ -41,12 +41,14 @@ class UpgradeTests(SynchronousTestCase):
         return moments
 
     def test_more_and_more_rarely(self) -> None:
-        """The pauses grow, and the last one is repeated."""
+        """The pauses grow, and the last one is repeated; at another address of this node they begin anew."""
         self.upgrades.add(self.public, False, 0.0)
         self.upgrades.add(self.public, False, 0.9)  # is known already
         moments = self.tried(150.0)
         pauses = [after - before for before, after in zip([0.0, *moments], moments, strict=False)]
         self.assertEqual(pauses, [*PAUSES, PAUSES[-1]])
+        self.upgrades.hurry(151.0)
+        self.assertEqual([step for _, step in self.upgrades.due(151.0)], [0])
 
     def test_only_one_of_the_two(self) -> None:
         """Who is behind begins later than the other, and who hears that the other is at it waits for longer yet."""
@@ -55,13 +57,6 @@ class UpgradeTests(SynchronousTestCase):
         now = PAUSES[0] + 2 * TURN
         self.upgrades.put_off(self.public, now)
         self.assertEqual(self.tried(10.0)[0], now + PAUSES[1] + TURN)
-
-    def test_hurry(self) -> None:
-        """At another address of this node everything is tried at once, and from the first pause on."""
-        self.upgrades.add(self.public, False, 0.0)
-        self.tried(30.0)
-        self.upgrades.hurry(31.0)
-        self.assertEqual([step for _, step in self.upgrades.due(31.0)], [0])
 
     def test_no_longer_than_needed(self) -> None:
         """A peer that is reached directly, or is silent for long, is tried no more."""
