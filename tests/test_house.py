@@ -91,6 +91,7 @@ PURE = (
     "middleware.deployment.frame",
     "middleware.deployment.manifest",
     "middleware.entangled.replication.cache",
+    "middleware.entangled.bounded",
     "middleware.entangled.errors",
     "middleware.entangled.identity",
     "middleware.entangled.contact",

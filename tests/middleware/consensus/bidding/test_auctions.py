@@ -21,6 +21,7 @@ from middleware.entangled.network.switchboard import Weather
 from middleware.entangled.wire import asker
 from middleware.entangled.wire.door import ROLE
 from middleware.entangled.wire.message import Failure
+from middleware.entangled.wire.method import error_of
 from middleware.node import SwarmNode
 from middleware.tasks.task import MEMBER, Task, group_key
 from tests.fleet import FleetCase, SwarmFleet
@@ -114,11 +115,10 @@ class DisseminationTests(AuctionCase):
         outside = [node for node in fleet.nodes if node.entangled.identity.node_id not in council]
         [known] = closest([node.entangled.contact for node in outside], group_key("job"), 1)
         refused: list[str] = []
-        answered = asker.error_of
 
         def noted(failure: Failure) -> Exception:
             refused.append(failure.text)
-            return answered(failure)
+            return error_of(failure)
 
         self.patch(party, "MAX_CHILDREN", 2)
         self.patch(asker, "error_of", noted)
