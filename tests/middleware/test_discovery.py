@@ -147,7 +147,7 @@ class DiscoveryTests(FleetCase):
         self.assertEqual([*a.overlay.contacts(), *b.overlay.contacts()], [])
         self.assertGreater(a.discovery.counters["foreign"], 0)
         self.assertEqual(a.discovery.counters["answered"], 0)
-        call, noise = a.endpoint.call(), random.Random(5)
+        call, noise = a.endpoint.greeter.call(), random.Random(5)
         thief = lan.segment.group()
         got: list[bytes] = []
         thief.listen(lambda datagram, source: got.append(datagram), lambda: None)

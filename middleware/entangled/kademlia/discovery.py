@@ -122,7 +122,7 @@ class Discovery:
 
     def _call(self) -> None:
         self.counters["calls"] += 1
-        self._called = self._endpoint.call()
+        self._called = self._endpoint.greeter.call()
         self._group.send(self._called)
 
     def _moved(self) -> None:
@@ -178,7 +178,7 @@ class Discovery:
             self.counters["repeated"] += 1
             return
         if datagram[0] == WHO:
-            if not self._endpoint.is_greeting(datagram):
+            if not self._endpoint.greeter.opens(datagram):
                 self.counters["foreign"] += 1
                 return
             self._callers.append(self._clock.seconds())

@@ -140,7 +140,7 @@ class Endpoint:
         )
         self._answerer = Answerer(clock, self._send, self._courier, self.counters, door.may, self._may_not)
         self._asker = Asker(clock, rng, self._peers, self._courier, self._send, self.counters)
-        self._greeter = Greeter(identity.public, self._peers, network, clock, rng, self.counters)
+        self.greeter = Greeter(identity.public, self._peers, network, clock, rng, self.counters)
         self._cookies = Cookies(self._own.cookie_key, rng)
         self.echoer = Echoer(self.post, clock, lambda: door.fingerprint)
         self.hailer = Hailer(self.post, clock, rng)
@@ -151,9 +151,9 @@ class Endpoint:
             DATA: self._on_data,
             INIT: self._on_init,
             RESP: self._on_resp,
-            WHO: self._greeter.on_who,
-            HERE: self._greeter.on_here,
-            COOKIE: self._greeter.on_cookie,
+            WHO: self.greeter.on_who,
+            HERE: self.greeter.on_here,
+            COOKIE: self.greeter.on_cookie,
             HAIL: lambda datagram, source: self._count(self.echoer.on_hail(datagram, source)),
             ECHO: lambda datagram, source: self._count(self.hailer.on_echo(datagram, source)),
         }
@@ -178,7 +178,7 @@ class Endpoint:
         self._answerer.clear()
         self._half_open.clear()
         error = NotRunning("the endpoint was stopped")
-        self._greeter.stop(error)
+        self.greeter.stop(error)
         self.hailer.stop(error)
         self._asker.stop(error)
         self._courier.stop()
@@ -314,15 +314,7 @@ class Endpoint:
         """Learn who listens at ``address``; fails with ``NoAnswer``.  The contact has not proved its key yet."""
         if not self.is_running:
             return defer.fail(NotRunning("the endpoint is not running; start it first"))
-        return self._greeter.greet(address, timeout)
-
-    def call(self) -> bytes:
-        """A WHO for many, such as all on a LAN; whose HERE comes is then greeted at its address."""
-        return self._greeter.call()
-
-    def is_greeting(self, datagram: bytes) -> bool:
-        """Whether ``datagram`` is a WHO or HERE of this team."""
-        return self._greeter.opens(datagram)
+        return self.greeter.greet(address, timeout)
 
     def overhear(self, datagram: bytes, source: Address) -> None:
         """Take a datagram that came by another way than the node's own port; answers leave by that port."""
