@@ -31,7 +31,7 @@ def _middleware(*names: str) -> tuple[str, ...]:
     return tuple(f"middleware.{name}" for name in names)
 
 
-BASE = _entangled("background", "contact", "errors", "identity", "listeners", "record", "token_bucket")
+BASE = _entangled("background", "bounded", "contact", "errors", "identity", "listeners", "record", "token_bucket")
 """Small modules of the library on which all of its packages stand."""
 LIBRARY = _middleware("entangled", "errors")
 

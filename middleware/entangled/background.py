@@ -13,6 +13,12 @@ from twisted.logger import Logger
 from middleware.entangled.errors import EntangledError
 
 
+def cancel(timer: IDelayedCall | None) -> None:
+    """Cancel a timer that may be none, or over."""
+    if timer is not None and timer.active():
+        timer.cancel()
+
+
 class _Chore:
     """Work that waits for its moment; with a ``period`` it is done again and again."""
 
@@ -38,8 +44,7 @@ class _Chore:
     def cancel(self) -> None:
         """Prevent it, where it has not been done."""
         self._chores._waiting.pop(self, None)
-        if self.call is not None and self.call.active():
-            self.call.cancel()
+        cancel(self.call)
 
 
 class Background:

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 
 from twisted.internet.interfaces import IDelayedCall, IReactorTime
 
+from middleware.entangled.background import cancel
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import EntangledError, Refused
 from middleware.entangled.wire.endpoint import Endpoint
@@ -171,5 +172,4 @@ class _Look:
 
     def end(self) -> None:
         """Stop renewing; the publisher notices by itself."""
-        if self._timer is not None and self._timer.active():
-            self._timer.cancel()
+        cancel(self._timer)

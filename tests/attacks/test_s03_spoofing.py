@@ -136,7 +136,7 @@ class ElsewhereTests(SynchronousTestCase):
         """A HERE from another address than was greeted is dropped and counted, though its token be right."""
         ground = self.ground
         greeted = ground.target.greet(Address("10.0.0.8", 8))
-        [token] = list(ground.target._greeter._pending)
+        [token] = list(ground.target.greeter._pending)
         key = derived_key(TEAM, b"greet")
         ground.shoot(here(key, token, Identity(b"e" * 32).public, random.Random(1)), STRANGER)
         self.assertNoResult(greeted)

@@ -19,9 +19,9 @@ from middleware.entangled.identity import Identity, exchange_key
 from middleware.entangled.kademlia.overlay import MAX_FOUND, K
 from middleware.entangled.network.network import Address
 from middleware.entangled.node import EntangledNode
-from middleware.entangled.reach.freshport import MAX_FRESH
 from middleware.entangled.reach.known import MAX_KNOWN
 from middleware.entangled.reach.relay import MAX_PAIRS
+from middleware.entangled.reach.way import MAX_FRESH
 from middleware.entangled.wire.answerer import MAX_CANCELLED
 from middleware.entangled.wire.greeting import TOKEN_BYTES, who
 from middleware.entangled.wire.method import MAX_ENTRIES

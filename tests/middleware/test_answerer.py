@@ -9,12 +9,7 @@ from twisted.internet.defer import CancelledError, Deferred
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import NoAnswer, Refused
 from middleware.entangled.wire.message import NO_LIMIT_MS, Cancel, Question, aged, decoded, encoded
-from middleware.entangled.wire.method import BadArguments
 from tests.middleware.test_endpoint import DELAY, EndpointCase
-
-
-class Occupied(Exception):
-    """The dog has another bone."""
 
 
 class CallTests(EndpointCase):
@@ -61,8 +56,8 @@ class CallTests(EndpointCase):
         return deadline - self.clock.seconds()
 
     def occupied(self, peer: Contact) -> None:
-        """Fail in a way of one's own."""
-        raise Occupied("with a bone")
+        """Refuse."""
+        raise Refused("with a bone", self.code)
 
     def test_cancelling_reaches_the_method(self) -> None:
         """Cancelling what ``ask`` returned cancels the Deferred or coroutine of the method, one way's delay later."""
@@ -98,7 +93,10 @@ class CallTests(EndpointCase):
         self.assertEqual(self.got(asked), "done")
 
     def test_deadline_is_carried(self) -> None:
-        """A method that asks for it learns how long its asker waits, less the way there."""
+        """A method learns how long its asker waits, less the way there, in milliseconds, cut to four bytes."""
+        for seconds, milliseconds in ((1.5, 1500), (-1.0, 0), (1e9, NO_LIMIT_MS)):
+            aged_one = decoded(aged(encoded(Question(1, "m", (), 7)), seconds))
+            self.assertEqual(aged_one, Question(1, "m", (), milliseconds))
         for timeout, least, most in ((None, 1.4, 1.5), (9.0, 8.9, 9.0)):
             left = self.got(self.a.ask(self.to_b, "when", timeout=timeout))
             self.assertTrue(least <= left <= most, left)
@@ -115,34 +113,11 @@ class CallTests(EndpointCase):
         self.taps[self.to_b.address].receiver(session.seal(late), self.to_a.address)
         self.assertEqual((self.runs, self.b.counters["late"]), ([], 2))
 
-    def test_time_left_travels_in_the_question(self) -> None:
-        """The time left stands in the last four bytes, in milliseconds, and is cut to what these hold."""
-        question = encoded(Question(1, "m", (), 7))
-        for seconds, milliseconds in ((1.5, 1500), (-1.0, 0), (1e9, NO_LIMIT_MS)):
-            self.assertEqual(decoded(aged(question, seconds)), Question(1, "m", (), milliseconds))
-
-    def test_typed_errors(self) -> None:
-        """An exception that both sides named arrives as itself, one named there only as ``Refused`` with its code."""
-        self.b.expose_error(Occupied, "dog.occupied")
-        asked = self.a.ask(self.to_b, "busy")
-        self.clock.advance(1)
-        error = self.failureResultOf(asked, Refused).value
-        self.assertEqual((str(error), error.code), ("with a bone", "dog.occupied"))
-        self.a.expose_error(Occupied, "dog.occupied")
-        self.assertEqual(self.failed(self.a.ask(self.to_b, "busy"), Occupied), "with a bone")
-
-    def test_codes_are_unambiguous(self) -> None:
-        """A code that is taken, or cannot be one, is refused where it is named."""
-        self.a.expose_error(Occupied, "dog.occupied")
-        self.a.expose_error(Occupied, "dog.occupied")
-        for code in ("dog.occupied", "bad-arguments", "", "x" * 65, "ä", "a\nb"):
-            self.assertRaises(ValueError, self.a.expose_error, KeyError, code)
-
-    def test_arguments_are_checked_where_declared(self) -> None:
-        """Arguments of a wrong kind or number are refused before the method runs, in words that name it."""
-        for arguments in ((), ("x",), (1, 2), (1, "a", 3), (True,)):
-            asked = self.a.ask(self.to_b, "whole", *arguments)
+    def test_refusals_have_a_code(self) -> None:
+        """A refusal arrives with its code and its text; one with a code that cannot be sent, as a plain refusal."""
+        for code, arrives in (("dog.busy", "dog.busy"), ("", "refused"), ("x" * 65, "refused"), ("a\nb", "refused")):
+            self.code = code
+            asked = self.a.ask(self.to_b, "busy")
             self.clock.advance(1)
-            error = self.failureResultOf(asked, BadArguments).value
-            self.assertIn("whole: ", str(error))
-        self.assertEqual(self.got(self.a.ask(self.to_b, "whole", 1, None)), [1, None])
+            error = self.failureResultOf(asked, Refused).value
+            self.assertEqual((str(error), error.code), ("with a bone", arrives))

@@ -43,23 +43,21 @@ class BackgroundTests(SynchronousTestCase):
         self.assertEqual(len(self.runs), 3)
 
     def test_stop_leaves_nothing(self) -> None:
-        """After the stop no timer is left, nothing new begins, and who sleeps is not woken."""
-        self.chores.every(1.0, lambda: self.runs.append(1))
+        """A sleeper is woken in time; after the stop no timer is left, nothing new begins, and no sleeper is woken."""
+        self.chores.every(2.0, lambda: self.runs.append(1))
         sleep = self.chores.sleep(1.0)
+        self.clock.advance(0.9)
+        self.assertNoResult(sleep)
+        self.clock.advance(0.2)
+        self.successResultOf(sleep)
+        sleep = self.chores.sleep(1.0)
+
         self.chores.stop()
         self.chores.later(1.0, self.runs.append, 1)
         self.assertEqual(self.clock.getDelayedCalls(), [])
         self.clock.advance(3.0)
         self.assertNoResult(sleep)
         self.assertEqual(self.runs, [])
-
-    def test_sleep(self) -> None:
-        """Who sleeps is woken in time."""
-        sleep = self.chores.sleep(1.0)
-        self.clock.advance(0.9)
-        self.assertNoResult(sleep)
-        self.clock.advance(0.2)
-        self.successResultOf(sleep)
 
     def test_fork_hears_only_accidents(self) -> None:
         """The weather and a refusal end work quietly, anything else is logged."""

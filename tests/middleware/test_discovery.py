@@ -7,20 +7,22 @@ import random
 from middleware.entangled.kademlia.discovery import ANSWERS, LISTEN
 from middleware.entangled.network.multicast import Segment, SegmentMulticast
 from middleware.entangled.network.network import Address
-from middleware.entangled.network.switchboard import CALM, Weather
 from middleware.entangled.node import EntangledNode
+from middleware.entangled.wire.greeting import HERE, WHO
+from middleware.entangled.wire.hail import HAIL
+from middleware.entangled.wire.session import INIT
 from tests.fleet import TEAM, Fleet, FleetCase
 
 
 class Lan(Fleet):
     """Nodes that were told no address, on one segment."""
 
-    def __init__(self, seed: int = 1, weather: Weather = CALM) -> None:
-        super().__init__(0, seed, weather)
+    def __init__(self) -> None:
+        super().__init__(0)
         self.segment = Segment(self.board)
         self.groups: list[SegmentMulticast] = []
 
-    def on(self, place: int, segment: Segment | None = None, team: bytes = TEAM) -> EntangledNode:
+    def on(self, place: int, *known: Address, segment: Segment | None = None, team: bytes = TEAM) -> EntangledNode:
         """A node of this place on ``segment``, which starts."""
         group = (segment or self.segment).group()
         network = self.board.network(*self.address(place))
@@ -28,7 +30,7 @@ class Lan(Fleet):
         node = EntangledNode(identity, team, network, store, self.clock, rng, lan=group)
         self.groups.append(group)
         self.nodes.append(node)
-        self.enter(node, [])
+        self.enter(node, list(known))
         return node
 
     def traffic(self) -> dict[str, int]:
@@ -40,33 +42,24 @@ class Lan(Fleet):
 class DiscoveryTests(FleetCase):
     """Behaviour of ``Discovery``."""
 
-    def lan(self, seed: int = 1, weather: Weather = CALM) -> Lan:
+    def lan(self) -> Lan:
         """A LAN that is stopped when the test ends."""
-        lan = Lan(seed, weather)
+        lan = Lan()
         self.worlds.append(lan)
         return lan
 
     def test_two_find_each_other(self) -> None:
-        """Two nodes without known nodes, started at one moment, are one network half a second later."""
+        """Two nodes without known nodes are one network half a second later; who lost everybody calls again soon."""
         lan = self.lan()
         a, b = lan.on(0), lan.on(1)
         lan.run(0.5)
         self.assertEqual(a.overlay.contacts(), [b.contact])
         self.assertEqual(b.overlay.contacts(), [a.contact])
-
-    def test_newcomer_reads_what_the_team_wrote(self) -> None:
-        """Who joins by the LAN knows everybody and reads what was written before it came."""
-        lan = self.lan()
-        first = lan.on(0)
-        lan.run(2.0)
-        key = bytes(20)
-        self.done(lan, first.put(key, "", b"value", concern="one"))
-        for place in range(1, 6):
-            lan.on(place)
-            lan.run(1.0)
-        last = lan.nodes[-1]
-        self.assertEqual(len(last.overlay.contacts()), 5)
-        self.assertEqual([record.value for record in self.done(lan, last.get(key))], [b"value"])
+        b.vanish()
+        lan.run(30.0)
+        c = lan.on(2)
+        lan.run(1.0)
+        self.assertIn(c.contact, a.overlay.contacts())
 
     def test_newcomer_is_not_whole_before_it_met_all(self) -> None:
         """Who entered through the LAN takes its team for whole only when it has met everybody in it."""
@@ -125,7 +118,7 @@ class DiscoveryTests(FleetCase):
         other = Segment(lan.board)
         for place in range(3):
             lan.on(place)
-            lan.on(place + 3, other)
+            lan.on(place + 3, segment=other)
         lan.run(5.0)
         self.assertEqual({len(node.overlay.contacts()) for node in lan.nodes}, {2})
         lan.segment.groups += other.groups
@@ -145,53 +138,29 @@ class DiscoveryTests(FleetCase):
         lan.run(0.3)
         self.assertEqual(a.overlay.contacts(), [b.contact])
 
-    def test_weather(self) -> None:
-        """With three datagrams of ten lost, five nodes find each other within ten seconds."""
-        lan = self.lan(seed=4, weather=Weather(loss=0.3, delay_s=0.005))
-        for place in range(5):
-            lan.on(place)
-        lan.run(10.0)
-        self.assertEqual({len(node.overlay.contacts()) for node in lan.nodes}, {4})
-
-    def test_another_team_is_not_met(self) -> None:
-        """A node of another team on the same LAN hears nothing from this one, and is counted."""
+    def test_strangers_change_nothing(self) -> None:
+        """Another team hears nothing, a recorded call is answered once, and forged answers are greeted a few times."""
         lan = self.lan()
         a, b = lan.on(0), lan.on(1, team=b"o" * 32)
         lan.run(5.0)
-        self.assertEqual([*a.overlay.contacts(), *b.overlay.contacts()], [])
         assert a.discovery is not None
+        self.assertEqual([*a.overlay.contacts(), *b.overlay.contacts()], [])
         self.assertGreater(a.discovery.counters["foreign"], 0)
         self.assertEqual(a.discovery.counters["answered"], 0)
-
-    def test_recording_is_answered_once(self) -> None:
-        """A call that somebody plays again and again is answered the first time only."""
-        lan = self.lan()
-        a = lan.on(0)
-        lan.run(1.0)
-        call = a.endpoint.call()
+        call, noise = a.endpoint.greeter.call(), random.Random(5)
         thief = lan.segment.group()
         got: list[bytes] = []
         thief.listen(lambda datagram, source: got.append(datagram), lambda: None)
         for _ in range(50):
             thief.send(call)
             lan.run(0.2)
-        thief.close()
-        self.assertEqual(len([datagram for datagram in got if datagram[0] == 0x15]), 1)
-
-    def test_garbage_changes_nothing(self) -> None:
-        """Forged, cut and empty datagrams raise nothing; forged answers lead a node to greet a few addresses only."""
-        lan = self.lan()
-        a = lan.on(0)
-        lan.run(1.0)
-        noise = random.Random(5)
-        thief = lan.segment.group()
-        thief.listen(lambda datagram, source: None, lambda: None)
-        for kind in (0, 0x11, 0x14, 0x15, 0x19):
+        self.assertEqual(len([datagram for datagram in got if datagram[0] == HERE]), 1)
+        a.discovery.counters.clear()
+        for kind in (0, INIT, WHO, HERE, HAIL):
             for size in (0, 1, 88, 89, 400):
                 thief.send((bytes([kind]) + noise.randbytes(size))[:size])
         lan.run(5.0)
         thief.close()
-        assert a.discovery is not None
         self.assertEqual(a.overlay.contacts(), [])
         self.assertLessEqual(a.discovery.counters["greeted"], 2)
 
@@ -200,21 +169,6 @@ class DiscoveryTests(FleetCase):
         lan = self.lan()
         first = lan.on(0)
         lan.run(1.0)
-        network, group = lan.board.network(*lan.address(1)), lan.segment.group()
-        node = EntangledNode(lan.identity(1), TEAM, network, lan.store(1), lan.clock, lan.rng(1), lan=group)
-        lan.nodes.append(node)
-        joined = lan.enter(node, [Address("10.0.0.99", 7000)])
-        self.done(lan, joined, 2.0)
-        self.assertEqual(node.overlay.contacts(), [first.contact])
-
-    def test_lost_team_is_looked_for_soon(self) -> None:
-        """A node that lost everybody calls again within seconds, and finds who came meanwhile."""
-        lan = self.lan()
-        a, b = lan.on(0), lan.on(1)
+        node = lan.on(1, Address("10.0.0.99", 7000))
         lan.run(2.0)
-        b.vanish()
-        lan.run(30.0)
-        lan.segment.is_blocked = False
-        c = lan.on(2)
-        lan.run(1.0)
-        self.assertIn(c.contact, a.overlay.contacts())
+        self.assertEqual(node.overlay.contacts(), [first.contact])

@@ -13,10 +13,9 @@ from zope.interface import implementer
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import NoAnswer, NotAdmitted, Refused
 from middleware.entangled.identity import Identity, exchange_key
-from middleware.entangled.network.address import address_of, packed_address
-from middleware.entangled.network.network import MAX_DATAGRAM, Address
+from middleware.entangled.network.network import Address, address_of, packed_address
 from middleware.entangled.node import EntangledNode
-from middleware.entangled.record import Slot, hashed_key
+from middleware.entangled.record import hashed_key
 from middleware.entangled.wire import door
 from middleware.entangled.wire.door import (
     DOUBLED,
@@ -33,6 +32,7 @@ from middleware.entangled.wire.door import (
     next_life,
 )
 from middleware.entangled.wire.endpoint import Endpoint
+from middleware.entangled.wire.rebuff import HOUR, MAX_REBUFFS, Rebuffs
 from middleware.entangled.wire.session import ANSWER_ROOM, DATA, INIT, RESP, Credentials, Hello, Invitation
 from tests.fleet import TEAM as FLEET_TEAM
 from tests.fleet import Fleet, FleetCase
@@ -89,39 +89,14 @@ class PassTests(ClosedCase):
     """What is shown in a handshake, and what becomes of it."""
 
     def test_first_answer_still_takes_one_round_trip(self) -> None:
-        """With the largest passes a first question still rides in the handshake and is answered in one round trip."""
+        """With the largest passes a first question rides in the handshake; its answer says where the INIT came from."""
         answer = bytes(ANSWER_ROOM - 20)
+        seen: list[tuple[Contact, Address]] = []
+        self.a.on_seen.add(lambda contact, address: seen.append((contact, address)))
         asked = self.a.ask(self.to_b, "echo", answer)
         self.clock.advance(2 * DELAY)
         self.assertEqual(self.successResultOf(asked), answer)
         self.assertEqual((self.at_a.judged, self.at_b.judged), ([self.to_b.public], [self.to_a.public]))
-
-    def test_resp_is_never_longer_than_its_init(self) -> None:
-        """However long the answer is, the RESP with its pass is no longer than the INIT, and that is one datagram."""
-        self.b.expose("zeros", lambda peer, padding, count: bytes(count), early=True)
-        sizes = ((0, 0), (0, ANSWER_ROOM - 20), (0, ANSWER_ROOM + 10), (500, 600), (800, 0), (2000, 2000))
-        for seed, (asked, answered) in enumerate(sizes, start=11):
-            asker, to_asker = self.endpoint(seed)
-            self.assertEqual(self.got(asker.ask(self.to_b, "zeros", bytes(asked), answered)), bytes(answered))
-            inits = [d for d, source in self.kept(self.to_b, INIT) if source == to_asker.address]
-            self.assertEqual(len(inits), 1)
-            for response, _ in self.kept(to_asker, RESP):
-                self.assertLessEqual(len(response), len(inits[0]))
-                self.assertLessEqual(len(inits[0]), MAX_DATAGRAM)
-
-    def test_an_init_without_room_for_a_pass(self) -> None:
-        """An INIT that leaves no room for the responder's pass is dropped for the price of a length."""
-        own = Credentials.of(Identity(b"m" * 32), TEAM)
-        init = Invitation(own, exchange_key(self.to_b.public), bytes(range(32)), 5, b"").datagram()
-        self.taps[self.to_b.address].receiver(init, self.to_a.address)
-        self.clock.advance(1)
-        self.assertEqual((self.b.counters["forged"], self.kept(self.to_a, RESP)), (1, []))
-
-    def test_both_are_told_where_they_are_seen(self) -> None:
-        """Who opens a session learns from which address its INIT came."""
-        seen: list[tuple[Contact, Address]] = []
-        self.a.on_seen.add(lambda contact, address: seen.append((contact, address)))
-        self.got(self.a.ask(self.to_b, "echo", 1))
         self.assertEqual(seen, [(self.to_b, self.to_a.address)])
 
     def test_refused_by_the_responder(self) -> None:
@@ -146,38 +121,23 @@ class PassTests(ClosedCase):
         self.assertEqual(len(self.kept(self.to_b, DATA)), 1)
 
     def test_said_once(self) -> None:
-        """However often a node knocks in vain, each side logs it once, with what to do about it."""
-        self.at_b.refused[self.to_a.public] = REVOKED
-        for _ in range(5):
-            self.refused(self.a.ask(self.to_b, "echo", 1), REVOKED)
-        self.assertEqual(len(self.kept(self.to_b, INIT)), 5)
-        self.assertEqual(len(self.log), 2)
-        self.assertTrue(all(meaning(REVOKED) in line for line in self.log), self.log)
-
-    def test_another_refusal_is_said_again(self) -> None:
-        """A refusal with another name is another line of the log."""
-        for code in (EXPIRED, REVOKED):
+        """Each side logs each refusal once, with what to do; a node that has a new pass is let in."""
+        for count, code in enumerate((REVOKED, EXPIRED), start=1):
             self.at_b.refused[self.to_a.public] = code
-            self.refused(self.a.ask(self.to_b, "echo", 1), code)
-        self.assertEqual(len(self.log), 4)
-
-    def test_let_in_again(self) -> None:
-        """Who was refused and has a new pass is let in at its next question."""
-        self.at_b.refused[self.to_a.public] = EXPIRED
-        self.refused(self.a.ask(self.to_b, "echo", 1), EXPIRED)
+            for _ in range(5):
+                self.refused(self.a.ask(self.to_b, "echo", 1), code)
+            self.assertEqual((len(self.kept(self.to_b, INIT)), len(self.log)), (5 * count, 2 * count))
+            self.assertTrue(all(meaning(code) in line for line in self.log[-2:]), self.log)
         del self.at_b.refused[self.to_a.public]
         self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 2)), 2)
 
-    def test_an_open_node_is_no_member(self) -> None:
-        """A node that shows no pass at all is foreign, though it holds the team's secret."""
-        stranger, _ = self.endpoint(9, gate=Gate(shown=b""))
-        self.refused(stranger.ask(self.to_b, "echo", 1), FOREIGN)
-
-    def test_a_pass_that_is_too_long(self) -> None:
-        """A pass of more bytes than this team's may have is foreign, whatever is in it, and costs no signature."""
+    def test_foreign_passes(self) -> None:
+        """Who shows no pass is foreign, and so is one of too many bytes, whatever is in it; that costs no signature."""
         self.at_a.shown += b"!"
         self.refused(self.a.ask(self.to_b, "echo", 1), FOREIGN)
         self.assertEqual(self.at_b.judged, [])
+        stranger, _ = self.endpoint(9, gate=Gate(shown=b""))
+        self.refused(stranger.ask(self.to_b, "echo", 1), FOREIGN)
 
     def test_a_repeated_init_is_refused_without_a_key_exchange(self) -> None:
         """The same INIT again gets the same refusal again, and the door is not asked a second time."""
@@ -191,12 +151,13 @@ class PassTests(ClosedCase):
         self.assertEqual(first, second)
 
     def test_a_forged_init_reaches_no_door(self) -> None:
-        """Without the team's secret an INIT costs a hash: no key is exchanged and the door is not asked."""
-        own = Credentials.of(Identity(b"m" * 32), b"x" * 32)
-        hello = Hello(self.at_a.life, self.at_a.shown, ROOM)
-        init = Invitation(own, exchange_key(self.to_b.public), bytes(range(32)), 5, b"", hello).datagram()
-        self.taps[self.to_b.address].receiver(init, self.to_a.address)
-        self.assertEqual((self.at_b.judged, self.b.counters["forged"]), ([], 1))
+        """Without the team's secret, or room for a pass, an INIT costs a hash at most: the door is not asked."""
+        for secret, hello in ((b"x" * 32, Hello(self.at_a.life, self.at_a.shown, ROOM)), (TEAM, Hello())):
+            own = Credentials.of(Identity(b"m" * 32), secret)
+            init = Invitation(own, exchange_key(self.to_b.public), bytes(range(32)), 5, b"", hello).datagram()
+            self.taps[self.to_b.address].receiver(init, self.to_a.address)
+        self.clock.advance(1)
+        self.assertEqual((self.at_b.judged, self.b.counters["forged"], self.kept(self.to_a, RESP)), ([], 2, []))
 
     def test_a_refusal_that_is_none(self) -> None:
         """A member that sends a refusal without a lawful name is counted, and its session lives on."""
@@ -242,17 +203,14 @@ class EvictionTests(ClosedCase):
             self.assertEqual(dict(end._courier._bytes_out), {})
 
     def test_evicted_before_it_confirmed(self) -> None:
-        """A session whose initiator has not confirmed it yet goes with its initiator."""
+        """A session whose initiator has not confirmed it yet goes with its initiator; a stranger's eviction is none."""
+        self.b.evict(Identity(b"n" * 32).public)
+        self.assertEqual(self.log, [])
         self.a.ask(self.to_b, "add", 1, changes=True).addErrback(lambda failure: None)
         self.clock.advance(1.5 * DELAY)
         self.b.evict(self.to_a.public)
         self.clock.advance(0.5 * DELAY)
         self.assertEqual((self.b._sessions, self.runs), ({}, []))
-
-    def test_nobody_to_evict(self) -> None:
-        """To evict somebody who was never met does nothing."""
-        self.b.evict(Identity(b"n" * 32).public)
-        self.assertEqual(self.log, [])
 
 
 class LifeTests(ClosedCase):
@@ -264,19 +222,12 @@ class LifeTests(ClosedCase):
         self.equip(end)
         return end, contact
 
-    def test_a_restart_is_welcome(self) -> None:
-        """A higher life is let in at once, and nobody hears of a refusal."""
-        self.got(self.a.ask(self.to_b, "echo", 1))
-        self.a.stop()
-        again, _ = self.life(2, 2)
-        self.assertEqual(self.got(again.ask(self.to_b, "echo", 2)), 2)
-        self.assertEqual((self.log, self.b.counters["refused"]), ([], 0))
-
     def test_the_older_one_is_told(self) -> None:
-        """While a later life goes on, the older one is told once that it is superseded, in its session and after."""
+        """A later life is let in; the older one is told once that it is superseded, in its session and after."""
         self.got(self.a.ask(self.to_b, "echo", 1))
         later, _ = self.life(2, 2)
         self.got(later.ask(self.to_b, "echo", 2))
+        self.assertEqual((self.log, self.b.counters["refused"]), ([], 0))
         self.refused(self.a.ask(self.to_b, "echo", 3), SUPERSEDED)
         self.refused(self.a.ask(self.to_b, "echo", 3), SUPERSEDED)
         self.assertEqual(self.got(later.ask(self.to_b, "echo", 4)), 4)
@@ -369,6 +320,7 @@ class SecretTests(ClosedCase):
 
     def test_both_are_good_for_a_while(self) -> None:
         """While the old secret still counts, who has the new one and who has not reach each other, both ways."""
+        self.assertRaises(ValueError, self.b.rekey, b"short")
         self.b.rekey(self.NEW, TEAM)
         self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 1), 4 * DELAY), 1)
         old, to_old = self.endpoint(7)
@@ -379,31 +331,6 @@ class SecretTests(ClosedCase):
         new, _ = self.endpoint(8, team=self.NEW)
         self.assertEqual(self.got(new.ask(self.to_b, "echo", 4), 4 * DELAY), 4)
 
-    def test_greetings_while_both_are_good(self) -> None:
-        """A greeting goes out under each secret in turn, and who is found by the old one is asked under it at once."""
-        self.b.rekey(self.NEW, TEAM)
-        self.equip(self.a)
-        found = self.got(self.b.greet(self.to_a.address), 1.0)
-        self.assertEqual(found, self.to_a)
-        self.assertEqual(self.got(self.b.ask(found, "echo", 1), 2 * DELAY), 1)
-
-    def test_sessions_live_on(self) -> None:
-        """A session outlives the secret under which it was opened."""
-        self.got(self.a.ask(self.to_b, "echo", 1))
-        for end in (self.a, self.b):
-            end.rekey(self.NEW)
-        self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 2), 2 * DELAY), 2)
-
-    def test_the_old_one_is_over(self) -> None:
-        """Who has only a secret that counts no more is answered by nothing."""
-        self.b.rekey(self.NEWER, self.NEW)
-        self.b.rekey(self.NEWER)
-        sent = len(self.kept(self.to_a, RESP))
-        self.clock.advance(1)
-        self.failed(self.a.ask(self.to_b, "echo", 1), NoAnswer)
-        self.failed(self.a.greet(self.to_b.address), NoAnswer)
-        self.assertEqual(len(self.kept(self.to_a, RESP)), sent)
-
     def test_cookies_under_each_secret(self) -> None:
         """Under load a member that has only the old secret can read its cookie, and so can one with only the new."""
         self.b.rekey(self.NEW, TEAM)
@@ -413,18 +340,15 @@ class SecretTests(ClosedCase):
             self.assertEqual(self.got(asker.ask(self.to_b, "echo", 1), 4 * DELAY), 1)
 
     def test_nobody_is_remembered_by_an_old_one(self) -> None:
-        """Who was met under the old secret is asked under the new one as soon as the old one counts no more."""
+        """Who was greeted under the old secret is asked under it, then under the new one when that alone counts."""
         self.equip(self.a)
         self.b.rekey(self.NEW, TEAM)
-        self.got(self.b.greet(self.to_a.address), 1.0)
+        self.assertEqual(self.got(self.b.greet(self.to_a.address), 1.0), self.to_a)
+        self.assertEqual(self.got(self.b.ask(self.to_a, "echo", 1), 2 * DELAY), 1)
         self.a.rekey(self.NEW)
         self.b.rekey(self.NEW)
-        self.assertEqual(self.got(self.b.ask(self.to_a, "echo", 1), 2 * DELAY), 1)
-
-    def test_what_is_no_secret(self) -> None:
-        """A secret of another length is refused, and what was before still counts."""
-        self.assertRaises(ValueError, self.b.rekey, b"short")
-        self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 1)), 1)
+        self.b._peers.evict(self.b._peers.peer(self.to_a))
+        self.assertEqual(self.got(self.b.ask(self.to_a, "echo", 2), 2 * DELAY), 2)
 
 
 class RoleTests(ClosedCase):
@@ -522,27 +446,6 @@ class MemberTests(FleetCase, LogCase):
         self.worlds.append(fleet)
         return fleet
 
-    def test_evicted_from_a_team(self) -> None:
-        """Who is evicted leaves every table, its leases end at once, nobody looks for it, and it does not come back."""
-        fleet = self.gated(4)
-        node, gone = fleet.nodes[0], fleet.nodes[3].identity
-        told: list[list[bytes | None]] = []
-        self.done(fleet, fleet.nodes[3].put(KEY, "here", b"3", "leased"))
-        self.done(fleet, fleet.nodes[3].put(KEY, "stays", b"4", "team"))
-        node.watch(KEY, lambda records: told.append([r.value for r in records]))
-        fleet.run(1.0)
-        self.assertEqual(told[-1], [b"3", b"4"])
-        fleet.evict(3, by=(0, 1, 2))
-        fleet.run(0.5)
-        self.assertEqual(told[-1], [b"4"])
-        fleet.run(60.0)
-        for place in range(3):
-            overlay = fleet.nodes[place].overlay
-            self.assertNotIn(gone.node_id, [c.node_id for c in [*overlay.contacts(), *overlay.roster.absent()]])
-            self.assertEqual(len(overlay.contacts()), 2)
-        self.assertEqual(fleet.nodes[3].overlay.contacts(), [])
-        self.assertGreaterEqual(self.done(fleet, node.put(KEY, "after", b"5", concern="all")), 3)
-
     def test_the_last_one_left_does_not_look_for_it(self) -> None:
         """Who evicted the only other member does not look for it where it was."""
         fleet = self.gated(2)
@@ -571,6 +474,14 @@ class MemberTests(FleetCase, LogCase):
                 fleet.run(0.01)
                 self.assertEqual(len(node.overlay.contacts()), 2)
             self.assertEqual(bool(copy._sessions), is_in)
+
+    def test_a_slot_that_is_not_for_it(self) -> None:
+        """What its own role forbids a node does not write: the writer is told at once, and nothing is sent."""
+        fleet = self.gated(2)
+        fleet.gates[1].unwritable.add((fleet.identity(1).public, "order"))
+        sent = fleet.board.counters["sent"]
+        error = self.failureResultOf(fleet.nodes[1].put(KEY, "order", b"x"), Refused).value
+        self.assertEqual((error.code, fleet.board.counters["sent"]), (ROLE, sent))
 
     def test_the_evicted_one_is_no_majority_by_itself(self) -> None:
         """Who is turned away by all counts them as absent, so it does not take itself for the team."""
@@ -617,41 +528,34 @@ class MemberTests(FleetCase, LogCase):
         fleet.run(2.0)
         return [one for one in sent if one[1] == fleet.address(0)]
 
-    def test_a_restart_in_a_closed_team(self) -> None:
-        """A member that was restarted is let in and known again, and nobody logs a refusal."""
-        log = self.listened()
-        fleet = self.gated(3)
-        fleet.kill(2)
-        fleet.run(1.0)
-        fleet.restart(2)
-        fleet.run(3.0)
-        self.assertEqual([len(node.overlay.contacts()) for node in fleet.nodes], [2, 2, 2])
-        self.assertEqual(log, [])
 
-    def test_a_slot_that_is_not_for_it(self) -> None:
-        """What its own role forbids a node does not write: the writer is told at once, and nothing is sent."""
-        fleet = self.gated(3)
-        fleet.gates[2].unwritable.add((fleet.identity(2).public, "order"))
-        sent = fleet.board.counters["sent"]
-        error = self.failureResultOf(fleet.nodes[2].put(KEY, "order", b"x"), Refused).value
-        self.assertEqual((error.code, fleet.board.counters["sent"]), (ROLE, sent))
+class RebuffTests(SynchronousTestCase):
+    """Behaviour of ``Rebuffs``."""
 
-    def test_replicas_do_not_take_it_either(self) -> None:
-        """Where a node writes against its role, no replica holds it, no reader sees it, and the refusal reaches it."""
-        fleet = self.gated(4)
-        for place in range(3):
-            fleet.gates[place].unwritable.add((fleet.identity(3).public, "order"))
-        stored = fleet.nodes[3].put(KEY, "order", b"x")
-        fleet.run(2.0)
-        error = self.failureResultOf(stored, Refused).value
-        self.assertEqual(error.code, ROLE)
-        self.assertIn(meaning(ROLE), str(error))
-        self.assertFalse(fleet.nodes[3]._owner.owns(Slot(KEY, fleet.identity(3).public, "order")))
-        told: list[list[bytes | None]] = []
-        fleet.nodes[1].watch(KEY, lambda records: told.append([r.value for r in records]))
-        fleet.run(60.0)
-        for place in range(3):
-            self.assertEqual(fleet.nodes[place].replica.held(KEY), [])
-            self.assertEqual(self.done(fleet, fleet.nodes[place].get(KEY)), [])
-        self.assertEqual([found for found in told if found], [])
-        self.assertGreaterEqual(self.done(fleet, fleet.nodes[3].put(KEY, "other", b"y")), 3)
+    def setUp(self) -> None:
+        self.rebuffs = Rebuffs()
+
+    def met(self, who: bytes, now: float, code: str = "revoked") -> None:
+        """Somebody is not let in."""
+        self.rebuffs.met(who, "10.0.0.1:7000", "we", code, "why; what to do", now)
+
+    def test_count_what_happens_again(self) -> None:
+        """The same refusal of the same key is one, with its first and last moment; another code is another one."""
+        for now in (1.0, 2.0, 5.0):
+            self.met(b"a", now)
+        self.met(b"a", 6.0, "expired")
+        found = [(each.code, each.first_at, each.last_at, each.count) for each in self.rebuffs.newest(6.0)]
+        self.assertEqual(found, [("expired", 6.0, 6.0, 1), ("revoked", 1.0, 5.0, 3)])
+
+    def test_forget_after_an_hour(self) -> None:
+        """What is longer ago than an hour is not told, and counts from one again."""
+        self.met(b"a", 0.0)
+        self.assertEqual(self.rebuffs.newest(HOUR + 1.0), [])
+        self.met(b"a", HOUR + 1.0)
+        self.assertEqual([each.count for each in self.rebuffs.newest(HOUR + 1.0)], [1])
+
+    def test_invented_keys_take_no_room(self) -> None:
+        """However many keys somebody invents, only the newest few are remembered."""
+        for number in range(10 * MAX_REBUFFS):
+            self.met(number.to_bytes(32), float(number))
+        self.assertEqual((len(self.rebuffs), self.rebuffs.newest(700.0)[0].last_at), (MAX_REBUFFS, 639.0))

@@ -19,7 +19,7 @@ from middleware.entangled.wire import method, peer
 from middleware.entangled.wire.endpoint import Endpoint
 from middleware.entangled.wire.message import MAX_MESSAGE
 from middleware.entangled.wire.peer import IN_TOUCH, SESSION_END_S
-from middleware.entangled.wire.session import DATA, INIT, INIT_LEAST, MAX_PLAIN, RESP, Invitation
+from middleware.entangled.wire.session import DATA, INIT, MAX_PLAIN, RESP, Invitation
 
 TEAM = b"k" * 32
 DELAY = 1 / 64  # sums of it are exact
@@ -119,44 +119,21 @@ class EndpointCase(SynchronousTestCase):
 class AskTests(EndpointCase):
     """Questions and answers."""
 
-    def test_first_answer_takes_one_round_trip(self) -> None:
-        """A first question rides in the handshake: the answer is there after one round trip and two datagrams."""
-        asked = self.a.ask(self.to_b, "echo", [1, b"x", {"a": None}])
-        self.clock.advance(2 * DELAY)
-        self.assertEqual(self.successResultOf(asked), [1, b"x", {"a": None}])
-        self.clock.advance(1)
-        self.assertEqual(self.board.counters["sent"], 3)  # the third confirms the session
-
     def test_change_waits_for_the_session(self) -> None:
-        """A changing question takes two round trips at first, then one, and no INIT carries it."""
+        """A changing question takes two round trips at first, then one; no INIT runs it, whatever the asker says."""
         self.assertEqual(self.got(self.a.ask(self.to_b, "add", 1, changes=True), 4 * DELAY), 1)
         self.assertEqual(self.got(self.a.ask(self.to_b, "add", 2, changes=True), 2 * DELAY), 2)
         self.assertEqual(self.board.counters["sent"], 6)
-
-    def test_undeclared_change_is_not_run_by_a_handshake(self) -> None:
-        """What the answerer exposed as a change never runs from an INIT, whatever the asker says, and is answered."""
-        asked = self.a.ask(self.to_b, "add", 5)
+        other, _ = self.endpoint(3)
+        asked = other.ask(self.to_b, "add", 5)
         self.clock.advance(2 * DELAY)
-        self.assertEqual(self.runs, [])
-        self.assertEqual(self.got(asked), 5)
-        self.assertEqual(self.runs, [5])
-
-    def test_no_reply_is_larger_than_its_init(self) -> None:
-        """A RESP is never larger than the INIT; an answer that does not fit comes over the session."""
-        for seed, size in enumerate((1, 400, 500, 520, 1300), start=100):
-            a, _ = self.endpoint(seed)
-            self.b.expose("fill", lambda peer, count: bytes(count))
-            self.assertEqual(self.got(a.ask(self.to_b, "fill", size)), bytes(size))
-            response = self.kept(Contact(self.to_b.public, a.address), RESP)[0][0]
-            init = self.kept(self.to_b, INIT)[-1][0]
-            self.assertGreaterEqual(len(init), INIT_LEAST)
-            self.assertLessEqual(len(response), len(init))
+        self.assertEqual(self.runs, [1, 2])
+        self.assertEqual((self.got(asked), self.runs), (5, [1, 2, 5]))
 
     def test_long_questions(self) -> None:
-        """A question too long for an INIT waits for the session, one above the cap fails before anything is sent."""
-        self.failureResultOf(self.a.ask(self.to_b, "echo", bytes(MAX_MESSAGE)), TooLarge)
-        self.assertEqual(self.board.counters["sent"], 0)
+        """A question too long for an INIT waits for the session; what cannot be sent at all fails at once."""
         self.assertEqual(len(self.got(self.a.ask(self.to_b, "echo", bytes(1330)))), 1330)
+
         self.failureResultOf(self.a.ask(self.to_b, "echo", object()), TypeError)
         self.assertRaises(TooLarge, self.a.tell, self.to_b, "echo", bytes(MAX_PLAIN))
 
@@ -235,13 +212,6 @@ class AskTests(EndpointCase):
         self.clock.advance(1)
         self.assertEqual([self.successResultOf(one) for one in both], [3, 4])
 
-    def test_many_questions_share_one_handshake(self) -> None:
-        """Questions asked at once of a stranger open a single session."""
-        asked = [self.a.ask(self.to_b, "echo", number) for number in range(20)]
-        self.clock.advance(1)
-        self.assertEqual([self.successResultOf(one) for one in asked], list(range(20)))
-        self.assertEqual(len(self.kept(self.to_b, INIT)), 1)
-
     def test_contacts_are_reported_when_proved(self) -> None:
         """The asker reports the answerer when it answers, the answerer the asker when its session is confirmed."""
         seen: list[tuple[float, str, Contact]] = []
@@ -267,18 +237,6 @@ class TellTests(EndpointCase):
         self.clock.advance(1)
         self.assertEqual(self.runs, [0, 1, 2, 3, 4, 5])
         self.assertEqual((self.b.counters["unknown method"], self.b.counters["refused"]), (1, 1))
-
-    def test_tells_find_a_restarted_peer(self) -> None:
-        """Somebody who only tells notices within seconds that the peer was restarted."""
-        self.a.tell(self.to_b, "add", 0)
-        self.clock.advance(1)
-        self.b.stop()
-        self.b, self.to_b = self.endpoint(3, port=self.to_b.address.port, identity=2)
-        self.equip(self.b)
-        for _ in range(10):
-            self.a.tell(self.to_b, "add", 1)
-            self.clock.advance(1)
-        self.assertGreater(len(self.runs), 4)
 
     def test_tells_that_cannot_arrive_are_counted(self) -> None:
         """What is told to nobody is dropped and counted, and the queue is bounded."""
@@ -313,44 +271,25 @@ class TellTests(EndpointCase):
 class WeatherTests(EndpointCase):
     """Loss, duplication, restart, moving."""
 
-    def test_changes_run_at_most_once(self) -> None:
-        """Under loss, duplication and reordering no change runs twice, and every answered one ran."""
-        self.board.weather = Weather(DELAY, DELAY / 2, loss=0.3, duplicate=0.3, reorder=0.2)
-        answered: list[int] = []
-        for number in range(300):
-            asked = self.a.ask(self.to_b, "add", number, changes=True)
-            asked.addCallbacks(answered.append, lambda failure: failure.trap(NoAnswer))
-            self.clock.advance(0.5)
-        self.clock.advance(3)
-        self.assertEqual(len(self.runs), len(set(self.runs)))
-        self.assertLessEqual(set(answered), set(self.runs))
-        self.assertGreater(len(answered), 270)
-
-    def test_questions_get_through_heavy_loss(self) -> None:
-        """With 30 % of the datagrams lost each way at least nine of ten questions are answered."""
-        self.board.weather = Weather(DELAY, loss=0.3)
-        answers: list[int] = []
-        for number in range(300):
-            self.a.ask(self.to_b, "echo", number).addCallbacks(answers.append, lambda failure: failure.trap(NoAnswer))
-            self.clock.advance(2)
-        self.assertGreater(len(answers), 270)
-
     def test_restarted_peer_answers_again(self) -> None:
-        """A peer that lost its sessions answers the next question, changing or not, within half a second."""
+        """A peer that lost its sessions, or came back elsewhere, answers the next question within half a second."""
         self.got(self.a.ask(self.to_b, "echo", 1))
-        for seed, name in ((3, "echo"), (4, "add")):
+        for seed, name, port in (
+            (3, "echo", self.to_b.address.port),
+            (4, "add", self.to_b.address.port),
+            (5, "add", 0),
+        ):
             self.board.kill(self.to_b.address)
-            self.b, self.to_b = self.endpoint(seed, port=self.to_b.address.port, identity=2)
+            self.b, self.to_b = self.endpoint(seed, port=port, identity=2)
             self.equip(self.b)
             self.assertEqual(self.got(self.a.ask(self.to_b, name, seed, changes=name == "add"), 0.5), seed)
-
-    def test_restart_at_another_address(self) -> None:
-        """A peer that comes back elsewhere is found at the address that the asker was given."""
-        self.got(self.a.ask(self.to_b, "echo", 1))
         self.board.kill(self.to_b.address)
-        self.b, self.to_b = self.endpoint(5, identity=2)
+        self.b, self.to_b = self.endpoint(6, port=self.to_b.address.port, identity=2)
         self.equip(self.b)
-        self.assertEqual(self.got(self.a.ask(self.to_b, "add", 7, changes=True)), 7)
+        for number in range(10):  # whoever only tells notices it, too
+            self.a.tell(self.to_b, "add", 10 + number)
+            self.clock.advance(1)
+        self.assertIn(19, self.runs)
 
     def test_address_follows_the_key(self) -> None:
         """Answers go where a peer's newest datagram came from, and a replay from elsewhere moves nothing."""
@@ -367,24 +306,6 @@ class WeatherTests(EndpointCase):
         self.b.on_contact.add(seen.append)
         self.assertEqual(self.got(self.b.ask(self.to_a, "echo", 3)), 3)
         self.assertEqual(seen, [Contact(self.to_a.public, Address("127.0.0.1", 40000))])
-
-    def test_runs_are_replayed_from_the_seed(self) -> None:
-        """The same seeds give the same datagrams at the same moments."""
-        digests = set()
-        for _ in range(2):
-            self.setUp()
-            self.test_questions_get_through_heavy_loss()
-            digests.add(self.board.digest())
-        self.assertEqual(len(digests), 1)
-
-    def test_old_session_is_renewed(self) -> None:
-        """After an hour the next question opens a new session beside the old one and is answered all the same."""
-        self.got(self.a.ask(self.to_b, "echo", 1))
-        for hours in (1.05, 3.0):
-            self.clock.advance(hours * 3600)
-            before = len(self.kept(self.to_b, INIT))
-            self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 2)), 2)
-            self.assertEqual(len(self.kept(self.to_b, INIT)), before + 1)
 
     def test_nobody_is_asked_on_a_session_that_may_be_gone(self) -> None:
         """In a wide network a question after a long silence takes one round trip, though the other side let go."""
@@ -430,13 +351,17 @@ class WeatherTests(EndpointCase):
         self.assertIn(sum(inits), (5, 6, 7))
 
     def test_session_that_cannot_be_renewed_is_dropped(self) -> None:
-        """Where the peer is silent nothing is sent any more under keys that have come to their end."""
-        self.got(self.a.ask(self.to_b, "echo", 1))
-        self.board.cut(self.to_a.address, self.to_b.address)
-        for _ in range(200):
-            self.a.tell(self.to_b, "echo", 1)
-            self.clock.advance(1.0)
-        self.assertEqual(self.a._sessions, {})
+        """Where the peer is silent nothing is sent any more under keys that came to their end, by age or by use."""
+        for tells, seconds in ((200, 1.0), (30, 0.0)):
+            self.got(self.a.ask(self.to_b, "echo", 1))
+            self.board.cut(self.to_a.address, self.to_b.address)
+            for _ in range(tells):
+                self.a.tell(self.to_b, "echo", 1)
+                self.clock.advance(seconds)
+            self.assertEqual(self.a._peers.known(self.to_b.public).sessions, ())  # type: ignore[union-attr]
+            self.patch(peer, "SESSION_DATAGRAMS", 5)
+            self.board.heal()
+            self.clock.advance(10.0)
 
     def test_worn_session_is_renewed(self) -> None:
         """After its number of datagrams a session gets a successor, and after twice as many nothing is sent on it."""
@@ -450,15 +375,6 @@ class WeatherTests(EndpointCase):
         self.assertIn(handshakes, range(4, 11))
         self.assertLessEqual(worn, 41)
 
-    def test_worn_session_without_successor_is_dropped(self) -> None:
-        """A session that is worn twice over is not used any more, even where nobody answers the handshake."""
-        self.patch(peer, "SESSION_DATAGRAMS", 5)
-        self.got(self.a.ask(self.to_b, "echo", 1))
-        self.board.cut(self.to_a.address, self.to_b.address)
-        for _ in range(30):
-            self.a.tell(self.to_b, "echo", 1)
-        self.assertEqual(self.a._peers.known(self.to_b.public).sessions, ())  # type: ignore[union-attr]
-
 
 class AttackTests(EndpointCase):
     """Datagrams that must change nothing."""
@@ -469,56 +385,6 @@ class AttackTests(EndpointCase):
         self.taps[self.to_b.address].receiver(datagram, source)
         self.clock.advance(2 * DELAY)
         return self.board.counters["sent"] - before
-
-    def test_wrong_team_is_not_answered(self) -> None:
-        """A node with another team key gets no byte back, neither to a question nor to a greeting."""
-        stranger, to_stranger = self.endpoint(9, team=b"x" * 32)
-        self.failed(stranger.ask(self.to_b, "echo", 1), NoAnswer)
-        self.failed(stranger.greet(self.to_b.address), NoAnswer)
-        self.assertEqual(self.taps[to_stranger.address].kept, [])
-        self.assertGreater(self.b.counters["forged"], 0)
-
-    def test_damaged_datagrams_are_silent(self) -> None:
-        """Every recorded datagram with a flipped byte or cut short is counted, and nothing is sent or run."""
-        self.got(self.a.ask(self.to_b, "add", 1, changes=True))
-        self.got(self.a.greet(self.to_b.address))
-        kept = list(self.taps[self.to_b.address].kept)
-        kept += self.taps[self.to_a.address].kept
-        sessions = len(self.b._sessions)
-        for datagram, _ in kept:
-            for _ in range(30):
-                damaged = bytearray(datagram)
-                damaged[self.rng.randrange(len(damaged))] ^= self.rng.randrange(1, 256)
-                self.assertEqual(self.send_raw(bytes(damaged)), 0)
-                self.assertEqual(self.send_raw(datagram[: self.rng.randrange(len(datagram))]), 0)
-        self.assertEqual((self.runs, len(self.b._sessions)), ([1], sessions))
-        self.assertEqual(self.send_raw(bytes(1500)), 0)
-        self.assertEqual(self.b.counters["oversized"], 1)
-
-    def test_replays_change_nothing(self) -> None:
-        """Recorded datagrams, sent again from elsewhere, run nothing, and only an INIT gets its one RESP again."""
-        self.got(self.a.ask(self.to_b, "echo", 0))
-        self.got(self.a.ask(self.to_b, "add", 1, changes=True))
-        seen: list[Contact] = []
-        self.b.on_contact.add(seen.append)
-        for datagram, _ in list(self.taps[self.to_b.address].kept):
-            sent = self.send_raw(datagram)
-            self.assertEqual(sent, 1 if datagram[0] == INIT else 0)
-        self.assertEqual((self.runs, seen), ([1], []))
-        self.assertEqual((self.b.counters["replayed"], self.b.counters["repeated"]), (2, 1))
-
-    def test_replay_to_a_restarted_node(self) -> None:
-        """A whole recording, played to the restarted node, makes no contact and runs no change."""
-        self.got(self.a.ask(self.to_b, "add", 1, changes=True))
-        recording = list(self.taps[self.to_b.address].kept)
-        self.b.stop()
-        self.b, self.to_b = self.endpoint(3, port=self.to_b.address.port, identity=2)
-        self.equip(self.b)
-        seen: list[Contact] = []
-        self.b.on_contact.add(seen.append)
-        for datagram, source in recording:
-            self.send_raw(datagram, source)
-        self.assertEqual((self.runs, seen), ([1], []))
 
     def test_response_counts_only_from_where_it_was_asked(self) -> None:
         """A RESP that comes from another address, or twice, opens nothing."""
@@ -540,23 +406,6 @@ class AttackTests(EndpointCase):
         self.assertEqual(self.successResultOf(asked), 1)
         counted = [self.a.counters[name] for name in ("misdirected", "forged", "malformed", "stale")]
         self.assertEqual(counted, [1, 1, 1, 1])
-
-    def test_flood_of_handshakes_stays_bounded(self) -> None:
-        """Handshakes that nobody confirms leave a bounded number of half-open sessions, and most get a cookie only."""
-        silent = self.board.network()
-        silent.listen(lambda datagram, source: None)
-        for number in range(700):
-            member = Endpoint(
-                Identity(number.to_bytes(32, "big")), TEAM, silent, self.clock, random.Random(1000 + number)
-            )
-            member.is_running = True
-            member.ask(self.to_b, "echo", 1).addErrback(lambda failure: None)
-            self.clock.advance(0.001)
-        self.assertLessEqual(len(self.b._sessions), 200)
-        self.assertGreater(self.b.counters["crowded"], 500)
-        self.clock.advance(60)
-        self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 1)), 1)
-        self.assertLessEqual(len(self.b._sessions), 2)
 
     def test_malformed_messages_of_members(self) -> None:
         """A member that seals rubbish, in a handshake or a session, is counted; the session goes on."""
@@ -601,13 +450,3 @@ class AttackTests(EndpointCase):
         self.assertEqual(self.runs, [0, 1, 2])
         self.clock.advance(40)
         self.assertEqual(self.got(self.a.ask(self.to_b, "add", 9, changes=True)), 9)
-
-    def test_random_bytes(self) -> None:
-        """Ten thousand random datagrams raise nothing and are answered by nothing."""
-        before = self.board.counters["sent"]
-        for number in range(10_000):
-            kind = bytes([0x11 + number % 6])
-            self.taps[self.to_b.address].receiver(kind + self.rng.randbytes(self.rng.randrange(700)), self.to_a.address)
-        self.taps[self.to_b.address].receiver(b"", self.to_a.address)
-        self.assertEqual(self.board.counters["sent"], before)
-        self.assertEqual(sum(self.b.counters.values()), 10_001)

@@ -1,13 +1,16 @@
-"""Tests of the doorstep: cookies under load."""
+"""Tests of what is said before any key is exchanged: cookies under load, and who is there at all."""
 
 from __future__ import annotations
 
 import random
 
+from middleware.entangled.errors import Malformed, NoAnswer, NotRunning
 from middleware.entangled.identity import Identity, exchange_key
 from middleware.entangled.network.network import Address
 from middleware.entangled.wire.greeting import COOKIE, COOKIE_BYTES, MOST_RATE, QUIET_RATE, Cookies
-from middleware.entangled.wire.session import INIT, INIT_LEAST, RESP, Credentials, Invitation
+from middleware.entangled.wire.hail import ECHO, HAIL, VERSION, Echo, Hailer, echo, echo_of, hail
+from middleware.entangled.wire.session import INIT_LEAST, RESP, Credentials, Invitation
+from tests.middleware.gate import Gate
 from tests.middleware.test_endpoint import DELAY, TEAM, EndpointCase
 
 HOME, ELSEWHERE = Address("10.0.0.1", 1), Address("10.0.0.1", 2)
@@ -42,17 +45,8 @@ class CookieTests(EndpointCase):
         self.assertTrue(all(len(answer) <= INIT_LEAST for answer in answers))
         self.assertEqual({len(answer) for answer in answers if answer[0] == COOKIE}, {COOKIE_BYTES})
 
-    def test_members_get_through(self) -> None:
-        """While a flood goes on a member pays with its cookie, and its question is answered in two round trips."""
-        self.flood(200)
-        self.b._cookies._quiet._tokens = -1e6  # as if it never ended
-        asked = self.a.ask(self.to_b, "echo", 7)
-        self.assertEqual(self.got(asked, 4 * DELAY), 7)
-        self.assertEqual(len(self.kept(self.to_a, COOKIE)), 1)
-        self.assertEqual(len(self.kept(self.to_b, INIT)), 2)
-
     def test_a_cookie_is_bound_to_its_address_and_time(self) -> None:
-        """A cookie pays from its own address and for at most four minutes; any other last field is unlawful."""
+        """A cookie pays from its own address, for at most four minutes, and for so many handshakes in a second."""
         cookies = Cookies(b"c" * 32, random.Random(1))
         cookie = cookies._cookie(HOME, int(1000 / 120))
         paid = self.invitation(1, cookie)
@@ -61,12 +55,7 @@ class CookieTests(EndpointCase):
         self.assertFalse(cookies.is_lawful(paid, HOME, 1400.0))
         self.assertFalse(cookies.is_lawful(paid, ELSEWHERE, 1000.0))
         self.assertTrue(cookies.is_lawful(self.invitation(1), ELSEWHERE, 1000.0))
-
-    def test_even_those_who_pay_are_counted(self) -> None:
-        """With cookies, too, no more handshakes are done in a second than the larger rate."""
-        cookies = Cookies(b"c" * 32, random.Random(1))
-        paid = self.invitation(1, cookies._cookie(HOME, 0))
-        admitted = sum(cookies.admits(paid, HOME, 1.0) for _ in range(2 * int(MOST_RATE)))
+        admitted = sum(cookies.admits(paid, HOME, 1000.0) for _ in range(2 * int(MOST_RATE)))
         self.assertEqual(admitted, int(MOST_RATE))
 
     def test_forged_cookies(self) -> None:
@@ -85,3 +74,54 @@ class CookieTests(EndpointCase):
         counted = [self.a.counters[name] for name in ("misdirected", "forged", "stale")]
         self.assertEqual(counted, [1, 2, 1])
         self.assertEqual(next(iter(self.a._peers._openings.values())).doors, {self.to_b.address: b""})
+
+
+TOKEN = b"0123456789abcdef"
+
+
+class HailTests(EndpointCase):
+    """Behaviour of ``Endpoint.hail`` and of what answers it."""
+
+    def test_who_is_there(self) -> None:
+        """An echo, of another team too, has the team's fingerprint, version and clock, and where the hail came from."""
+        self.b.echoer.wall = lambda: 1_700_000_000.25
+        self.b.echoer._fingerprint = lambda: Gate.fingerprint
+        found = self.got(self.a.hail(self.to_b.address), 2 * DELAY)
+        self.assertEqual(found[1:], Echo(b"", VERSION, b"the team", 1_700_000_000.25, self.to_a.address)[1:])
+
+        _, to_other = self.endpoint(3, team=b"o" * 32)
+
+        found = self.got(self.a.hail(to_other.address))
+        self.assertEqual((found.fingerprint, found.wall), (bytes(8), 0.0))
+
+    def test_nobody_is_there(self) -> None:
+        """Where nobody listens the hail fails in time, and one that is cancelled leaves nothing behind."""
+        self.failed(self.a.hail(HOME, 1.0), NoAnswer, 1.0)
+        self.a.hail(HOME, 1.0).addErrback(lambda failure: None).cancel()
+        self.assertEqual(self.a.hailer._pending, {})
+        pending = self.a.hail(HOME)
+        self.a.stop()
+        self.failureResultOf(pending, NotRunning)
+        self.failureResultOf(self.a.hail(HOME), NotRunning)
+
+    def test_what_is_none(self) -> None:
+        """Hails and echoes of a wrong length or for no question are counted and answered by nothing."""
+        receiver = self.taps[self.to_b.address].receiver
+        before = self.board.counters["sent"]
+        for datagram in (hail(TOKEN)[:-1], hail(TOKEN) + b"x", bytes([HAIL]), bytes([ECHO]) + bytes(7)):
+            receiver(datagram, HOME)
+        receiver(echo(hail(TOKEN), bytes(8), 0.0, HOME), HOME)
+        self.assertEqual(self.b.counters, {"malformed": 4, "unasked": 1})
+        self.assertEqual(self.board.counters["sent"], before)
+        self.assertRaises(Malformed, echo, b"", bytes(8), 0.0, HOME)
+        self.assertRaises(Malformed, echo_of, hail(TOKEN))
+
+    def test_an_echo_from_elsewhere(self) -> None:
+        """An echo from another address than was hailed is no answer."""
+        sent: list[bytes] = []
+        hailer = Hailer(lambda datagram, to: sent.append(datagram), self.clock, random.Random(1))
+        asked = hailer.hail(HOME)
+        hailer.on_echo(echo(sent[0], bytes(8), 0.0, ELSEWHERE), ELSEWHERE)
+        self.assertNoResult(asked)
+        hailer.on_echo(echo(sent[0], bytes(8), 0.0, ELSEWHERE), HOME)
+        self.assertEqual(self.successResultOf(asked).seen, ELSEWHERE)

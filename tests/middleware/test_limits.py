@@ -12,7 +12,7 @@ from typing import Any
 
 from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia import overlay
-from middleware.entangled.reach import known
+from middleware.entangled.reach import acquaintance, carrier, introducer, known, outside, upgrade, way
 from middleware.entangled.record import Record, hashed_key
 from middleware.entangled.replication import overlap, replica
 from middleware.entangled.wire import answerer, door, method, peer
@@ -26,7 +26,8 @@ SMALL = 24
 CROWD = 60
 PATCHED = (
     *((answerer, "MAX_ASKING"), (method, "MAX_ACCOUNTS"), (overlay, "MAX_HEARD"), (overlap, "MAX_ASKED")),
-    *((replica, "MAX_DOUBTFUL"), (known, "MAX_KNOWN"), (known, "MAX_PEERS"), (door, "MAX_LIVES"), (peer, "MAX_PEERS")),
+    *((replica, "MAX_DOUBTFUL"), (known, "MAX_PEERS"), (door, "MAX_LIVES"), (peer, "MAX_PEERS")),
+    *((module, "MAX_KNOWN") for module in (acquaintance, carrier, introducer, outside, upgrade, way)),
 )
 
 # Bounded by caps of their own, which are larger than this crowd.

@@ -1,4 +1,4 @@
-"""One iterative search."""
+"""One iterative search, and the XOR metric of ids that it goes by."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.contact import Contact
-from middleware.entangled.kademlia.distance import closest
+from middleware.entangled.identity import ID_BYTES
+from middleware.entangled.kademlia.distance import bucket_index, closest, distance
 from middleware.entangled.kademlia.lookup import Lookup
 from middleware.entangled.kademlia.routing import RoutingTable
 from middleware.entangled.network.network import Address
@@ -25,13 +26,6 @@ CROWD = closest([contact(i) for i in range(40)], TARGET, 40)
 
 
 class LookupTest(SynchronousTestCase):
-    def test_nobody_to_ask(self) -> None:
-        """A search that knows nobody is over before it begins."""
-        lookup = Lookup(TARGET, 8, 3, [])
-        self.assertEqual(lookup.next(), [])
-        self.assertTrue(lookup.is_finished)
-        self.assertEqual(lookup.closest(), [])
-
     def test_asks_the_closest_first(self) -> None:
         """At most alpha are asked at the same time, the closest first, and nobody twice."""
         lookup = Lookup(TARGET, 8, 3, reversed(CROWD[:8]))
@@ -72,38 +66,31 @@ class LookupTest(SynchronousTestCase):
         self.assertEqual(lookup.closest(), CROWD[1:3])
 
     def test_all_fail(self) -> None:
-        """A search in which everybody fails is over, and found nobody."""
-        lookup = Lookup(TARGET, 8, 3, CROWD[:2])
-        for known in lookup.next():
-            lookup.failed(known)
-        self.assertTrue(lookup.is_finished)
-        self.assertEqual(lookup.closest(), [])
+        """A search that knows nobody, or in which everybody fails, is over, and found nobody."""
+        for seeds in ([], CROWD[:2]):
+            lookup = Lookup(TARGET, 8, 3, seeds)
+            for known in lookup.next():
+                lookup.failed(known)
+            self.assertTrue(lookup.is_finished)
+            self.assertEqual((lookup.next(), lookup.closest()), ([], []))
 
     def test_slow_frees_its_place(self) -> None:
-        """A slow contact lets others be asked, one beyond the k closest included, but the search waits for it."""
-        lookup = Lookup(TARGET, 2, 2, CROWD[:4])
-        self.assertEqual(lookup.next(), CROWD[:2])
-        lookup.slow(CROWD[0])
-        lookup.slow(CROWD[0])
-        self.assertEqual(lookup.next(), [CROWD[2]])
-        lookup.answered(CROWD[1], [])
-        lookup.answered(CROWD[2], [])
-        self.assertFalse(lookup.is_finished)
-        lookup.answered(CROWD[0], [])
-        self.assertTrue(lookup.is_finished)
-        self.assertEqual(lookup.closest(), CROWD[:2])
-
-    def test_slow_then_lost(self) -> None:
-        """Where the slow one is lost in the end, the one asked in its stead makes the search complete at once."""
-        lookup = Lookup(TARGET, 2, 2, CROWD[:4])
-        lookup.next()
-        lookup.slow(CROWD[0])
-        lookup.next()
-        lookup.answered(CROWD[1], [])
-        lookup.answered(CROWD[2], [])
-        lookup.failed(CROWD[0])
-        self.assertTrue(lookup.is_finished)
-        self.assertEqual(lookup.closest(), CROWD[1:3])
+        """A slow contact lets others be asked, but the search waits for it; where it is lost, they take its place."""
+        for is_lost in (False, True):
+            lookup = Lookup(TARGET, 2, 2, CROWD[:4])
+            self.assertEqual(lookup.next(), CROWD[:2])
+            lookup.slow(CROWD[0])
+            lookup.slow(CROWD[0])
+            self.assertEqual(lookup.next(), [CROWD[2]])
+            lookup.answered(CROWD[1], [])
+            lookup.answered(CROWD[2], [])
+            self.assertFalse(lookup.is_finished)
+            if is_lost:
+                lookup.failed(CROWD[0])
+            else:
+                lookup.answered(CROWD[0], [])
+            self.assertTrue(lookup.is_finished)
+            self.assertEqual(lookup.closest(), CROWD[1:3] if is_lost else CROWD[:2])
 
     def test_late_answer_counts(self) -> None:
         """An answer that comes after all was lost hope of is believed."""
@@ -162,3 +149,41 @@ class LookupTest(SynchronousTestCase):
             asked = in_flight.pop(rng.randrange(len(in_flight)))
             lookup.answered(asked, tables[asked.node_id].closest(target))
         self.assertEqual(lookup.closest(), closest(nodes[1:], target, 4))
+
+
+IDS = st.binary(min_size=ID_BYTES, max_size=ID_BYTES)
+
+
+class DistanceTest(SynchronousTestCase):
+    @settings(deadline=None, derandomize=True, database=None)
+    @given(IDS, IDS, IDS)
+    def test_metric(self, a: bytes, b: bytes, c: bytes) -> None:
+        """The distance is a metric: zero for one id only, the same both ways, and no way round is shorter."""
+        self.assertEqual(distance(a, b) == 0, a == b)
+        self.assertEqual(distance(a, b), distance(b, a))
+        self.assertLessEqual(distance(a, c), distance(a, b) + distance(b, c))
+
+    @settings(deadline=None, derandomize=True, database=None)
+    @given(IDS, IDS)
+    def test_bucket_holds_its_range(self, own: bytes, other: bytes) -> None:
+        """The bucket i of an id spans the distances from 2**i to below 2**(i+1)."""
+        if own != other:
+            index = bucket_index(own, other)
+            self.assertLessEqual(2**index, distance(own, other))
+            self.assertLess(distance(own, other), 2 ** (index + 1))
+
+    def test_no_bucket_for_oneself(self) -> None:
+        """A node's own id has no bucket."""
+        self.assertRaises(ValueError, bucket_index, b"\1" * ID_BYTES, b"\1" * ID_BYTES)
+
+    def test_closest_first(self) -> None:
+        """The closest contacts come first, whatever the order they were given in, and no more than asked for."""
+        contacts = [contact(i) for i in range(30)]
+        target = contacts[7].node_id
+        found = closest(contacts, target, 5)
+        self.assertEqual(found, closest(reversed(contacts), target, 5))
+        self.assertEqual(found[0], contacts[7])
+        self.assertEqual(len(closest(contacts, target, 99)), 30)
+        ranked = sorted(distance(c.node_id, target) for c in contacts)
+
+        self.assertEqual([distance(c.node_id, target) for c in found], ranked[:5])

@@ -67,23 +67,6 @@ class MessageTests(SynchronousTestCase):
             self.assertEqual(decoded(encoded(message)), message)
 
     @settings(max_examples=400, deadline=None, derandomize=True, database=None)
-    @given(data=st.binary(max_size=200))
-    def test_decoded_is_total(self, data: bytes) -> None:
-        """Whatever the bytes, there is a message or ``Malformed``."""
-        self._decode(data)
-
-    @settings(max_examples=300, deadline=None, derandomize=True, database=None)
-    @given(
-        fields=_VALUES | st.lists(_VALUES, min_size=2, max_size=5), place=st.integers(0, 200), byte=st.integers(0, 255)
-    )
-    def test_decoded_is_total_on_near_misses(self, fields: Any, place: int, byte: int) -> None:
-        """Lawful msgpack of a wrong shape, and shapes with one byte changed, give a message or ``Malformed``."""
-        data = bytearray(msgpack.packb(fields))
-        self._decode(bytes(data))
-        data[place % len(data)] = byte
-        self._decode(bytes(data))
-
-    @settings(max_examples=400, deadline=None, derandomize=True, database=None)
     @given(
         kind=st.sampled_from([0, 1, 2, 3, 4, 5, True, 1.0]),
         fields=st.lists(
@@ -100,48 +83,20 @@ class MessageTests(SynchronousTestCase):
             found = None
         self.assertEqual(found, by_the_table(kind, fields))
 
-    def _decode(self, data: bytes) -> None:
-        try:
-            message = decoded(data)
-        except Malformed:
-            return
-        self.assertIsInstance(message, Message)
-
     def test_refuses_what_is_out_of_shape(self) -> None:
-        """Wrong ids, names, kinds and lengths, deep nesting, extensions, huge claims and odd map keys are refused."""
+        """Deep nesting, extensions, huge claims, odd map keys and what is no message are refused."""
         deep: object = 1
         deep_maps: object = 1
         for _ in range(40):
             deep, deep_maps = [deep], {"in": deep_maps}
         shapes: list[object] = [
             [],
-            [0],
             5,
             None,
-            [False, 1, "m", [], 9],
-            [1.0, 1, "m"],
-            [0, -1, 0, "m", [], 9],
-            [0, True, 0, "m", [], 9],
-            [0, 1, 0, "", []],
-            [0, 1, 0, "m" * 65, []],
-            [0, 1, 0, b"m", [], 9],
-            [0, 1, 0, "m", {}, 9],
-            [0, 1, 0, "m", []],
-            [0, 1, 0, "m", [], -1],
-            [0, 1, 0, "m", [], 2**32],
-            [0, 1, 0, "m", [], True],
+            [0, 1, 0, "m" * 65, [], 9],
             [0, 1, 0, "m", [], 1, 1],
-            [0, 1, 2, "m", [], 1],
-            [0, 1, -1, "m", [], 1],
-            [0, 1, True, "m", [], 1],
-            [0, 1, "m", [], 1],
             [1, 1, deep],
             [1, 1, deep_maps],
-            [1, 1.5, 2],
-            [2, 1, 256, "x"],
-            [2, 1, 1, "x" * 301],
-            [2, 1, 1, b"x"],
-            [4, "m", [], 9],
             [1, 1, msgpack.ExtType(5, b"x")],
             [1, 1, msgpack.ExtType(5, b"")],
             [1, 1, msgpack.Timestamp(1)],

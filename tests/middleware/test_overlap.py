@@ -115,7 +115,7 @@ class JoinTests(FleetCase):
             fleet.run(3.0)
 
     def test_a_newcomer_takes_over(self) -> None:
-        """Seconds later it knows everybody, is sure, and holds what belongs to it; nobody compares with it again."""
+        """Seconds later it knows everybody, is sure, and holds what belongs to it."""
         fleet = self.fleet(10)
         keys = [hashed_key(str(number)) for number in range(60)]
         for key in keys:

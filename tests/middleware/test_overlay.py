@@ -32,11 +32,6 @@ from tests.fleet import TEAM, FleetCase
 
 
 class OverlayTests(FleetCase):
-    def test_everybody_knows_everybody_in_a_small_team(self) -> None:
-        """In a team of five each knows the four others."""
-        fleet = self.fleet(5)
-        self.assertEqual([len(node.overlay.table) for node in fleet.nodes], [4] * 5)
-
     def test_who_has_not_met_its_team_has_no_majority(self) -> None:
         """Of the few that a newcomer knows at first no majority is made, though all of them were to agree."""
         node = self.fleet(5).nodes[4]
@@ -105,23 +100,14 @@ class OverlayTests(FleetCase):
         self.assertEqual([len(node.overlay.table) for node in fleet.nodes[:2]], [1, 1])
 
     def test_return_after_a_cut(self) -> None:
-        """A node whose radio was out, for however long, is known to all again soon after, and knows them."""
-        for seconds in (2.0, 6.0, 60.0):
+        """Nodes behind a cut, of however long, are known to all again soon after, and know them."""
+        for places, seconds, after in (((3,), 2.0, 6.0), ((3,), 6.0, 6.0), ((3,), 60.0, 6.0), ((0, 1), 3.0, 12.0)):
             fleet = self.fleet(4)
-            fleet.board.partition([fleet.address(3)])
+            fleet.board.partition([fleet.address(place) for place in places])
             fleet.run(seconds)
             fleet.board.heal()
-            fleet.run(6.0)
+            fleet.run(after)
             self.assertEqual([len(node.overlay.table) for node in fleet.nodes], [3] * 4, seconds)
-
-    def test_two_halves_find_each_other(self) -> None:
-        """A team that was cut in two for some seconds is one again soon after."""
-        fleet = self.fleet(4)
-        fleet.board.partition([fleet.address(0), fleet.address(1)])
-        fleet.run(3.0)
-        fleet.board.heal()
-        fleet.run(12.0)
-        self.assertEqual([len(node.overlay.table) for node in fleet.nodes], [3] * 4)
 
 
 class NewcomerTests(SynchronousTestCase):

@@ -4,47 +4,28 @@ from __future__ import annotations
 
 import random
 
-from twisted.trial.unittest import SynchronousTestCase
-
-from middleware.entangled.clock import HeapClock
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import Refused
-from middleware.entangled.identity import Identity
 from middleware.entangled.network.network import Address
-from middleware.entangled.network.switchboard import Switchboard, Weather
 from middleware.entangled.streams import MAX_PARTS, MAX_VIEWERS, OPEN_TTL, PART_BYTES, Streams
-from middleware.entangled.wire.endpoint import Endpoint
+from tests.middleware.test_endpoint import DELAY, EndpointCase
 
-TEAM = b"t" * 32
 CAMERA = "camera"
 
 
-class StreamsTests(SynchronousTestCase):
+class StreamsTests(EndpointCase):
+    """``b`` publishes, ``a`` looks."""
+
     def setUp(self) -> None:
-        self.clock = HeapClock()
-        self.board = Switchboard(self.clock, random.Random(1), Weather(delay_s=0.001))
-        self.ends = [self.opened(n) for n in (1, 2)]
-        self.publisher, self.viewer = (streams for _, streams in self.ends)
-        self.to_publisher, self.to_viewer = (Contact(Identity(bytes([n]) * 32).public, self.at(n)) for n in (1, 2))
+        super().setUp()
+        self.publisher, self.viewer = Streams(self.b, self.clock), Streams(self.a, self.clock)
+        self.to_publisher, self.to_viewer = self.to_b, self.to_a
         self.frames: list[tuple[int, bytes]] = []
         self.ages: list[float] = []
 
-    def at(self, n: int) -> Address:
-        """Where the n-th end listens."""
-        return Address("10.0.0.1", 7000 + n)
-
-    def opened(self, n: int) -> tuple[Endpoint, Streams]:
-        """One end."""
-        endpoint = Endpoint(
-            Identity(bytes([n]) * 32), TEAM, self.board.network(*self.at(n)), self.clock, random.Random(n)
-        )
-        endpoint.start()
-        return endpoint, Streams(endpoint, self.clock)
-
     def tearDown(self) -> None:
-        for endpoint, streams in self.ends:
-            streams.stop()
-            endpoint.stop()
+        for each in (self.publisher, self.viewer, self.a, self.b):
+            each.stop()
 
     def see(self, sequence: int, frame: bytes, age: float) -> None:
         """Take note of a frame."""
@@ -56,7 +37,7 @@ class StreamsTests(SynchronousTestCase):
         self.viewer._answer_part(self.to_publisher, CAMERA, sequence, number, count, part, age_ms)
 
     def test_frames_arrive_whole(self) -> None:
-        """A frame of many parts arrives as it was, at every watcher, until each of them stops."""
+        """A frame of many parts arrives as it was, at every watcher, until it stops; no timer is left."""
         others: list[int] = []
         stop = self.viewer.look(self.to_publisher, CAMERA, self.see)
         stop_other = self.viewer.look(self.to_publisher, CAMERA, lambda sequence, frame, age: others.append(sequence))
@@ -70,6 +51,12 @@ class StreamsTests(SynchronousTestCase):
         self.clock.advance(0.1)
         stop_other()
         self.assertEqual((self.frames, others), ([(1, frame)], [1, 2]))
+        self.viewer.look(self.to_publisher, CAMERA, self.see)
+        self.clock.advance(0.1)
+        self.tearDown()
+        self.publisher.offer(CAMERA, 3, b"x")
+        self.clock.advance(0.1)
+        self.assertEqual(self.clock.getDelayedCalls(), [])
 
     def test_age_counts_from_the_camera(self) -> None:
         """A frame's age is what it was when it was sent, and its time on the way, though no clock is compared."""
@@ -78,18 +65,22 @@ class StreamsTests(SynchronousTestCase):
         self.publisher.offer(CAMERA, 1, bytes(2 * PART_BYTES), 0.25)
         self.clock.advance(0.1)
         (age,) = self.ages
-        self.assertLess(abs(age - 0.251), 0.0005)
+        self.assertLess(abs(age - 0.25 - DELAY), 0.0005)
         self.part(2, 0, 2, b"a", 500)
         self.clock.advance(0.3)
         self.part(2, 1, 2, b"b", 500)
-        self.assertLess(abs(self.ages[1] - 0.801), 0.0005)
+        self.assertLess(abs(self.ages[1] - 0.8 - DELAY), 0.0005)
 
     def test_nothing_is_sent_unseen(self) -> None:
-        """While nobody looks nothing is sent, and soon after the last look ended neither."""
+        """While nobody looks nothing is sent, soon after the last look neither; nor are empty and too large frames."""
         self.assertFalse(self.publisher.is_wanted(CAMERA))
         stop = self.viewer.look(self.to_publisher, CAMERA, self.see)
         self.clock.advance(10.0)
         self.assertTrue(self.publisher.is_wanted(CAMERA))
+        for frame in (bytes(MAX_PARTS * PART_BYTES + 1), b""):
+            self.publisher.offer(CAMERA, 1, frame)
+        self.clock.advance(0.1)
+        self.assertEqual(self.frames, [])
         stop()
         self.clock.advance(OPEN_TTL + 0.1)
         sent = self.board.counters["sent"]
@@ -130,18 +121,9 @@ class StreamsTests(SynchronousTestCase):
         self.viewer._answer_part(self.to_publisher, "other", 1, 0, 1, b"x")
         self.assertEqual(self.frames, [])
 
-    def test_too_large_a_frame(self) -> None:
-        """A frame of more parts than there may be is not sent; an empty one neither."""
-        self.viewer.look(self.to_publisher, CAMERA, self.see)
-        self.clock.advance(0.1)
-        for frame in (bytes(MAX_PARTS * PART_BYTES + 1), b""):
-            self.publisher.offer(CAMERA, 1, frame)
-        self.clock.advance(0.1)
-        self.assertEqual(self.frames, [])
-
     def test_viewers_are_bounded(self) -> None:
         """There is an end to viewers and names, whoever looks may go on looking, and places come free again."""
-        peers = [Contact(bytes([n]) * 32, self.at(9)) for n in range(MAX_VIEWERS + 1)]
+        peers = [Contact(bytes([n]) * 32, Address("10.0.0.1", 9)) for n in range(MAX_VIEWERS + 1)]
         for number, peer in enumerate(peers[:-1]):
             self.assertTrue(self.publisher._answer_open(peer, f"channel {number}"))
         self.assertRaises(Refused, self.publisher._answer_open, peers[-1], CAMERA)
@@ -150,14 +132,3 @@ class StreamsTests(SynchronousTestCase):
         self.clock.advance(OPEN_TTL + 0.1)
         self.assertTrue(self.publisher._answer_open(peers[-1], CAMERA))
         self.assertTrue(self.publisher.is_wanted(CAMERA))
-
-    def test_stop(self) -> None:
-        """After the stop nothing is left on the clock, and a frame that still comes is not sent."""
-        self.viewer.look(self.to_publisher, CAMERA, self.see)
-        self.clock.advance(0.1)
-        for endpoint, streams in self.ends:
-            streams.stop()
-            endpoint.stop()
-        self.publisher.offer(CAMERA, 1, b"x")
-        self.clock.advance(0.1)
-        self.assertEqual(self.clock.getDelayedCalls(), [])

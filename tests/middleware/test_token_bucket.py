@@ -9,16 +9,13 @@ from middleware.entangled.token_bucket import TokenBucket
 
 class TokenBucketTests(SynchronousTestCase):
     def test_so_many_at_once_and_so_many_a_second(self) -> None:
-        """A burst goes through, then what time has brought, and never more than it holds."""
+        """A burst, by default of one second, goes through, then what time has brought, and never more than it holds."""
+        bucket = TokenBucket(2.0)
+        self.assertEqual([bucket.take(0.0) for _ in range(3)], [True, True, False])
         bucket = TokenBucket(2.0, 3.0)
         self.assertEqual([bucket.take(10.0) for _ in range(4)], [True, True, True, False])
         self.assertEqual([bucket.take(10.5), bucket.take(10.5)], [True, False])
         self.assertEqual([bucket.take(100.0) for _ in range(4)], [True, True, True, False])
-
-    def test_holds_what_a_second_brings(self) -> None:
-        """Where no size is named as many go through at once as in a second."""
-        bucket = TokenBucket(2.0)
-        self.assertEqual([bucket.take(0.0) for _ in range(3)], [True, True, False])
 
     def test_take_much(self) -> None:
         """What asks for more than there is takes nothing; less than that is still there."""

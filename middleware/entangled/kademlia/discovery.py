@@ -16,6 +16,7 @@ from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
 
 from middleware.entangled.background import Background
+from middleware.entangled.bounded import keep
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.kademlia.membership import Membership
 from middleware.entangled.kademlia.overlay import Overlay
@@ -121,7 +122,7 @@ class Discovery:
 
     def _call(self) -> None:
         self.counters["calls"] += 1
-        self._called = self._endpoint.call()
+        self._called = self._endpoint.greeter.call()
         self._group.send(self._called)
 
     def _moved(self) -> None:
@@ -177,14 +178,12 @@ class Discovery:
             self.counters["repeated"] += 1
             return
         if datagram[0] == WHO:
-            if not self._endpoint.is_greeting(datagram):
+            if not self._endpoint.greeter.opens(datagram):
                 self.counters["foreign"] += 1
                 return
             self._callers.append(self._clock.seconds())
         self.counters["heard"] += 1
-        if len(self._heard) >= MAX_HEARD:
-            del self._heard[next(iter(self._heard))]
-        self._heard[digest] = None
+        keep(self._heard, digest, None, MAX_HEARD)
         if self._pending >= MAX_PENDING:
             self.counters["crowded"] += 1
             return

@@ -17,6 +17,7 @@ from twisted.internet.interfaces import IReactorTime
 from twisted.logger import Logger
 
 from middleware.entangled.background import Background
+from middleware.entangled.bounded import keep
 from middleware.entangled.contact import Contact, unpacked
 from middleware.entangled.errors import NoAnswer, NotRunning, Refused
 from middleware.entangled.kademlia.detour import Detour
@@ -143,10 +144,7 @@ class Membership:
         self.sounding.lost()
         if contact.address.is_virtual:
             return
-        self._former.pop(contact.address, None)
-        self._former[contact.address] = None
-        if len(self._former) > MAX_FORMER:
-            del self._former[next(iter(self._former))]
+        keep(self._former, contact.address, None, MAX_FORMER)
 
     def forget(self, contact: Contact) -> None:
         """Do not look for ``contact`` any more."""

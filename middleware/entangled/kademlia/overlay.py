@@ -17,6 +17,7 @@ from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
 
 from middleware.entangled.background import Background
+from middleware.entangled.bounded import keep
 from middleware.entangled.contact import Contact, unpacked
 from middleware.entangled.errors import EntangledError, NoAnswer, Refused
 from middleware.entangled.kademlia.distance import closest
@@ -191,10 +192,7 @@ class Overlay:
 
     def note_found(self, key: bytes, found: list[Contact]) -> None:
         """Keep in mind what a lookup found."""
-        self._found.pop(key, None)
-        self._found[key] = found
-        if len(self._found) > MAX_FOUND:
-            del self._found[next(iter(self._found))]
+        keep(self._found, key, found, MAX_FOUND)
 
     def voters(self, key: bytes, targets: list[Contact]) -> Voters:
         """Return the voters for ``key``, whose replicas are ``targets``.
@@ -346,13 +344,10 @@ class Overlay:
             return
         now, node_id = self._clock.seconds(), contact.node_id
         is_fresh = now - self._heard_at.get(node_id, -FRESH) < FRESH
-        if is_fresh and node_id not in self._misses and node_id not in self._slow and self._known(node_id) == contact:
+        if is_fresh and node_id not in self._misses and node_id not in self._slow and self.contact(node_id) == contact:
             return  # it was said a moment ago
         is_new = self.table.get(contact.node_id) is None and self.roster.get(contact.node_id) is None
-        self._heard_at.pop(node_id, None)
-        self._heard_at[node_id] = now
-        if len(self._heard_at) > MAX_HEARD:
-            del self._heard_at[next(iter(self._heard_at))]
+        keep(self._heard_at, node_id, now, MAX_HEARD)
         self._misses.pop(contact.node_id, None)
         self._slow.discard(contact.node_id)
         doubtful = self.table.saw(contact, now)
@@ -366,7 +361,7 @@ class Overlay:
 
     def heard(self, contact: Contact) -> None:
         """``contact`` asked or told us something in its session; a new address it has to prove first."""
-        if self._known(contact.node_id) == contact:
+        if self.contact(contact.node_id) == contact:
             self.proved(contact)
             return
         now = self._clock.seconds()
@@ -395,7 +390,7 @@ class Overlay:
     def known(self, node_id: bytes) -> Contact | None:
         """The contact with this id, the absent ones among the members too."""
         absent = (contact for contact in self.roster.absent() if contact.node_id == node_id)
-        return self._known(node_id) or next(absent, None)
+        return self.contact(node_id) or next(absent, None)
 
     def contacts(self) -> list[Contact]:
         """Everybody who is known here."""
@@ -412,11 +407,11 @@ class Overlay:
 
     def contact(self, node_id: bytes) -> Contact | None:
         """The contact with this id."""
-        return self._known(node_id)
+        return self.roster.get(node_id) or self.table.get(node_id)
 
     def is_contact(self, contact: Contact) -> bool:
         """Whether this very contact is known."""
-        return self._known(contact.node_id) == contact
+        return self.contact(contact.node_id) == contact
 
     def missed(self, contact: Contact, is_over: bool = False) -> None:
         """``contact`` did not answer, once more; ``is_over``: it is let go of at once.
@@ -448,7 +443,7 @@ class Overlay:
 
     def doubted(self) -> list[Contact]:
         """The contacts that did not answer the last time."""
-        return [contact for node_id in self._misses if (contact := self._known(node_id)) is not None]
+        return [contact for node_id in self._misses if (contact := self.contact(node_id)) is not None]
 
     @property
     def is_anybody_doubted(self) -> bool:
@@ -482,7 +477,7 @@ class Overlay:
         before = self._clock.seconds() - CHECK_GAP
         heard = self._heard_at
         unheard = {c.node_id: float("-inf") for c in table.contacts() if c.node_id not in heard}
-        for node_id in [node_id for node_id in self._misses if self._known(node_id) is None]:
+        for node_id in [node_id for node_id in self._misses if self.contact(node_id) is None]:
             del self._misses[node_id]
         self._heard_at = unheard | {
             node_id: at
@@ -498,9 +493,6 @@ class Overlay:
             if is_over():
                 return
             await self._chores.sleep(step)
-
-    def _known(self, node_id: bytes) -> Contact | None:
-        return self.roster.get(node_id) or self.table.get(node_id)
 
     def _is_for_roster(self, node_id: bytes, has_place: bool) -> bool:
         if not self.is_large:

@@ -13,6 +13,7 @@ import random
 from bisect import bisect_right
 from dataclasses import dataclass, field
 
+from middleware.entangled.bounded import keep
 from middleware.entangled.contact import Contact
 from middleware.entangled.identity import ID_BYTES
 from middleware.entangled.kademlia.distance import bucket_index, closest
@@ -244,10 +245,7 @@ class RoutingTable:
 
     def _queue(self, bucket: _Bucket, newcomer: Contact, now: float) -> Contact | None:
         """Let ``newcomer`` wait, and say who should be asked whether it is still there."""
-        bucket.waiting.pop(newcomer.node_id, None)
-        bucket.waiting[newcomer.node_id] = newcomer
-        if len(bucket.waiting) > self._k:
-            del bucket.waiting[next(iter(bucket.waiting))]
+        keep(bucket.waiting, newcomer.node_id, newcomer, self._k)
         oldest = next(iter(bucket.entries.values()))
         # A flood of newcomers shall not become a flood of pings to one old contact.
         if now - max(oldest.seen_at, oldest.questioned_at) < PATIENCE:

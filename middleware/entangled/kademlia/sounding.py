@@ -13,7 +13,6 @@ from middleware.entangled.background import Background
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import NoAnswer
 from middleware.entangled.kademlia.overlay import K, Overlay
-from middleware.entangled.kademlia.pace import Pace
 from middleware.entangled.wire.endpoint import Endpoint
 
 PROBE = 1.0
@@ -30,6 +29,35 @@ UPKEEP = 15.0
 """Seconds between two looks at what changes slowly in a large network."""
 SESSION_S = 120.0
 """Seconds of silence after which a session is let go of in a large network: there are too many peers to keep all."""
+
+LEAST, FIRST, MOST = 15.0, 60.0, 300.0
+"""Seconds of silence after which a far contact is asked: where all come and go, at first, and where nobody does."""
+GONE = 0.05
+LONGER = 2.0 ** (GONE / (1 - GONE))
+"""By what that grows with each answer."""
+
+
+class Pace:
+    """How often the far contacts are asked; ``wait`` is the silence in seconds after which one is.
+
+    In a network that changes slowly nearly every question is in vain, in one that changes quickly a contact that nobody
+    asked for a minute is mostly gone.  So the wait is halved for each contact that was lost and grows a little with
+    each that answers: it settles where ``GONE`` of those asked are gone.  After Kademlia's and Bamboo's measurements
+    lookups bear that many dead contacts without taking longer.
+    """
+
+    __slots__ = ("wait",)
+
+    def __init__(self) -> None:
+        self.wait = FIRST
+
+    def answered(self) -> None:
+        """Take note that a contact which was silent for so long is still there."""
+        self.wait = min(MOST, self.wait * LONGER)
+
+    def lost(self) -> None:
+        """Take note that a contact is gone."""
+        self.wait = max(LEAST, self.wait / 2)
 
 
 class Sounding:

@@ -6,7 +6,7 @@ from collections import Counter
 from typing import Any
 
 from middleware.entangled.errors import EntangledError
-from middleware.entangled.network.network import Address, Network, Receiver
+from middleware.entangled.network.network import Address, Network, Ports, Receiver, ports_of
 from middleware.entangled.network.tunnel import TunnelNetwork
 from middleware.entangled.network.url import VIRTUAL
 
@@ -33,9 +33,9 @@ class JointNetwork:
         return counted
 
     @property
-    def ports(self) -> Any:
+    def ports(self) -> Ports | None:
         """The local ports of ``udp``, where it can have several."""
-        return self.udp if hasattr(self.udp, "open_port") else getattr(self.udp, "ports", None)
+        return ports_of(self.udp)
 
     @property
     def detours(self) -> list[Address]:

@@ -17,6 +17,7 @@ from twisted.internet.interfaces import IDelayedCall
 from twisted.internet.protocol import DatagramProtocol
 from twisted.logger import Logger
 
+from middleware.entangled.background import cancel
 from middleware.entangled.network.interface import Interface, chosen, interfaces
 from middleware.entangled.network.multicast import GROUP, GROUP6
 from middleware.entangled.network.network import MAX_DATAGRAM, Address, Receiver
@@ -62,15 +63,13 @@ class LanMulticast:
 
     def close(self) -> None:
         """Leave the group; may be called twice."""
-        if self._timer is not None and self._timer.active():
-            self._timer.cancel()
+        cancel(self._timer)
         families, self._families = self._families, []
         for family in families:
             family.close()
 
     def _look_again(self) -> None:
-        if self._timer is not None and self._timer.active():
-            self._timer.cancel()
+        cancel(self._timer)
         self._timer = self._reactor.callLater(LOOK, self._look_again)
         found = chosen(self._look(), self._host)
         if found == self._known:

@@ -54,7 +54,7 @@ class Tls:
             except ssl.SSLWantReadError:
                 break
             except ssl.SSLError as error:
-                self.fault = f"TLS: {error.reason or error}"
+                self._fail(error)
                 break
             if not piece:
                 self.fault = "the other end has closed TLS"
@@ -66,18 +66,20 @@ class Tls:
         try:
             self._tls.write(data)
         except ssl.SSLError as error:
-            self.fault = f"TLS: {error.reason or error}"
+            self._fail(error)
         return self._out.read()
 
     def _shake(self) -> None:
         try:
             self._tls.do_handshake()
-        except ssl.SSLWantReadError:
-            return
-        except ssl.SSLError as error:
-            self.fault = f"TLS: {error.reason or error}"
-        else:
             self.is_open = True
+        except ssl.SSLWantReadError:
+            pass
+        except ssl.SSLError as error:
+            self._fail(error)
+
+    def _fail(self, error: ssl.SSLError) -> None:
+        self.fault = f"TLS: {error.reason or error}"
 
 
 class Proxied:

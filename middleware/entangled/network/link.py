@@ -16,6 +16,7 @@ from twisted.python.failure import Failure
 from zope.interface import implementer
 
 from formats.websocket import NORMAL
+from middleware.entangled.background import cancel
 from middleware.entangled.network.layer import Layer
 from middleware.entangled.network.network import Address
 from middleware.entangled.network.websocket import WebSocket
@@ -142,8 +143,7 @@ class Link(StreamProtocol):
 
     def forget(self) -> None:
         """Leave nothing on the clock; who takes the last words takes them."""
-        if self._closing is not None and self._closing.active():
-            self._closing.cancel()
+        cancel(self._closing)
 
     # -- called by the stream ---------------------------------------------------------------------------------------
 
@@ -180,8 +180,7 @@ class Link(StreamProtocol):
 
     def connectionLost(self, reason: Failure | None = None) -> None:
         """The stream is gone."""
-        if self._closing is not None and self._closing.active():
-            self._closing.cancel()
+        cancel(self._closing)
         self._over("the connection was lost" if self.socket.is_open else "hung up before a tunnel began")
 
     def pauseProducing(self) -> None:

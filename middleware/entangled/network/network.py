@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from ipaddress import IPv6Address
 from typing import NamedTuple, Protocol, runtime_checkable
 
 MAX_DATAGRAM = 1400
@@ -17,6 +18,10 @@ EVERYWHERE = "*"
 MAX_LED = 1024
 """Addresses of which a network keeps in mind by which local port they are written to."""
 _RELAYED = 41
+ADDRESS = 18
+"""Bytes of an address in datagrams: an IPv6 address (16, IPv4 mapped into it) and the port (2)."""
+_MAPPED = bytes(10) + b"\xff\xff"
+_NONE = bytes(ADDRESS)
 
 
 class Address(NamedTuple):
@@ -42,6 +47,29 @@ def relayed(node_id: bytes) -> Address:
 def is_relayed(address: Address) -> bool:
     """Whether an address is one that ``relayed`` gives."""
     return len(address.host) == _RELAYED and address.host[0] == "~"
+
+
+def packed_address(address: Address) -> bytes:
+    """The 18 bytes; zero for what is no address of the internet, such as a name."""
+    host, port = address
+    try:
+        if ":" in host:
+            packed = IPv6Address(host.partition("%")[0]).packed
+        else:
+            packed = _MAPPED + bytes(map(int, host.split(".")))
+        return packed + port.to_bytes(2, "little") if len(packed) == 16 else _NONE
+    except (ValueError, OverflowError):
+        return _NONE
+
+
+def address_of(packed: bytes) -> Address | None:
+    """The address in 18 bytes; None where none was packed, or they are too few."""
+    port = int.from_bytes(packed[16:], "little")
+    if len(packed) != ADDRESS or not port:
+        return None
+    if packed.startswith(_MAPPED):
+        return Address(".".join(map(str, packed[12:16])), port)
+    return Address(str(IPv6Address(packed[:16])), port)
 
 
 Receiver = Callable[[bytes, Address], None]

@@ -15,6 +15,7 @@ from twisted.internet.interfaces import IAddress, IDelayedCall, IProtocol, IReac
 from twisted.python.failure import Failure
 from zope.interface import implementer
 
+from middleware.entangled.background import cancel
 from middleware.entangled.errors import PortInUse
 from middleware.entangled.network.carrier import Accept, Strain
 from middleware.entangled.network.network import Address
@@ -230,8 +231,7 @@ class Pipe:
             return
         self.is_lost = True
         self.buffer.clear()
-        if self._timer is not None and self._timer.active():
-            self._timer.cancel()
+        cancel(self._timer)
         if self in self._pipes.streams:
             self._pipes.streams.remove(self)
         if self.protocol is not None:

@@ -16,6 +16,7 @@ from typing import Protocol
 
 from twisted.internet.interfaces import IReactorTime
 
+from middleware.entangled.bounded import keep
 from middleware.entangled.errors import PortInUse
 from middleware.entangled.network.nat import Nat
 from middleware.entangled.network.network import MAX_CARRIED, MAX_LED, Address, Receiver
@@ -139,10 +140,8 @@ class SwitchboardNetwork:
 
     def lead(self, to: Address, port: int) -> int:
         """Let what goes to ``to`` leave by ``port``; 0: by the first one."""
-        before = self._led.pop(to, 0)
-        self._led[to] = port if port in self.further else 0
-        if len(self._led) > MAX_LED:
-            del self._led[next(iter(self._led))]
+        before = self._led.get(to, 0)
+        keep(self._led, to, port if port in self.further else 0, MAX_LED)
         return before
 
     def local(self, to: Address, port: int = 0) -> Address:

@@ -20,6 +20,7 @@ from ipaddress import ip_address
 from twisted.internet.interfaces import IDelayedCall, IReactorTime
 from twisted.logger import Logger
 
+from middleware.entangled.background import cancel
 from middleware.entangled.network.bundle import MOST, Bundle
 from middleware.entangled.network.carrier import Carrier
 from middleware.entangled.network.layer import Layer, Proxied, Tls, client_context, server_context
@@ -133,8 +134,7 @@ class TunnelNetwork:
         for link in list(self._ending):
             link.forget()
         self._ending.clear()
-        if self._timer is not None and self._timer.active():
-            self._timer.cancel()
+        cancel(self._timer)
         self._timer = None
 
     # -- called by the links ----------------------------------------------------------------------------------------

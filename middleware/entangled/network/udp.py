@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import errno
-import fcntl
 import math
 import socket
-import struct
 from collections import Counter
 from collections.abc import Callable
-from contextlib import suppress
 from functools import lru_cache
 from typing import Any
 
@@ -19,7 +16,9 @@ from twisted.internet.error import CannotListenError
 from twisted.internet.protocol import DatagramProtocol
 from twisted.logger import Logger
 
+from middleware.entangled.bounded import keep
 from middleware.entangled.errors import PortInUse
+from middleware.entangled.network.interface import interfaces, is_any
 from middleware.entangled.network.network import EVERYWHERE, MAX_CARRIED, MAX_LED, Address, Receiver
 
 # Bursts come in faster than Python reads: the usual 208 KiB hold 160 full datagrams, this holds five times as many.
@@ -27,8 +26,6 @@ RECEIVE_BUFFER = 1 << 20
 ROUTE_S = 5.0
 """Seconds for which what the system said of a way holds: addresses of a laptop change as it moves."""
 _PAIRS = 8
-_SIOCGIFADDR = 0x8915
-_GLOBAL = "00"
 
 
 class UdpNetwork:
@@ -60,9 +57,7 @@ class UdpNetwork:
     @property
     def address(self) -> Address:
         """The node's own address; the port is known once ``listen`` was called."""
-        host = self._host
-        if host in ("0.0.0.0", "::", EVERYWHERE):
-            host = self._cached("", self._own_host)
+        host = self._cached("", self._own_host) if is_any(self._host) else self._host
         return Address(host, self._number)
 
     def listen(self, receiver: Receiver) -> None:
@@ -132,22 +127,20 @@ class UdpNetwork:
 
     def lead(self, to: Address, port: int) -> int:
         """Let what goes to ``to`` leave by ``port``; 0: by the first one."""
-        before = self._led.pop(to, 0)
-        self._led[to] = port
-        if len(self._led) > MAX_LED:
-            del self._led[next(iter(self._led))]
+        before = self._led.get(to, 0)
+        keep(self._led, to, port, MAX_LED)
         return before
 
     def local(self, to: Address, port: int = 0) -> Address:
         """The address of this machine from which a datagram to ``to`` leaves."""
         host = self._host
-        if host in ("0.0.0.0", "::", EVERYWHERE):
+        if is_any(host):
             host = self._cached(to.host, lambda: _route(to.host)) or self.address.host
         return Address(host, port or self._led.get(to, 0) or self._number)
 
     def hosts(self) -> list[str]:
         """The addresses of this machine at which it hears, asked anew after ``ROUTE_S``."""
-        if self._host not in ("0.0.0.0", "::", EVERYWHERE):
+        if not is_any(self._host):
             return [self._host]
         now = self._reactor.seconds()
         if now - self._hosts_at > ROUTE_S:
@@ -235,6 +228,12 @@ def _in_use(host: str, port: int, trouble: Any) -> PortInUse:
     return PortInUse(f"UDP {host}:{port}: {why}; {remedy}")
 
 
+def _own_hosts() -> list[str]:
+    """The addresses of this machine that others may reach: not those of its loopback or of one link alone."""
+    found = [host for interface in interfaces() if not interface.is_loopback for host in interface.addresses]
+    return sorted(found, key=lambda host: ":" in host)
+
+
 def _route(host: str) -> str:
     """The own address from which the system would write to ``host``; empty where it has no way there."""
     if not _is_ip(host):
@@ -245,22 +244,6 @@ def _route(host: str) -> str:
             return str(probe.getsockname()[0])
     except OSError:
         return ""
-
-
-def _own_hosts() -> list[str]:
-    """The addresses of this machine that others may reach: not those of its loopback or of one link alone."""
-    found = []
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        for _, name in socket.if_nameindex():
-            with suppress(OSError):
-                answer = fcntl.ioctl(probe, _SIOCGIFADDR, struct.pack("256s", name.encode()[:15]))
-                found.append(socket.inet_ntoa(answer[20:24]))
-    with suppress(OSError, ValueError), open("/proc/net/if_inet6", encoding="ascii") as lines:
-        for line in lines:
-            figures, _, _, scope, *_ = line.split()
-            if scope == _GLOBAL:
-                found.append(socket.inet_ntop(socket.AF_INET6, bytes.fromhex(figures)))
-    return [host for host in found if not host.startswith("127.")]
 
 
 @lru_cache(maxsize=1024)

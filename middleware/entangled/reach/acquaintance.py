@@ -7,10 +7,11 @@ from collections.abc import Callable, Collection, Iterable
 
 from twisted.internet.interfaces import IReactorTime
 
+from middleware.entangled.bounded import keep
 from middleware.entangled.contact import Contact
 from middleware.entangled.network.network import Address, is_relayed
 from middleware.entangled.reach.carrier import Carriers
-from middleware.entangled.reach.known import LIVELY_S, keep
+from middleware.entangled.reach.known import LIVELY_S, MAX_KNOWN
 from middleware.entangled.reach.outside import Outside
 from middleware.entangled.wire.peer import Peers
 
@@ -56,7 +57,7 @@ class Acquaintances:
             return
         namers = self._namers.pop(contact.node_id, None) or {}
         keep(namers, by.public, None, MAX_NAMERS)
-        keep(self._namers, contact.node_id, namers)
+        keep(self._namers, contact.node_id, namers, MAX_KNOWN)
 
     def helpers(self, wanted: bytes, hinted: Collection[Contact], asked: Collection[bytes]) -> list[Contact]:
         """Whom to ask about the node of that id, but for those that were ``asked``.

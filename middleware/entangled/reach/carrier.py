@@ -7,10 +7,11 @@ from __future__ import annotations
 
 from twisted.internet.interfaces import IReactorTime
 
+from middleware.entangled.bounded import keep
 from middleware.entangled.contact import Contact
 from middleware.entangled.identity import ID_BYTES
 from middleware.entangled.network.network import Address, is_relayed, relayed
-from middleware.entangled.reach.known import keep
+from middleware.entangled.reach.known import MAX_KNOWN
 from middleware.entangled.reach.path import PathNetwork
 from middleware.entangled.reach.relay import CARRY, HEAD
 from middleware.entangled.wire.endpoint import Endpoint
@@ -39,7 +40,7 @@ class Carriers:
         carriers[carrier] = self._clock.seconds()
         if len(carriers) > MAX_CARRIERS:
             del carriers[min(carriers, key=lambda public: carriers[public])]
-        keep(self._carriers, to, carriers)
+        keep(self._carriers, to, carriers, MAX_KNOWN)
 
     def of(self, to: bytes) -> list[bytes]:
         """The public keys of those who carry to the node of that id."""

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable
-from typing import TypeVar
-
+from middleware.entangled.bounded import keep
 from middleware.entangled.identity import node_id
 from middleware.entangled.wire.peer import MAX_PEERS, Peers
 from middleware.entangled.wire.session import Session
@@ -13,20 +11,6 @@ LIVELY_S = 20.0
 """Seconds since a peer was heard for which it is worth asking."""
 MAX_KNOWN = 1024
 """Peers of which is kept who named them, who carries to them, and the like."""
-
-Key = TypeVar("Key", bound=Hashable)
-Value = TypeVar("Value")
-
-
-def keep(table: dict[Key, Value], key: Key, value: Value, most: int | None = None) -> None:
-    """Put something at the end of a table, and drop what was put there first where that is more than ``MAX_KNOWN``.
-
-    ``most`` stands for another number.
-    """
-    table.pop(key, None)
-    table[key] = value
-    if len(table) > (MAX_KNOWN if most is None else most):
-        del table[next(iter(table))]
 
 
 class Known:

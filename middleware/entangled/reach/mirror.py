@@ -13,8 +13,7 @@ from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
 
 from middleware.entangled.background import Background
-from middleware.entangled.network.address import ADDRESS, address_of, packed_address
-from middleware.entangled.network.network import Address, Ports
+from middleware.entangled.network.network import ADDRESS, Address, Ports, address_of, packed_address
 from middleware.entangled.token_bucket import TokenBucket
 from middleware.entangled.wire.session import Session
 

@@ -10,10 +10,11 @@ from collections.abc import Callable, Iterable
 from twisted.internet.interfaces import IReactorTime
 
 from middleware.entangled.background import Background
+from middleware.entangled.bounded import keep
 from middleware.entangled.contact import Contact
 from middleware.entangled.network.network import Address, is_relayed
 from middleware.entangled.reach.candidate import is_near, is_possible
-from middleware.entangled.reach.known import keep
+from middleware.entangled.reach.known import MAX_KNOWN
 from middleware.entangled.reach.path import PathNetwork
 from middleware.entangled.wire.endpoint import Endpoint
 from middleware.entangled.wire.session import Session
@@ -64,11 +65,6 @@ class Outside:
         recent = sorted(self._seen.values(), key=lambda seen: -seen[1])
         return list(dict.fromkeys(address for address, at in recent if recent[0][1] - at < SEEN_S))
 
-    def seen_as(self, peer: Contact) -> Address | None:
-        """The address of this node as ``peer`` last told it."""
-        seen = self._seen.get(peer.public)
-        return seen[0] if seen is not None else None
-
     def is_far(self, address: Address) -> bool:
         """Whether others may know more of an address than that it does not answer."""
         if address.host[:1] == "~":
@@ -96,7 +92,7 @@ class Outside:
         if self._last == address:
             address = self._last  # one object for all who see it there
         self._last = address
-        keep(self._seen, peer.public, (address, now))
+        keep(self._seen, peer.public, (address, now), MAX_KNOWN)
         self.is_translated = self.is_translated or address.host not in self._paths.hosts()
         # By another port of this node itself it is seen elsewhere anyway.
         is_usual = self._paths.local(peer.address).port == self._paths.address.port
@@ -112,7 +108,7 @@ class Outside:
             return
         if now - self._told_at.get(contact.public, -SEEN_GAP) < SEEN_GAP:
             return
-        keep(self._told_at, contact.public, now)
+        keep(self._told_at, contact.public, now, MAX_KNOWN)
         self._chores.later(SEEN_AFTER, self._tell, contact)
 
     def _tell(self, contact: Contact) -> None:

@@ -24,18 +24,16 @@ from middleware.entangled.errors import Refused
 from middleware.entangled.identity import node_id
 from middleware.entangled.network.network import Address, is_relayed, relayed
 from middleware.entangled.reach.acquaintance import Acquaintances
-from middleware.entangled.reach.allowance import Allowance
 from middleware.entangled.reach.candidate import MAX_CANDIDATES, is_loopback, is_possible, packed, unpacked
 from middleware.entangled.reach.carrier import MAX_CARRIERS, Carriers
-from middleware.entangled.reach.freshport import FreshPorts
-from middleware.entangled.reach.introducer import ASKED_S, USUAL, Introducer
+from middleware.entangled.reach.introducer import ASKED_S, USUAL, Allowance, Introducer
 from middleware.entangled.reach.known import Known
 from middleware.entangled.reach.mirror import IMAGE, MIRROR, Mirror
 from middleware.entangled.reach.outside import Outside
 from middleware.entangled.reach.path import PathNetwork
 from middleware.entangled.reach.relay import CARRIED, CARRY, Relay
 from middleware.entangled.reach.upgrade import Upgrades
-from middleware.entangled.reach.way import HELD_S, Ways
+from middleware.entangled.reach.way import HELD_S, FreshPorts, Ways
 from middleware.entangled.wire.endpoint import Endpoint
 from middleware.entangled.wire.peer import Opening, Peer
 from middleware.entangled.wire.session import Session

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from middleware.entangled.reach.known import keep
+from middleware.entangled.bounded import keep
+from middleware.entangled.reach.known import MAX_KNOWN
 from middleware.entangled.wire.peer import Peer, Peers
 
 PAUSES = (1.0, 2.0, 5.0, 5.0, 15.0, 60.0)
@@ -40,7 +41,7 @@ class Upgrades:
     def add(self, public: bytes, is_behind: bool, now: float) -> None:
         """Try the direct way to a peer from now on; the one of the two who ``is_behind`` leaves it to the other."""
         if public not in self._upgrades:
-            keep(self._upgrades, public, _Upgrade(now + PAUSES[0] + (TURN if is_behind else 0.0)))
+            keep(self._upgrades, public, _Upgrade(now + PAUSES[0] + (TURN if is_behind else 0.0)), MAX_KNOWN)
 
     def drop(self, public: bytes) -> None:
         """Try no more: nobody carries to that peer."""

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 from twisted.internet.interfaces import IReactorTime
 
+from middleware.entangled.bounded import keep
 from middleware.entangled.contact import Contact
 from middleware.entangled.network.network import is_relayed
 from middleware.entangled.reach.carrier import Carriers
-from middleware.entangled.reach.known import keep
+from middleware.entangled.reach.known import MAX_KNOWN
 from middleware.entangled.reach.outside import Outside
 from middleware.entangled.reach.passage import Kind, Passage, kind_of
 from middleware.entangled.reach.path import PathNetwork
@@ -20,8 +19,10 @@ HELD_S = 5.0
 """Seconds for which a handshake goes on that others help with."""
 OPENED = 64
 """Sessions that are opened anew when this node's address changed."""
-
-Way = Literal["none", "direct", "carried"]
+MAX_FRESH = 16
+"""Fresh local ports at the same time."""
+SHUT_S = 60.0
+"""Seconds after which a fresh port is closed where no session goes by it."""
 
 
 class Ways:
@@ -38,13 +39,6 @@ class Ways:
         self._passages: dict[bytes, tuple[Kind, float]] = {}
         self._introduced_at: dict[bytes, float] = {}
         self._holes: dict[bytes, None] = {}
-
-    def way(self, contact: Contact) -> Way:
-        """How a peer is reached now: directly, by those who carry, or not at all so far."""
-        session = self._peers.session(contact.public)
-        if session is None:
-            return "none"
-        return "carried" if is_relayed(session.contact.address) else "direct"
 
     def passage(self, contact: Contact) -> Passage:
         """How a peer is reached now, by whom, and since when."""
@@ -79,14 +73,14 @@ class Ways:
 
     def introduced(self, public: bytes) -> None:
         """Take note that somebody introduces this node and a peer to each other now."""
-        keep(self._introduced_at, public, self._clock.seconds())
+        keep(self._introduced_at, public, self._clock.seconds(), MAX_KNOWN)
 
     def established(self, session: Session) -> None:
         """Take note of a session that is used from now on."""
         self._note_passage(session)
         address = session.contact.address
         if not is_relayed(address) and self._outside.is_far(address):
-            keep(self._holes, session.contact.public, None)
+            keep(self._holes, session.contact.public, None, MAX_KNOWN)
 
     def open_again(self, teller: bytes) -> None:
         """Open the sessions anew that went through a hole in the own router, the newest ones of them at least.
@@ -121,7 +115,7 @@ class Ways:
             noted = (self._kind(former), former.opened_at)
         if noted is not None or kind == "punched":  # else the session itself says it
             since = noted[1] if noted is not None and noted[0] == kind else self._clock.seconds()
-            keep(self._passages, public, (kind, since))
+            keep(self._passages, public, (kind, since), MAX_KNOWN)
 
     def _kind(self, session: Session) -> Kind:
         contact = session.contact
@@ -130,3 +124,45 @@ class Ways:
         introduced_at = self._introduced_at.get(contact.public, float("-inf"))
         was_introduced = before == "punched" or abs(session.opened_at - introduced_at) < HELD_S
         return kind_of(contact.address, own, self._outside.is_translated, was_introduced)
+
+
+class FreshPorts:
+    """Further local ports, from which a node knocks where early knocks may have spoilt its usual one."""
+
+    def __init__(self, paths: PathNetwork, ways: Ways, clock: IReactorTime) -> None:
+        self._paths = paths
+        self._ways = ways
+        self._clock = clock
+        self._opened_at: dict[int, float] = {}
+
+    def __len__(self) -> int:
+        return len(self._opened_at)
+
+    def __contains__(self, port: int) -> bool:
+        return port in self._opened_at
+
+    def open(self) -> int:
+        """A fresh local port; 0 where there are too many."""
+        now = self._clock.seconds()
+        if len(self._opened_at) >= MAX_FRESH:
+            unused = self._unused_since(now - HELD_S)
+            if not unused:
+                return 0
+            self._shut(unused[0])
+        port = self._paths.open_port()
+        if port:
+            self._opened_at[port] = now
+        return port
+
+    def shut_unused(self, now: float) -> None:
+        """Close those that were opened long ago, and by which no session goes."""
+        for port in self._unused_since(now - SHUT_S):
+            self._shut(port)
+
+    def _unused_since(self, before: float) -> list[int]:
+        """Those by which no session goes though they were opened before that moment, the oldest first."""
+        return [port for port, at in self._opened_at.items() if at < before and not self._ways.uses(port)]
+
+    def _shut(self, port: int) -> None:
+        del self._opened_at[port]
+        self._paths.shut_port(port)

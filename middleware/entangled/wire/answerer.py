@@ -15,6 +15,7 @@ from twisted.internet.interfaces import IReactorTime
 from twisted.logger import Logger
 from twisted.python.failure import Failure as Trouble
 
+from middleware.entangled.bounded import keep
 from middleware.entangled.contact import Contact
 from middleware.entangled.token_bucket import TokenBucket
 from middleware.entangled.wire.courier import Courier
@@ -35,7 +36,7 @@ from middleware.entangled.wire.message import (
     Told,
     encoded,
 )
-from middleware.entangled.wire.method import Entry, ErrorCodes, Ledger, Method
+from middleware.entangled.wire.method import Entry, Ledger, Method, failure_of
 from middleware.entangled.wire.session import MAX_PLAIN, Session
 
 MAX_CANCELLED = 1024
@@ -61,7 +62,6 @@ class Answerer:
         clock: IReactorTime,
         send: Callable[[Session, bytes], None],
         courier: Courier,
-        codes: ErrorCodes,
         counters: Counter[str],
         may: Callable[[bytes, str], bool],
         refused: Callable[[Contact, str], None],
@@ -72,7 +72,6 @@ class Answerer:
         self._clock = clock
         self._send = send
         self._courier = courier
-        self._codes = codes
         self._counters = counters
         self._ledger = Ledger()
         self._cancelled: dict[tuple[bytes, int], None] = {}
@@ -174,9 +173,7 @@ class Answerer:
         self._courier.forget(public, Key(False, message.id))
         entry = self._ledger.entry(public, message.id)
         if entry is None:
-            self._cancelled[public, message.id] = None
-            if len(self._cancelled) > MAX_CANCELLED:
-                del self._cancelled[next(iter(self._cancelled))]
+            keep(self._cancelled, (public, message.id), None, MAX_CANCELLED)
         elif entry.work is not None:
             self._counters["cancelled"] += 1
             self._stop(entry)
@@ -261,13 +258,8 @@ class Answerer:
 
     def _is_within(self, public: bytes) -> bool:
         """Whether a peer may ask one thing more now."""
-        asking = self._asking
-        bucket = asking.pop(public, None)
-        if bucket is None:
-            bucket = TokenBucket(QUESTIONS, QUESTIONS_AT_ONCE)
-            if len(asking) >= MAX_ASKING:
-                del asking[next(iter(asking))]
-        asking[public] = bucket
+        bucket = self._asking.get(public) or TokenBucket(QUESTIONS, QUESTIONS_AT_ONCE)
+        keep(self._asking, public, bucket, MAX_ASKING)
         return bucket.take(self._clock.seconds())
 
     def _called(self, method: Method, peer: Contact, arguments: tuple[object, ...], deadline: float) -> object:
@@ -281,7 +273,7 @@ class Answerer:
     def _worded(self, method: Method, number: int, result: object) -> bytes:
         """The bytes that tell the asker the result of a method, good or bad."""
         if isinstance(result, Trouble):
-            known = self._codes.failure(number, result)
+            known = failure_of(number, result)
             if known is not None:
                 return encoded(known)
             self._log.failure("{method} failed for a peer", failure=result, method=method.name)
@@ -297,7 +289,7 @@ class Answerer:
         return answer
 
     def _told_no(self, method: Method, trouble: Trouble) -> None:
-        if self._codes.failure(0, trouble) is not None:
+        if failure_of(0, trouble) is not None:
             self._counters["refused"] += 1
         else:
             self._log.failure("{method} failed for a peer", failure=trouble, method=method.name)

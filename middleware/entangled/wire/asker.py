@@ -14,6 +14,7 @@ from twisted.internet import defer
 from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IDelayedCall, IReactorTime
 
+from middleware.entangled.background import cancel
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import Crowded, NoAnswer, TooLarge
 from middleware.entangled.network.network import Address
@@ -30,8 +31,8 @@ from middleware.entangled.wire.message import (
     aged,
     encoded,
 )
-from middleware.entangled.wire.method import ErrorCodes
-from middleware.entangled.wire.peer import OPENING_S, Opening, Peer, Peers, cancel
+from middleware.entangled.wire.method import error_of
+from middleware.entangled.wire.peer import OPENING_S, Opening, Peer, Peers
 from middleware.entangled.wire.session import MAX_PLAIN, Session
 
 PATIENCE = 1.5
@@ -91,13 +92,11 @@ class Asker:
         peers: Peers,
         courier: Courier,
         send: Callable[[Session, bytes], None],
-        codes: ErrorCodes,
         counters: Counter[str],
     ) -> None:
         self._clock = clock
         self._peers = peers
         self._send = send
-        self._codes = codes
         self._counters = counters
         self._courier = courier
         self._inquiries: dict[int, Inquiry] = {}
@@ -188,21 +187,13 @@ class Asker:
 
     def stop(self, error: Exception) -> None:
         """Cancel every timer and fail every question with ``error``."""
-        inquiries = list(self._inquiries.values())
-        for inquiry in inquiries:
-            self._drop(inquiry)
-        for inquiry in inquiries:
-            inquiry.deferred.errback(error)
+        self._fail_all(list(self._inquiries.values()), lambda: error)
 
     def refused(self, peer: Peer, error: Callable[[], Exception]) -> None:
         """Fail every question to a peer: one of us does not let the other in."""
         self._counters["untold"] += len(peer.tells)
         peer.tells = ()
-        inquiries = self._of(peer)
-        for inquiry in inquiries:
-            self._drop(inquiry)
-        for inquiry in inquiries:
-            inquiry.deferred.errback(error())
+        self._fail_all(self._of(peer), error)
 
     def is_asked(self, number: int, public: bytes) -> bool:
         """Whether the question ``number`` waits for an answer of the peer with that key."""
@@ -229,7 +220,7 @@ class Asker:
         if isinstance(message, Answer):
             inquiry.deferred.callback(message.value)
         else:
-            inquiry.deferred.errback(self._codes.error(message))
+            inquiry.deferred.errback(error_of(message))
 
     def established(self, peer: Peer, session: Session, is_owed: bool) -> None:
         """Send what waited for a session; ``is_owed`` where the peer waits to hear from us."""
@@ -354,6 +345,12 @@ class Asker:
         cancel(inquiry.timer)
         wait = max(0.0, min(wait, inquiry.deadline - self._clock.seconds()))
         inquiry.timer = self._clock.callLater(wait, self._due, inquiry)
+
+    def _fail_all(self, inquiries: list[Inquiry], error: Callable[[], Exception]) -> None:
+        for inquiry in inquiries:
+            self._drop(inquiry)
+        for inquiry in inquiries:
+            inquiry.deferred.errback(error())
 
     def _fail(self, inquiry: Inquiry, why: str) -> None:
         self._forget(inquiry)

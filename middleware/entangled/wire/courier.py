@@ -12,6 +12,8 @@ from dataclasses import dataclass
 
 from twisted.internet.interfaces import IDelayedCall, IReactorTime
 
+from middleware.entangled.background import cancel
+from middleware.entangled.bounded import keep
 from middleware.entangled.errors import Malformed
 from middleware.entangled.wire.flow import IDLE_S, Flow, Parcel
 from middleware.entangled.wire.message import (
@@ -23,7 +25,6 @@ from middleware.entangled.wire.message import (
     part_of,
     receipt_of,
 )
-from middleware.entangled.wire.peer import cancel
 from middleware.entangled.wire.session import Session
 
 # Going out: eight of the largest to one peer, so that a burst of writes is not refused; 16 MiB in all.
@@ -175,10 +176,6 @@ class Courier:
         if flow is not None:
             flow.drop(key)
 
-    def forget(self, public: bytes, key: Key) -> None:
-        """Forget what has come of a message from a peer."""
-        self._forget((public, key))
-
     def restart(self, public: bytes) -> None:
         """Begin what goes to a peer anew: there is a new session, so perhaps the peer was restarted."""
         flow = self._flows.get(public)
@@ -191,7 +188,7 @@ class Courier:
         for key in list(flow.parcels) if flow is not None else ():
             self.drop(public, key)
         for where in [where for where in self._assemblies if where[0] == public]:
-            self._forget(where)
+            self.forget(*where)
 
     def let_go(self, public: bytes) -> None:
         """Forget how fast the way to a peer is, where nothing goes there."""
@@ -249,11 +246,9 @@ class Courier:
             return
         is_urgent = assembly.add(part, now)
         if assembly.is_whole:
-            self._forget(where)
+            self.forget(public, key)
             if not key.is_answer:
-                self._ended[where] = None
-                if len(self._ended) > MAX_ENDED:
-                    del self._ended[next(iter(self._ended))]
+                keep(self._ended, where, None, MAX_ENDED)
             self._send(public, packed_receipt(key, True, 0, part.number, assembly.here))
             self._deliver(session, key, assembly.message())
             return
@@ -276,11 +271,8 @@ class Courier:
 
     def _give_up(self, where: tuple[bytes, Key], now: float) -> None:
         self._counters["abandoned"] += 1
-        self._forget(where)
-        self._tardy.pop(where[0], None)
-        self._tardy[where[0]] = now
-        if len(self._tardy) > MAX_TARDY:
-            del self._tardy[next(iter(self._tardy))]
+        self.forget(*where)
+        keep(self._tardy, where[0], now, MAX_TARDY)
 
     def _new_flow(self, public: bytes) -> Flow:
         if len(self._flows) >= MAX_FLOWS:
@@ -296,10 +288,10 @@ class Courier:
         self._flows[public] = flow
         return flow
 
-    def _forget(self, where: tuple[bytes, Key]) -> None:
-        assembly = self._assemblies.pop(where, None)
+    def forget(self, public: bytes, key: Key) -> None:
+        """Forget what has come of a message from a peer."""
+        assembly = self._assemblies.pop((public, key), None)
         if assembly is not None:
-            public = where[0]
             self._bytes_in[public] -= assembly.total
             if not self._bytes_in[public]:
                 del self._bytes_in[public]

@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
+from middleware.entangled.bounded import keep
 from middleware.entangled.record import Slot
 from middleware.entangled.token_bucket import TokenBucket
 
@@ -80,7 +81,7 @@ class Door(Protocol):
 
     ``room`` is the number of bytes that a pass of this team may take, at most ``MAX_ROOM``, and the same for all its
     members; 0 in an open team.  ``shown`` is this node's own pass, ``life`` the life that it lives.  ``fingerprint``
-    is what anybody may know of the team, 8 bytes (zero: it does not say).
+    is what anybody may know of the team, 8 bytes (zero: it does not say).  The methods answer as an open team does.
     """
 
     @property
@@ -104,78 +105,51 @@ class Door(Protocol):
 
         Changes nothing: what it judges may be a recording.
         """
+        return ""
 
     def admit(self, public: bytes, shown: bytes) -> str:
         """As ``judge``, of a node that has confirmed its session, so it may be remembered."""
+        return ""
 
     def may(self, public: bytes, method: str) -> bool:
         """Whether ``public`` is the key of a present member that may call ``method``; no, where it is not known."""
+        return True
 
     def may_store(self, slot: Slot) -> bool:
         """Whether the certificate of the owner of ``slot``, as it is at present, allows it to write there."""
+        return True
 
     def may_stay(self, slot: Slot) -> bool:
         """Whether what is held in ``slot``, written when its owner was allowed to, may be held on and shown."""
+        return True
 
     def authority(self, owner: bytes) -> Authority:
         """What ``may_store`` goes by for this owner; it changes when that does."""
+        return Authority()
 
     def roles_of(self, public: bytes) -> frozenset[str] | None:
         """Return the roles that the holder of that key has now, none for a stranger or a revoked or expired member.
 
         None means that the team is open and restricts nobody.
         """
+        return None
 
     def certificate(self, owner: bytes) -> bytes:
         """The certificate of an owner by which other nodes can judge its records; empty where it is unknown."""
+        return b""
 
     def learn(self, owner: bytes, certificate: bytes) -> bool:
         """Take in the certificate of an owner that another node showed; whether it holds."""
+        return False
 
 
-class OpenDoor:
+class OpenDoor(Door):
     """The door of an open team: who holds the key is in, and may do everything."""
 
     room = 0
     shown = b""
     life = UNCOUNTED
     fingerprint = bytes(8)
-
-    def judge(self, public: bytes, shown: bytes) -> str:
-        """Nobody is refused."""
-        return ""
-
-    def admit(self, public: bytes, shown: bytes) -> str:
-        """Nobody is refused, or remembered."""
-        return ""
-
-    def may(self, public: bytes, method: str) -> bool:
-        """Everybody may."""
-        return True
-
-    def may_store(self, slot: Slot) -> bool:
-        """Everybody may."""
-        return True
-
-    def may_stay(self, slot: Slot) -> bool:
-        """Everything may."""
-        return True
-
-    def authority(self, owner: bytes) -> Authority:
-        """The same for everybody."""
-        return Authority()
-
-    def roles_of(self, public: bytes) -> frozenset[str] | None:
-        """Nobody is restricted."""
-        return None
-
-    def certificate(self, owner: bytes) -> bytes:
-        """Nobody has one."""
-        return b""
-
-    def learn(self, owner: bytes, certificate: bytes) -> bool:
-        """Nobody needs one."""
-        return False
 
 
 OPEN = OpenDoor()
@@ -224,10 +198,8 @@ class Lives:
         """Take note of a life that was proved and not refused; whether it follows another one."""
         if not life.number:
             return False
-        last, before = self._known.pop(public, (life, life))
-        self._known[public] = (last, before) if life == last else (life, last)
-        if len(self._known) > MAX_LIVES:
-            del self._known[next(iter(self._known))]
+        last, before = self._known.get(public, (life, life))
+        keep(self._known, public, (last, before) if life == last else (life, last), MAX_LIVES)
         return life != last
 
     def forget(self, public: bytes) -> None:
@@ -255,10 +227,7 @@ class Stamps:
         last, newest = self._newest.get(public, (UNCOUNTED, 0))
         if life.number < last.number or (life == last and stamp <= newest):
             return False
-        self._newest.pop(public, None)
-        self._newest[public] = (life, stamp)
-        if len(self._newest) > MAX_LIVES:
-            del self._newest[next(iter(self._newest))]
+        keep(self._newest, public, (life, stamp), MAX_LIVES)
         return True
 
 
@@ -274,15 +243,11 @@ class Noted:
 
     def is_new(self, now: float, *what: object) -> bool:
         """Whether to log ``what``; noted it is then."""
-        if what in self._said:
-            self._said[what] = self._said.pop(what)
+        is_new = what not in self._said
+        if is_new and not self._lines.take(now):
             return False
-        if not self._lines.take(now):
-            return False
-        self._said[what] = None
-        if len(self._said) > MAX_NOTED:
-            del self._said[next(iter(self._said))]
-        return True
+        keep(self._said, what, None, MAX_NOTED)
+        return is_new
 
 
 def checked_secrets(secrets: Sequence[bytes]) -> tuple[bytes, ...]:

@@ -16,6 +16,7 @@ from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
 from twisted.logger import Logger
 
+from middleware.entangled.bounded import keep
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import Forged, Malformed, NotAdmitted, NotRunning
 from middleware.entangled.identity import Identity
@@ -54,7 +55,7 @@ from middleware.entangled.wire.message import (
     Told,
     decoded,
 )
-from middleware.entangled.wire.method import ErrorCodes, Method
+from middleware.entangled.wire.method import Method
 from middleware.entangled.wire.peer import Peers
 from middleware.entangled.wire.rebuff import Rebuffs, Side
 from middleware.entangled.wire.session import (
@@ -124,7 +125,6 @@ class Endpoint:
         self._rng = rng
         self._identity = identity
         self._own = Credentials.of(identity, team_key)
-        self._codes = ErrorCodes()
         self._lives = Lives()
         self._stamps = Stamps()
         self._noted = Noted()
@@ -138,9 +138,9 @@ class Endpoint:
             lambda number, public: self._asker.progressed(number, public),
             self.counters,
         )
-        self._answerer = Answerer(clock, self._send, self._courier, self._codes, self.counters, door.may, self._may_not)
-        self._asker = Asker(clock, rng, self._peers, self._courier, self._send, self._codes, self.counters)
-        self._greeter = Greeter(identity.public, self._peers, network, clock, rng, self.counters)
+        self._answerer = Answerer(clock, self._send, self._courier, self.counters, door.may, self._may_not)
+        self._asker = Asker(clock, rng, self._peers, self._courier, self._send, self.counters)
+        self.greeter = Greeter(identity.public, self._peers, network, clock, rng, self.counters)
         self._cookies = Cookies(self._own.cookie_key, rng)
         self.echoer = Echoer(self.post, clock, lambda: door.fingerprint)
         self.hailer = Hailer(self.post, clock, rng)
@@ -151,9 +151,9 @@ class Endpoint:
             DATA: self._on_data,
             INIT: self._on_init,
             RESP: self._on_resp,
-            WHO: self._greeter.on_who,
-            HERE: self._greeter.on_here,
-            COOKIE: self._greeter.on_cookie,
+            WHO: self.greeter.on_who,
+            HERE: self.greeter.on_here,
+            COOKIE: self.greeter.on_cookie,
             HAIL: lambda datagram, source: self._count(self.echoer.on_hail(datagram, source)),
             ECHO: lambda datagram, source: self._count(self.hailer.on_echo(datagram, source)),
         }
@@ -178,7 +178,7 @@ class Endpoint:
         self._answerer.clear()
         self._half_open.clear()
         error = NotRunning("the endpoint was stopped")
-        self._greeter.stop(error)
+        self.greeter.stop(error)
         self.hailer.stop(error)
         self._asker.stop(error)
         self._courier.stop()
@@ -228,7 +228,7 @@ class Endpoint:
         """Let peers call ``answer(peer, *arguments)`` under ``name``.
 
         It returns something that msgpack can hold (``MAX_MESSAGE`` at most), a Deferred or a coroutine of it, or raises
-        ``Refused`` or an exception that both sides named by ``expose_error``: the asker gets it with its text.
+        ``Refused``: the asker gets it with its code and its text.
         Arguments that do not fit the function's parameters and plain annotations are refused before it runs; other
         exceptions are logged, and the asker gets ``Refused("internal error")``.  It runs only in an established
         session, and with ``changes`` at most once for each question; a repeated one is given the answer of the first.
@@ -242,14 +242,6 @@ class Endpoint:
         keyword-only parameter ``deadline`` gets that moment, in seconds of this node's clock (infinite where none).
         """
         self._answerer.methods[name] = Method(name, answer, changes, idempotent, early)
-
-    def expose_error(self, kind: type[Exception], code: str) -> None:
-        """Let exceptions of ``kind`` cross the wire, both ways, under ``code``, made again from their text alone.
-
-        What has no name here arrives as ``Refused`` with its ``code``.  Raises ``ValueError`` for a code that is taken
-        or cannot be one.
-        """
-        self._codes.add(kind, code)
 
     def route_inside(self, kind: int, receiver: Inside) -> None:
         """Hand what peers send in confirmed sessions with this first byte to ``receiver``.
@@ -286,9 +278,9 @@ class Endpoint:
         something: such a question waits for the session, others ride in the handshake.  For one that ``is_light`` no
         session is opened beside the one that there is, however silent the peer.
 
-        Fails with ``NoAnswer``, ``Refused`` (the peer's text), an exception named by ``expose_error``, ``TooLarge``,
-        ``Crowded``, ``NotAdmitted``, ``NotRunning``, or with the ``TypeError`` of arguments that msgpack cannot hold.
-        When it is cancelled, the peer is told and cancels its work.
+        Fails with ``NoAnswer``, ``Refused`` (the peer's code and text), ``TooLarge``, ``Crowded``, ``NotAdmitted``,
+        ``NotRunning``, or with the ``TypeError`` of arguments that msgpack cannot hold.  When it is
+        cancelled, the peer is told and cancels its work.
         """
         if not self.is_running:
             return defer.fail(NotRunning("the endpoint is not running; start it first"))
@@ -322,15 +314,7 @@ class Endpoint:
         """Learn who listens at ``address``; fails with ``NoAnswer``.  The contact has not proved its key yet."""
         if not self.is_running:
             return defer.fail(NotRunning("the endpoint is not running; start it first"))
-        return self._greeter.greet(address, timeout)
-
-    def call(self) -> bytes:
-        """A WHO for many, such as all on a LAN; whose HERE comes is then greeted at its address."""
-        return self._greeter.call()
-
-    def is_greeting(self, datagram: bytes) -> bool:
-        """Whether ``datagram`` is a WHO or HERE of this team."""
-        return self._greeter.opens(datagram)
+        return self.greeter.greet(address, timeout)
 
     def overhear(self, datagram: bytes, source: Address) -> None:
         """Take a datagram that came by another way than the node's own port; answers leave by that port."""
@@ -613,9 +597,7 @@ class Endpoint:
         if self._is_news(contact.public, code, True):
             self._log.warn("{text}", text=text, code=code)
         self._part(contact.public, text, code)
-        if len(self.refusals) >= MAX_REFUSALS:
-            del self.refusals[next(iter(self.refusals))]
-        self.refusals[contact.public] = contact, code
+        keep(self.refusals, contact.public, (contact, code), MAX_REFUSALS)
         self.on_refused(contact, code)
 
     def _part(self, public: bytes, text: str, code: str) -> None:

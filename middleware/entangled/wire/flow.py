@@ -8,6 +8,7 @@ from itertools import islice
 
 from twisted.internet.interfaces import IDelayedCall, IReactorTime
 
+from middleware.entangled.background import cancel
 from middleware.entangled.wire.congestion import BACK_OFF, LONGEST, RoundTrip, Window
 from middleware.entangled.wire.message import (
     MAX_PARTS,
@@ -19,7 +20,6 @@ from middleware.entangled.wire.message import (
     Receipt,
     part_count,
 )
-from middleware.entangled.wire.peer import cancel
 
 IDLE_S = 10.0
 TURNS = 4  # parcels to one peer that take turns; the others wait, or each would hold memory at the receiver

@@ -13,18 +13,17 @@ from __future__ import annotations
 import hashlib
 import random
 from collections import Counter
-from dataclasses import dataclass
 
 from nacl import bindings
 from nacl.exceptions import CryptoError
 from twisted.internet.defer import Deferred
-from twisted.internet.interfaces import IDelayedCall, IReactorTime
+from twisted.internet.interfaces import IReactorTime
 
 from middleware.entangled.contact import Contact
-from middleware.entangled.errors import Forged, NoAnswer
+from middleware.entangled.errors import Forged
 from middleware.entangled.network.network import Address, Network
 from middleware.entangled.token_bucket import TokenBucket
-from middleware.entangled.wire.congestion import BACK_OFF, FIRST_GUESS, LONGEST
+from middleware.entangled.wire.hail import Probes
 from middleware.entangled.wire.peer import Peers
 from middleware.entangled.wire.session import MAC, Credentials, has_cookie, mac_of
 
@@ -125,11 +124,13 @@ class Cookies:
         ).digest()
 
 
-class Greeter:
+class Greeter(Probes[Contact]):
     """Greets addresses for an endpoint until one answers or the time is up, greets back, and pays with cookies.
 
     It does so under each secret of the team that ``peers`` goes by, in turn, the newest first.
     """
+
+    silence = "nobody of this team answers"
 
     def __init__(
         self,
@@ -140,23 +141,17 @@ class Greeter:
         rng: random.Random,
         counters: Counter[str],
     ) -> None:
+        super().__init__(network.send, clock)
         self._public = public
         self._peers = peers
-        self._network = network
-        self._clock = clock
         self._rng = rng
         self._counters = counters
-        self._pending: dict[bytes, _Greeting] = {}
 
     def greet(self, address: Address, timeout: float) -> Deferred[Contact]:
         """Learn who listens at ``address`` within ``timeout`` seconds; fails with ``NoAnswer``."""
         token = self._rng.randbytes(TOKEN_BYTES)
-        deferred: Deferred[Contact] = Deferred(lambda _: self._cancelled(token))
         datagrams = [who(own.greet_key, token, self._rng) for own in self._peers.ring]
-        now = self._clock.seconds()
-        self._pending[token] = _Greeting(address, datagrams, now + timeout, deferred, now)
-        self._send(token, FIRST_GUESS)
-        return deferred
+        return self._begin(token, address, datagrams, timeout)
 
     def call(self) -> bytes:
         """A WHO for many, such as all on a LAN; whose HERE comes is then greeted at its address."""
@@ -166,19 +161,12 @@ class Greeter:
         """Whether ``datagram`` is a WHO or HERE of this team."""
         return self._opened(datagram) is not None
 
-    def stop(self, error: Exception) -> None:
-        """Fail what is pending with ``error``."""
-        for token in list(self._pending):
-            greeting = self._forget(token)
-            if greeting is not None:
-                greeting.deferred.errback(error)
-
     def on_who(self, datagram: bytes, source: Address) -> None:
         """Answer a greeting, if it is one of our team."""
         found = self._opened(datagram)
         if found is not None:
             own, token, _ = found
-            self._network.send(here(own.greet_key, token, self._public, self._rng), source)
+            self._send(here(own.greet_key, token, self._public, self._rng), source)
 
     def on_here(self, datagram: bytes, source: Address) -> None:
         """Take the answer to a greeting of ours."""
@@ -223,35 +211,3 @@ class Greeter:
                 continue
         self._counters["forged"] += 1
         return None
-
-    def _send(self, token: bytes, wait: float) -> None:
-        greeting = self._pending[token]
-        left = greeting.deadline - self._clock.seconds()
-        if left <= 0:
-            self._forget(token)
-            greeting.deferred.errback(NoAnswer(f"nobody of this team answers at {greeting.address}"))
-            return
-        self._network.send(greeting.datagrams[greeting.tries % len(greeting.datagrams)], greeting.address)
-        greeting.tries += 1
-        wait = min(wait, LONGEST)
-        greeting.timer = self._clock.callLater(min(wait, left), self._send, token, wait * BACK_OFF)
-
-    def _cancelled(self, token: bytes) -> None:
-        self._forget(token)
-
-    def _forget(self, token: bytes) -> _Greeting | None:
-        greeting = self._pending.pop(token, None)
-        if greeting is not None and greeting.timer is not None and greeting.timer.active():
-            greeting.timer.cancel()
-        return greeting
-
-
-@dataclass(slots=True, eq=False)
-class _Greeting:
-    address: Address
-    datagrams: list[bytes]
-    deadline: float
-    deferred: Deferred[Contact]
-    begun_at: float
-    tries: int = 0
-    timer: IDelayedCall | None = None

@@ -7,20 +7,20 @@ speaks, by how much the clocks differ, and from where it is seen.  An ECHO is as
 from __future__ import annotations
 
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Generic, NamedTuple, TypeVar
 
 from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IDelayedCall, IReactorTime
 
+from middleware.entangled.background import cancel
 from middleware.entangled.errors import Malformed, NoAnswer
-from middleware.entangled.network.address import ADDRESS, address_of, packed_address
-from middleware.entangled.network.network import Address
+from middleware.entangled.network.network import ADDRESS, Address, address_of, packed_address
 from middleware.entangled.token_bucket import TokenBucket
 from middleware.entangled.wire.congestion import BACK_OFF, FIRST_GUESS, LONGEST
-from middleware.entangled.wire.peer import cancel
 
+T = TypeVar("T")
 HAIL, ECHO = 0x19, 0x1A
 VERSION = 1
 TOKEN = 16
@@ -93,29 +93,74 @@ class Echoer:
 
 
 @dataclass(slots=True, eq=False)
-class _Hailing:
+class Probe(Generic[T]):
+    """A question to an address; ``datagrams`` are sent in turn."""
+
     address: Address
+    datagrams: Sequence[bytes]
+    begun_at: float
     deadline: float
-    deferred: Deferred[Echo]
+    deferred: Deferred[T]
+    tries: int = 0
     timer: IDelayedCall | None = None
 
 
-class Hailer:
+class Probes(Generic[T]):
+    """Sends each question again until it is answered or its time is up; ``send`` sends a datagram."""
+
+    silence = "nobody answers"
+
+    def __init__(self, send: Callable[[bytes, Address], None], clock: IReactorTime) -> None:
+        self._send = send
+        self._clock = clock
+        self._pending: dict[bytes, Probe[T]] = {}
+
+    def stop(self, error: Exception) -> None:
+        """Fail what is pending with ``error``."""
+        for token in list(self._pending):
+            probe = self._forget(token)
+            if probe is not None:
+                probe.deferred.errback(error)
+
+    def _begin(self, token: bytes, address: Address, datagrams: Sequence[bytes], timeout: float) -> Deferred[T]:
+        now, deferred = self._clock.seconds(), Deferred[T](lambda _: self._drop(token))
+        self._pending[token] = Probe(address, datagrams, now, now + timeout, deferred)
+        self._try(token, FIRST_GUESS)
+        return deferred
+
+    def _try(self, token: bytes, wait: float) -> None:
+        probe = self._pending[token]
+        left = probe.deadline - self._clock.seconds()
+        if left <= 0:
+            self._forget(token)
+            probe.deferred.errback(NoAnswer(f"{self.silence} at {probe.address}"))
+            return
+        self._send(probe.datagrams[probe.tries % len(probe.datagrams)], probe.address)
+        probe.tries += 1
+        wait = min(wait, LONGEST)
+        probe.timer = self._clock.callLater(min(wait, left), self._try, token, wait * BACK_OFF)
+
+    def _drop(self, token: bytes) -> None:
+        self._forget(token)
+
+    def _forget(self, token: bytes) -> Probe[T] | None:
+        probe = self._pending.pop(token, None)
+        if probe is not None:
+            cancel(probe.timer)
+        return probe
+
+
+class Hailer(Probes[Echo]):
     """Hails addresses until one answers or the time is up; ``send`` sends a datagram."""
 
     def __init__(self, send: Callable[[bytes, Address], None], clock: IReactorTime, rng: random.Random) -> None:
-        self._send = send
-        self._clock = clock
+        super().__init__(send, clock)
         self._rng = rng
-        self._pending: dict[bytes, _Hailing] = {}
 
     def hail(self, address: Address, timeout: float = 1.5) -> Deferred[Echo]:
         """Who is at ``address``; fails with ``NoAnswer`` after ``timeout`` seconds."""
         token = self._rng.randbytes(TOKEN)
-        deferred: Deferred[Echo] = Deferred(lambda _: self._cancelled(token))
-        self._pending[token] = _Hailing(address, self._clock.seconds() + timeout, deferred)
-        self._again(token, FIRST_GUESS)
-        return deferred
+        return self._begin(token, address, [hail(token)], timeout)
 
     def on_echo(self, datagram: bytes, source: Address) -> str:
         """Take an answer; why it was dropped, in one word."""
@@ -123,38 +168,10 @@ class Hailer:
             answer = echo_of(datagram)
         except Malformed:
             return "malformed"
-        hailing = self._pending.get(answer.token)
-        if hailing is None:
+        probe = self._pending.get(answer.token)
+        if probe is None:
             return "unasked"
-        if hailing.address != source:
-            return ""
-        self._forget(answer.token)
-        hailing.deferred.callback(answer)
+        if probe.address == source:
+            self._forget(answer.token)
+            probe.deferred.callback(answer)
         return ""
-
-    def stop(self, error: Exception) -> None:
-        """Fail what is pending with ``error``."""
-        for token in list(self._pending):
-            hailing = self._forget(token)
-            if hailing is not None:
-                hailing.deferred.errback(error)
-
-    def _again(self, token: bytes, wait: float) -> None:
-        hailing = self._pending[token]
-        left = hailing.deadline - self._clock.seconds()
-        if left <= 0:
-            self._forget(token)
-            hailing.deferred.errback(NoAnswer(f"nobody answers at {hailing.address}"))
-            return
-        self._send(hail(token), hailing.address)
-        wait = min(wait, LONGEST)
-        hailing.timer = self._clock.callLater(min(wait, left), self._again, token, wait * BACK_OFF)
-
-    def _cancelled(self, token: bytes) -> None:
-        self._forget(token)
-
-    def _forget(self, token: bytes) -> _Hailing | None:
-        hailing = self._pending.pop(token, None)
-        if hailing is not None:
-            cancel(hailing.timer)
-        return hailing

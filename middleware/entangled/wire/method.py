@@ -1,12 +1,11 @@
 """Method: what peers may call, with arguments checked before it runs; which calls ran; and how errors are named.
 
-``Ledger`` keeps a repeated question from running twice.  ``ErrorCodes`` has the exceptions that cross the wire: a code
-is looked up in a table that the program filled, and never imported.
+``Ledger`` keeps a repeated question from running twice.  An error crosses the wire as ``Refused``, with its code and
+its text.
 """
 
 from __future__ import annotations
 
-import contextlib
 import inspect
 import math
 import re
@@ -21,10 +20,10 @@ from twisted.internet.defer import CancelledError, Deferred
 from twisted.internet.interfaces import IDelayedCall
 from twisted.python.failure import Failure as Trouble
 
+from middleware.entangled.background import cancel
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import Refused
 from middleware.entangled.wire.message import BAD_ARGUMENTS, CANCELLED, Failure, is_code
-from middleware.entangled.wire.peer import cancel
 from middleware.entangled.wire.session import Session
 
 KEPT_S = 30.0
@@ -170,42 +169,19 @@ def _kinds(hint: object) -> tuple[type, ...] | None:
     return (plain,) if plain in _PLAIN else None
 
 
-class ErrorCodes:
-    """The exceptions that cross the wire as themselves, and their codes."""
+def failure_of(number: int, trouble: Trouble) -> Failure | None:
+    """What the asker of question ``number`` is told of an error; None where it is not meant for others."""
+    error = trouble.value
+    if isinstance(error, Refused):
+        return Failure(number, error.code if is_code(error.code) else Refused.code, str(error))
+    if isinstance(error, CancelledError):
+        return Failure(number, CANCELLED, "the call was cancelled")
+    return None
 
-    def __init__(self) -> None:
-        self._codes: dict[type[Exception], str] = {}
-        self._kinds: dict[str, type[Exception]] = {}
-        self.add(BadArguments, BAD_ARGUMENTS)
 
-    def add(self, kind: type[Exception], code: str) -> None:
-        """Name a class; raises ``ValueError`` where the code is taken, or is not 1 to 64 printable ASCII characters."""
-        if not is_code(code):
-            raise ValueError(f"{code!r} is no code; it has 1 to 64 printable ASCII characters")
-        if self._kinds.get(code, kind) is not kind:
-            raise ValueError(f"the code {code!r} belongs to {self._kinds[code].__name__}; choose another one")
-        self._codes[kind] = code
-        self._kinds[code] = kind
-
-    def failure(self, number: int, trouble: Trouble) -> Failure | None:
-        """What the asker of question ``number`` is told of an error; None where it is not meant for others."""
-        error = trouble.value
-        for kind in type(error).__mro__:
-            if kind in self._codes:
-                return Failure(number, self._codes[kind], str(error))
-        if isinstance(error, Refused):
-            return Failure(number, error.code if is_code(error.code) else Refused.code, str(error))
-        if isinstance(error, CancelledError):
-            return Failure(number, CANCELLED, "the call was cancelled")
-        return None
-
-    def error(self, failure: Failure) -> Exception:
-        """The exception that a failure stands for: of its class where the code is known, else ``Refused`` with it."""
-        kind = self._kinds.get(failure.code)
-        if kind is not None:
-            with contextlib.suppress(Exception):  # the class is the owner's code: it may want other arguments
-                return kind(failure.text)
-        return Refused(failure.text, failure.code)
+def error_of(failure: Failure) -> Refused:
+    """The exception that a failure stands for."""
+    return BadArguments(failure.text) if failure.code == BAD_ARGUMENTS else Refused(failure.text, failure.code)
 
 
 @dataclass(slots=True)
@@ -257,9 +233,9 @@ class Ledger:
 
     def settle(self, public: bytes, oldest: int, now: float) -> None:
         """Forget what ended of the questions of a peer before ``oldest``: it has those answers, or gave them up."""
-        if public not in self._accounts and not self._has_place():
-            return  # it is turned away in a moment
         account = self._account(public, now)
+        if account is None:
+            return  # it is turned away in a moment
         life = oldest >> LIFE_BITS
         before = account.settled.get(life)
         if before is None and len(account.settled) >= MAX_LIVES:
@@ -273,10 +249,8 @@ class Ledger:
 
     def begin(self, public: bytes, question: int, session: Session | None, now: float, is_bulky: bool) -> Entry | None:
         """Enter a question that is about to run; None where there is no room."""
-        if public not in self._accounts and not self._has_place():
-            return None
         account = self._account(public, now)
-        if self._count >= MAX_ENTRIES or len(account.running) + len(account.ended) >= MAX_PER_PEER:
+        if account is None or self._count >= MAX_ENTRIES or len(account.running) + len(account.ended) >= MAX_PER_PEER:
             return None
         entry = account.running[question] = Entry(session, is_bulky)
         self._count += 1
@@ -324,12 +298,17 @@ class Ledger:
             del self._accounts[found]
         return found is not None
 
-    def _account(self, public: bytes, now: float) -> _Account:
-        """The account of a peer, without what is over; the one that was silent for longest goes, if that is long."""
-        account = self._accounts.get(public)
+    def _account(self, public: bytes, now: float) -> _Account | None:
+        """The account of a peer, without what is over; None where there is no room for another one.
+
+        The one that was silent for longest goes, if that is long.
+        """
+        account = self._accounts.pop(public, None)
         if account is None:
-            account = self._accounts[public] = _Account()
-        self._accounts[public] = self._accounts.pop(public)  # whoever was silent for longest stands first
+            if not self._has_place():
+                return None
+            account = _Account()
+        self._accounts[public] = account  # whoever was silent for longest stands first
         account.heard_at = now
         self._expire(account, now)
         oldest_public, oldest = next(iter(self._accounts.items()))

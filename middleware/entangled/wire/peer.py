@@ -14,13 +14,13 @@ from types import MappingProxyType
 
 from twisted.internet.interfaces import IDelayedCall, IReactorTime
 
+from middleware.entangled.background import cancel
 from middleware.entangled.contact import Contact
 from middleware.entangled.identity import exchange_key
 from middleware.entangled.listeners import Listeners
 from middleware.entangled.network.network import Address, Network, is_relayed
-from middleware.entangled.wire.congestion import BACK_OFF, FIRST_GUESS, LONGEST, RoundTrip
+from middleware.entangled.wire.congestion import BACK_OFF, FIRST_GUESS, LONGEST, Loss, RoundTrip
 from middleware.entangled.wire.door import OPEN, Door
-from middleware.entangled.wire.loss import Loss
 from middleware.entangled.wire.session import INDEX_BYTES, Credentials, Hello, Invitation, Session
 
 STRANGER_WAIT = 0.3
@@ -551,10 +551,7 @@ class Peers:
     def _prepare_help(self, opening: Opening, address: Address) -> None:
         if self.is_far(address):
             wait = 0.0 if is_relayed(address) else HELP_S
-            opening.helper = self._clock.callLater(wait, self._call_for_help, opening)
-
-    def _call_for_help(self, opening: Opening) -> None:
-        self.on_silence(opening)
+            opening.helper = self._clock.callLater(wait, self.on_silence, opening)
 
     def _is_lively_and_direct(self, session: Session) -> bool:
         is_lively = self._clock.seconds() - session.heard_at < LIVELY_S
@@ -571,9 +568,3 @@ class Peers:
     def _end(self, sessions: Iterable[Session]) -> None:
         for session in sessions:
             self.sessions.pop(session.local_index, None)
-
-
-def cancel(timer: IDelayedCall | None) -> None:
-    """Cancel a timer that may be none, or over."""
-    if timer is not None and timer.active():
-        timer.cancel()

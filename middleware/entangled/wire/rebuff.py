@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Literal
 
+from middleware.entangled.bounded import keep
+
 MAX_REBUFFS = 64
 """Rebuffs that are remembered; the one that happened longest ago goes first."""
 HOUR = 3600.0
@@ -43,14 +45,12 @@ class Rebuffs:
 
     def met(self, who: bytes, address: str, side: Side, code: str, reason: str, now: float) -> None:
         """Take note of a refusal."""
-        known = self._known.pop((who, side, code), None)
+        known = self._known.get((who, side, code), None)
         if known is None or now - known.last_at > HOUR:
             met = Rebuff(who, address, side, code, reason, now, now)
         else:
             met = replace(known, address=address, last_at=now, count=known.count + 1)
-        self._known[who, side, code] = met
-        if len(self._known) > MAX_REBUFFS:
-            del self._known[next(iter(self._known))]
+        keep(self._known, (who, side, code), met, MAX_REBUFFS)
 
     def newest(self, now: float, span: float = HOUR) -> list[Rebuff]:
         """Those of the last ``span`` seconds, the newest first."""

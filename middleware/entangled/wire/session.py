@@ -20,8 +20,7 @@ from typing import NamedTuple
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import Forged
 from middleware.entangled.identity import Identity, exchange_key
-from middleware.entangled.network.address import ADDRESS, address_of, packed_address
-from middleware.entangled.network.network import MAX_DATAGRAM, Address
+from middleware.entangled.network.network import ADDRESS, MAX_DATAGRAM, Address, address_of, packed_address
 from middleware.entangled.wire.door import NONCE, UNCOUNTED, Life, is_refusal
 from middleware.entangled.wire.noise import (
     FIRST_OVERHEAD,
@@ -383,34 +382,25 @@ class HalfOpen:
         return response if made_at > now - RESPONSES_S else None
 
     def add(self, session: Session, now: float) -> None:
-        """Keep a new session, and let go of those that are too many or too old."""
-        unconfirmed = self._unconfirmed
-        self._sessions[session.local_index] = unconfirmed[session.local_index] = session
-        self._expire(now)
+        """Keep a new session, and let go of what is too much or too old."""
+        self._sessions[session.local_index] = self._unconfirmed[session.local_index] = session
+        self.sweep(now)
+
+    def answered(self, init: bytes, response: bytes, now: float) -> None:
+        """Keep the RESP of an INIT, and let go of what is too much or too old."""
+        self._responses.pop(ephemeral_of(init), None)
+        self._responses[ephemeral_of(init)] = (now, response)
+        self.sweep(now)
 
     def sweep(self, now: float) -> None:
-        """Let go of what is too old."""
-        self._expire(now)
-        self._tidy(now)
-
-    def _expire(self, now: float) -> None:
-        unconfirmed = self._unconfirmed
+        """Let go of what is too much or too old."""
+        unconfirmed, responses = self._unconfirmed, self._responses
         while unconfirmed:
             index, oldest = next(iter(unconfirmed.items()))
             if len(unconfirmed) <= MAX_UNCONFIRMED and oldest.opened_at > now - UNCONFIRMED_S:
                 break
             del unconfirmed[index]
             self._sessions.pop(index, None)
-
-    def answered(self, init: bytes, response: bytes, now: float) -> None:
-        """Keep the RESP of an INIT, and let go of those that are too many or too old."""
-        responses = self._responses
-        responses.pop(ephemeral_of(init), None)
-        responses[ephemeral_of(init)] = (now, response)
-        self._tidy(now)
-
-    def _tidy(self, now: float) -> None:
-        responses = self._responses
         while responses:
             ephemeral, (made_at, _) = next(iter(responses.items()))
             if len(responses) <= MAX_RESPONSES and made_at > now - RESPONSES_S:

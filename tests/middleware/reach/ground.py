@@ -83,7 +83,8 @@ class Ground:
 
     def way(self, a: EntangledNode, b: EntangledNode) -> str:
         """How ``a`` reaches ``b`` now."""
-        return a.reach.ways.way(b.contact)
+        kind = a.reach.ways.passage(b.contact).kind
+        return kind if kind in ("none", "carried") else "direct"
 
     def call(self, a: EntangledNode, contact: Contact, timeout: float | None = None) -> tuple[Any, float]:
         """What ``a`` is answered, and after how many seconds."""

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import random
 from typing import Any
 
-from middleware.entangled.contact import Contact, unpacked
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.entangled.clock import HeapClock
+from middleware.entangled.contact import Contact
 from middleware.entangled.errors import Refused
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.network import Address, relayed
 from middleware.entangled.network.switchboard import Weather
-from middleware.entangled.reach.allowance import MEETS, MEETS_AT_ONCE
-from middleware.entangled.reach.known import MAX_KNOWN
-from middleware.entangled.wire.peer import KNOCKS, MAX_DOORS
+from middleware.entangled.reach.candidate import MAX_CANDIDATES, is_loopback, is_near, packed, unpacked
+from middleware.entangled.reach.introducer import INTRODUCTIONS, MEETS, MEETS_AT_ONCE, Allowance
 from tests.middleware.reach.ground import GroundCase
 
 INTRODUCE, MEET = "reach.introduce", "reach.meet"
@@ -84,31 +85,6 @@ class HostileTests(GroundCase):
         self.assertEqual(self.flushLoggedErrors(), [])
         self.assertEqual(self.asked("echo", 3), 3)
 
-    def test_knocking_for_others_is_bounded(self) -> None:
-        """One who introduces strangers without end makes a node knock at a few addresses, some times a second."""
-        sent = self.g.board.counters["unheard"]
-        rng = random.Random(1)
-        for _ in range(200):
-            hosts = [[f"203.0.114.{rng.randrange(1, 255)}", 7000] for _ in range(50)]
-            stranger = Identity(rng.randbytes(32)).public
-            self.a.call(self.g.met_at(self.b), MEET, stranger, hosts, 0, changes=True).addErrback(lambda failure: None)
-            self.g.run(0.005)
-        self.g.run(30.0)
-        reach = self.b.reach
-        for table in (
-            reach._known,
-            reach.acquaintances,
-            reach._carriers,
-            reach._upgrades,
-            reach._allowance,
-            reach.outside._seen,
-        ):
-            self.assertLessEqual(len(table), MAX_KNOWN)
-        knocks = self.g.board.counters["unheard"] - sent
-        self.assertLess(knocks, (MEETS_AT_ONCE + 30 * MEETS) * MAX_DOORS * 2 * KNOCKS)
-        self.assertGreater(knocks, 0)
-        self.assertEqual(len(self.b.endpoint.peers._openings), 0)
-
     def test_liars_are_outdone(self) -> None:
         """An introducer that makes up addresses keeps nobody from those that the others tell."""
         made_up = [[f"203.0.114.{n}", 7000] for n in range(20)]
@@ -121,13 +97,6 @@ class HostileTests(GroundCase):
         assert contact is not None
         self.assertEqual(self.g.call(c, contact)[0], 7)
 
-    def test_ways_of_others(self) -> None:
-        """An address that means something only to who says it arrives as the way that others carry."""
-        public = self.b.identity.public
-        for host in ("~wss-0123456789ab", relayed(bytes(20)).host, "~"):
-            contact = unpacked([public, host, 1])
-            self.assertEqual(contact, Contact(public, relayed(self.b.identity.node_id)))
-
     def test_nobody_to_ask(self) -> None:
         """A carried way that nobody knows fails as any silence does, and leaves nothing behind."""
         stranger = Identity(b"s" * 32)
@@ -139,26 +108,6 @@ class HostileTests(GroundCase):
         self.g.run(6.0)
         self.assertEqual(len(self.a.endpoint.peers._openings), 0)
 
-    def test_own_address(self) -> None:
-        """A node learns from a peer how it looks from outside."""
-        c = self.g.at("c", "full")
-        self.g.run(1.0)
-        self.assertEqual(c.reach.outside.seen_as(self.g.nodes["pub"].contact), Address(self.g.routers["c"].host, 7000))
-        self.assertEqual(self.a.reach.outside.addresses, [self.a.contact.address])
-
-    def test_noise_inside_sessions(self) -> None:
-        """Whatever a member puts behind the first bytes of carrying and mirrors, nothing is raised."""
-        peer = self.a.endpoint.peers.known(self.b.identity.public)
-        assert peer is not None and peer.session is not None
-        rng = random.Random(7)
-        for kind in (0x03, 0x05, 0x06, 0x07):
-            for length in range(80):
-                self.a.endpoint.send_inside(peer.session, bytes([kind]) + rng.randbytes(length))
-                self.g.run(0.01)
-        self.g.run(5.0)
-        self.assertEqual(self.flushLoggedErrors(), [])
-        self.assertEqual(self.asked("echo", 3), 3)
-
     def test_outside(self) -> None:
         """Behind a symmetric router two peers see two ports, behind others one and the same."""
         for site, kind, ports in (("c", "port", 1), ("d", "sym", 2)):
@@ -166,3 +115,70 @@ class HostileTests(GroundCase):
             self.g.run(2.0)
             self.assertGreaterEqual(len({address.port for address in c.reach.outside.addresses}), ports)
             self.assertEqual({address.host for address in c.reach.outside.addresses}, {self.g.routers[site].host})
+
+
+ASKER, OTHER, STRANGER = b"a" * 32, b"o" * 32, b"s" * 32
+
+
+class AllowanceTests(SynchronousTestCase):
+    """Behaviour of ``Allowance``."""
+
+    def setUp(self) -> None:
+        """An allowance of which nobody has used anything."""
+        self.clock = HeapClock()
+        self.allowance = Allowance(self.clock)
+
+    def test_each_peer_has_its_own(self) -> None:
+        """Who has used up its introductions waits for the next one, and keeps nobody else from any."""
+        granted = [self.allowance.may_introduce(ASKER) for _ in range(int(2 * INTRODUCTIONS) + 1)]
+        self.assertEqual((sum(granted), granted[-1]), (2 * INTRODUCTIONS, False))
+        self.assertTrue(self.allowance.may_introduce(OTHER))
+        self.assertTrue(self.allowance.may_meet(ASKER))
+        self.clock.advance(1.01 / INTRODUCTIONS)
+        self.assertEqual([self.allowance.may_introduce(ASKER) for _ in range(2)], [True, False])
+
+    def test_who_is_met_does_not_count(self) -> None:
+        """What an introducer used up comes back once for each peer that answers, and at the pace of strangers else."""
+        while self.allowance.may_meet(ASKER):
+            self.allowance.introduced(STRANGER, ASKER)
+        for public, again in ((OTHER, False), (STRANGER, True), (STRANGER, False)):
+            self.allowance.met(public)
+            self.assertEqual(self.allowance.may_meet(ASKER), again)
+        self.clock.advance(2 * MEETS_AT_ONCE / MEETS)
+        granted = [self.allowance.may_meet(ASKER) for _ in range(int(2 * MEETS_AT_ONCE))]
+        self.assertEqual(sum(granted), MEETS_AT_ONCE)
+
+
+class CandidateTests(SynchronousTestCase):
+    """Behaviour of the functions of ``candidate``."""
+
+    def test_there_and_back(self) -> None:
+        """Addresses of both families come back as they went, each once, and no more than there may be."""
+        addresses = [Address("203.0.113.1", 7000), Address("2001:db8::1", 1), Address("192.168.1.2", 65535)]
+        self.assertEqual(unpacked(packed([*addresses, *addresses])), addresses)
+        many = [Address("203.0.113.1", port) for port in range(1, 50)]
+        self.assertEqual(unpacked([list(address) for address in many]), many[:MAX_CANDIDATES])
+
+    def test_what_no_peer_can_have(self) -> None:
+        """Groups, any, all, names, carried ways, odd ports and what is no list at all are left out."""
+        hosts = ["224.0.0.1", "ff02::1", "0.0.0.0", "::", "255.255.255.255", "localhost", "~" + "0" * 40, "", "1" * 99]
+        for host in hosts:
+            self.assertEqual(unpacked([[host, 7000]]), [], host)
+        odd: list[object] = [None, 7, "x", [7], [[]], [["203.0.113.1"]], [["203.0.113.1", 0]], [["203.0.113.1", "7"]]]
+        for fields in odd:
+            self.assertEqual(unpacked(fields), [], repr(fields))
+        self.assertEqual(unpacked([["203.0.113.1", 65536], [b"203.0.113.1", 1], ["203.0.113.1", True]]), [])
+
+    def test_near(self) -> None:
+        """One machine and one site's own network are near; public hosts, other sites and other families are not."""
+        near = [("127.0.0.1", "192.168.1.2"), ("192.168.1.9", "192.168.1.2"), ("10.0.7.1", "10.0.9.1")]
+        near += [("203.0.113.1", "203.0.113.1"), ("fe80::1", "fe80::2"), ("fd00::1", "fd00::2")]
+        far = [("203.0.113.1", "203.0.113.2"), ("192.168.1.2", "10.0.0.1"), ("192.168.1.2", "192.169.1.2")]
+        far += [("10.1.0.1", "10.2.0.1"), ("2001:db8::1", "2001:db8::2"), ("::ffff", "1.2.3.4"), ("x", "127.0.0.1")]
+        self.assertEqual([pair for pair in near if not is_near(*pair)], [])
+        self.assertEqual([pair for pair in far if is_near(*pair)], [])
+        self.assertEqual(
+            [is_loopback(host) for host in ("127.0.0.9", "::1", "10.0.0.1", "x")], [True, True, False, False]
+        )
+        self.assertFalse(is_near("10.0.7.1", "10.0.9.1", is_translated=True))
+        self.assertTrue(is_near("10.0.9.7", "10.0.9.1", is_translated=True))

@@ -5,10 +5,14 @@ from __future__ import annotations
 import random
 from typing import Any
 
+from twisted.trial.unittest import SynchronousTestCase
+
 from middleware.entangled.contact import Contact
 from middleware.entangled.network.network import Address, relayed
 from middleware.entangled.network.switchboard import Weather
 from middleware.entangled.node import EntangledNode
+from middleware.entangled.reach.passage import Passage, kind_of
+from middleware.entangled.reach.way import HELD_S, MAX_FRESH, SHUT_S
 from middleware.entangled.wire.noise import TransportKeys
 from middleware.entangled.wire.peer import Peer
 from middleware.entangled.wire.session import Session
@@ -77,23 +81,18 @@ class WeatherTests(GroundCase):
         self.assertLessEqual(len(late), 2, late)
 
     def test_leaky_routers(self) -> None:
-        """Routers that early knocks spoil are reached within 5 s, punched from fresh ports."""
+        """Routers that early knocks spoil are reached within 5 s, punched from fresh ports, however far one of them."""
         for one, other in (("leaky", "leaky"), ("leaky", "port"), ("port", "leaky")):
-            ground = self.ground()
-            way, seconds = ways(ground, one, other)
-            self.assertLess(seconds, 5.0, f"{one} and {other}")
-            ground.run(5.0)
-            a, b = ground.nodes["a2"], ground.nodes["b2"]
-            self.assertEqual((one, other, ground.way(a, b)), (one, other, "direct"))
-
-    def test_staggered_start(self) -> None:
-        """One a quarter of a second farther away, so that knocks come early: reached within 5 s all the same."""
-        for one, other in (("leaky", "leaky"), ("leaky", "port"), ("port", "leaky")):
-            ground = self.ground()
-            ground.site("b", other)
-            ground.board.router_weather[ground.routers["b"]] = Weather(delay_s=0.25)
-            _, seconds = ways(ground, one, other)
-            self.assertLess(seconds, 5.0, f"{one} and {other}")
+            for delay_s in (0.015, 0.25):
+                ground = self.ground()
+                ground.site("b", other)
+                ground.board.router_weather[ground.routers["b"]] = Weather(delay_s)
+                _, seconds = ways(ground, one, other)
+                self.assertLess(seconds, 5.0, f"{one} and {other}")
+                ground.run(5.0)
+                if delay_s < 0.1:
+                    way = ground.way(ground.nodes["a2"], ground.nodes["b2"])
+                    self.assertEqual((one, other, way), (one, other, "direct"))
 
     def test_late_words(self) -> None:
         """One side hears half a second late of the other: reached at once by who carries, and directly later on."""
@@ -112,19 +111,6 @@ class WeatherTests(GroundCase):
                     ground.run(1.0)
                     ways_seen.add(ground.way(ground.nodes["a2"], ground.nodes["b2"]))
                 self.assertEqual((one, other, late, ways_seen), (one, other, late, {"direct"}))
-
-    def test_neighbours_behind_one_router(self) -> None:
-        """Two nodes behind one router that has no hairpin find each other by their own addresses."""
-        for kind in ("full", "port", "sym"):
-            ground = self.ground()
-            a = ground.at("a", kind, 2)
-            ground.run(2.0)
-            b = ground.at("a", kind, 3)
-            ground.run(1.5)
-            for one, other in ((a, b), (b, a)):
-                peer = one.endpoint.peers.known(other.identity.public)
-                assert peer is not None and peer.session is not None
-                self.assertEqual(peer.session.contact.address, other.contact.address)
 
     def test_routers_within_a_private_net(self) -> None:
         """Routers whose outside is a private net too, of the same first bytes as the inside, are punched as others."""
@@ -229,9 +215,15 @@ class CarriedTests(GroundCase):
         return a, b
 
     def test_direct_as_soon_as_it_can_be(self) -> None:
-        """When the routers get better, a carried pair goes direct by itself, and nothing is carried any more."""
+        """A carried pair can say much to each other, and goes direct by itself when its routers get better."""
         ground = self.ground()
         a, b = self.carried(ground)
+        session = a.endpoint.peers.session(b.identity.public)
+        assert session is not None
+        large, got = random.Random(1).randbytes(20_000), list[Any]()
+        a.call(session.contact, "echo", large).addBoth(got.append)
+        ground.run(5.0)
+        self.assertEqual(got, [large])
         for router in ground.routers.values():
             router.kind = "port"
         ground.run(70.0)
@@ -255,18 +247,6 @@ class CarriedTests(GroundCase):
             while ground.call(a, to_b)[0] != 7:
                 self.assertLess(ground.clock.seconds() - began, 5.0)
             self.assertLess(ground.clock.seconds() - began, 5.0)
-
-    def test_parcels_are_carried(self) -> None:
-        """What fills whole datagrams is carried as well: 20 kB come back as they went."""
-        ground = self.ground()
-        a, b = self.carried(ground)
-        peer = a.endpoint.peers.known(b.identity.public)
-        assert peer is not None and peer.session is not None
-        large = random.Random(1).randbytes(20_000)
-        got: list[Any] = []
-        a.call(peer.session.contact, "echo", large).addBoth(got.append)
-        ground.run(5.0)
-        self.assertEqual(got, [large])
 
     def test_who_hears_of_it_reaches_it(self) -> None:
         """A carried peer that others are told of is reached by them: directly where they can be seen, else carried."""
@@ -325,3 +305,94 @@ def _reached_again(ground: Ground, asked: EntangledNode, asker: EntangledNode) -
             return ground.clock.seconds() - began
         ground.run(0.2)
     return float("inf")
+
+
+class FreshPortTests(GroundCase):
+    """Behaviour of ``FreshPorts``, of a node that nobody needs one for."""
+
+    def test_so_many_and_no_more(self) -> None:
+        """Where all are open there is another one only when the oldest is of no use any more, in its place."""
+        ground = self.ground()
+        ports = ground.at("a", "none").reach._ports
+        opened = [ports.open() for _ in range(MAX_FRESH)]
+        self.assertEqual((len(set(opened)), ports.open()), (MAX_FRESH, 0))
+        ground.run(HELD_S + 0.1)
+        another = ports.open()
+        self.assertNotEqual(another, 0)
+        self.assertEqual(len(ports), MAX_FRESH)
+        self.assertIn(another, ports)
+        self.assertEqual([port in ports for port in opened], [False] + [True] * (MAX_FRESH - 1))
+
+    def test_unused_ones_are_shut(self) -> None:
+        """A fresh port that led nowhere is closed after a while, and not before."""
+        ground = self.ground()
+        reach = ground.at("a", "none").reach
+        reach._open_port()
+        ground.run(SHUT_S - 1.0)
+        self.assertEqual(len(reach._ports), 1)
+        ground.run(3.0)
+        self.assertEqual(len(reach._ports), 0)
+
+
+OWN = Address("192.168.1.7", 8484)
+
+
+class KindTests(SynchronousTestCase):
+    """Behaviour of ``kind_of``."""
+
+    def test_each_kind_of_address(self) -> None:
+        """Who carries, tunnels or loops back shows in the address; a far one that was introduced is punched."""
+        kinds = {
+            "carried": relayed(bytes(20)),
+            "tunnel": Address("~wss-0123456789ab", 1),
+            "machine": Address("127.0.0.1", 7000),
+            "lan": Address("192.168.1.9", 8484),
+            "direct": Address("203.0.113.9", 8484),
+        }
+        self.assertEqual([kind_of(address, OWN, False, False) for address in kinds.values()], list(kinds))
+        self.assertEqual(kind_of(OWN, OWN, False, False), "machine")
+        introduced = [kind_of(kinds[kind], OWN, False, True) for kind in ("lan", "direct")]
+        self.assertEqual(introduced, ["lan", "punched"])
+
+
+class PassageTests(GroundCase):
+    """Behaviour of ``Ways.passage``, over routers in memory."""
+
+    def passage(self, a: EntangledNode, b: EntangledNode) -> Passage:
+        """How one reaches the other."""
+        return a.reach.ways.passage(b.contact)
+
+    def test_kinds(self) -> None:
+        """Two behind cone routers are punched, two behind symmetric ones carried, two of one site on their LAN."""
+        carrier = self.ground().nodes["pub"].identity.node_id
+        for one, other, site, kind in (
+            ("port", "port", "b", "punched"),
+            ("sym", "sym", "b", "carried"),
+            ("sym", "sym", "a", "lan"),
+        ):
+            ground = self.ground()
+            a = ground.at("a", one)
+            ground.run(2.0)
+            b = ground.at(site, other, 3)
+            self.assertEqual(self.passage(a, b), Passage("none"))
+            ground.run(6.0)
+            for near, far in ((a, b), (b, a)):
+                passage = self.passage(near, far)
+                self.assertEqual((passage.kind, passage.by), (kind, carrier if kind == "carried" else b""))
+            self.assertEqual(self.passage(a, ground.nodes["pub"]).kind, "direct")
+
+    def test_since(self) -> None:
+        """A way is as old as it is, whatever sessions succeed each other; one that was lost begins anew."""
+        ground = self.ground()
+        a, pub = ground.nodes["pub"], ground.at("b", "none")
+        began = ground.clock.seconds()
+        ground.run(60.0)
+        since = self.passage(a, pub).since
+        assert since is not None
+        self.assertLess(abs(since - began), 1.0)
+        a.endpoint.reopen(pub.contact)
+        ground.run(10.0)
+        self.assertEqual(self.passage(a, pub).since, since)
+        pub.vanish()
+        ground.run(60.0)
+        self.assertNotIn(pub.identity.public, a.reach.ways._passages)

@@ -17,9 +17,10 @@ from middleware.consensus.strategy import Report
 from middleware.entangled.errors import Refused
 from middleware.entangled.kademlia.distance import closest
 from middleware.entangled.network.switchboard import Weather
+from middleware.entangled.wire import asker
 from middleware.entangled.wire.door import ROLE
 from middleware.entangled.wire.message import Failure
-from middleware.entangled.wire.method import ErrorCodes
+from middleware.entangled.wire.method import error_of
 from middleware.node import SwarmNode
 from middleware.tasks.task import MEMBER, Task, group_key
 from tests.fleet import FleetCase, SwarmFleet
@@ -105,14 +106,13 @@ class DisseminationTests(AuctionCase):
         outside = [node for node in fleet.nodes if node.entangled.identity.node_id not in council]
         [known] = closest([node.entangled.contact for node in outside], group_key("job"), 1)
         refused: list[str] = []
-        answered = ErrorCodes.error
 
-        def noted(codes: ErrorCodes, failure: Failure) -> Exception:
+        def noted(failure: Failure) -> Exception:
             refused.append(failure.text)
-            return answered(codes, failure)
+            return error_of(failure)
 
         self.patch(party, "MAX_CHILDREN", 2)
-        self.patch(ErrorCodes, "error", noted)
+        self.patch(asker, "error_of", noted)
         for node in outside:
             around = replace(node.dissemination._around, contacts=lambda: [known])
             node.dissemination._around = around

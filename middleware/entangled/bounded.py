@@ -1,0 +1,17 @@
+"""Bounded: tables of what is known of others, who may be any number."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable
+from typing import TypeVar
+
+Key = TypeVar("Key", bound=Hashable)
+Value = TypeVar("Value")
+
+
+def keep(table: dict[Key, Value], key: Key, value: Value, most: int) -> None:
+    """Put ``value`` at the end of a table, and drop its first entry where it has more than ``most``."""
+    table.pop(key, None)
+    table[key] = value
+    if len(table) > most:
+        del table[next(iter(table))]
