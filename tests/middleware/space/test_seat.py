@@ -102,21 +102,6 @@ class SeatTests(SynchronousTestCase):
         assert reply is not None
         return reply.kind
 
-    def test_votes_survive_a_restart(self) -> None:
-        """The next life on the same store is the same member: what was accepted and what is leased still holds."""
-        life = self.seat.incarnation
-        self.claim(place(1))
-        self.confirm(place(1))
-        self.claim(place(2), lease=5.0)
-        self.clock.advance(100.0)
-        self.seat = self.made(2)
-        self.assertEqual(self.seat.incarnation, life)
-        vote = self.seat.vote(place(1))
-        self.assertEqual(vote and vote.value, b"a")
-        self.assertEqual(self.claim(place(2), 2, b"b"), Kind.HELD)
-        self.clock.advance(5.0)
-        self.assertEqual(self.claim(place(2), 2, b"b"), Kind.GRANTED)
-
     def test_lost_memory_is_another_life(self) -> None:
         """A member whose store is empty or rotten has another incarnation, and refuses what counts on the old one."""
         life = self.seat.incarnation
@@ -146,11 +131,6 @@ class SeatTests(SynchronousTestCase):
         for question in wrong:
             self.assertRaises(Refused, self.seat.answer_claim, PEER, *question)
         self.assertRaises(Refused, self.seat.answer_confirm, PEER, KEY, [where], life, 1, b"a", b"")
-        self.assertEqual(len(self.seat), 0)
-
-    def test_confirm_needs_a_claim(self) -> None:
-        """A confirm of what was never promised here is refused and not remembered."""
-        self.assertEqual(self.confirm(place(1)), Kind.UNPREPARED)
         self.assertEqual(len(self.seat), 0)
 
     def test_nothing_is_promised_about_what_is_over(self) -> None:
@@ -210,40 +190,6 @@ class SeatTests(SynchronousTestCase):
         disk.callback(None)
         self.assertEqual(self._kind(self.successResultOf(answer), Event.PREPARE), Kind.GRANTED)
 
-    def test_release(self) -> None:
-        """A released lease lets the next one in; what was released is over, and nobody releases for another."""
-        self.claim(place(1), lease=50.0)
-        self.release(place(1), 1, b"b")
-        self.assertEqual(self.claim(place(1), 2, b"b"), Kind.HELD)
-        self.release(place(1), 1, b"a")
-        self.assertEqual((self.confirm(place(1)), self.claim(place(1))), (Kind.OUTBID, Kind.OUTBID))
-        self.assertEqual(self.claim(place(1), 2, b"b"), Kind.GRANTED)
-
-    def release(self, where: Place, counter: int, taker: bytes) -> None:
-        """Give a claim back."""
-        self.seat.answer_release(PEER, KEY, [where.packed()], self.seat.incarnation, counter, taker)
-
-    def test_lower_ballots(self) -> None:
-        """What is lower than what was promised gets no promise and is not accepted, nor after a restart."""
-        self.claim(place(1), 5, b"b", lease=0.5)
-        for _ in range(2):
-            self.clock.advance(1.0)
-            self.assertEqual((self.claim(place(1), 4, b"a"), self.confirm(place(1), 5, b"a")), (Kind.OUTBID,) * 2)
-            self.seat = self.made(2)
-        self.assertEqual(self.confirm(place(1), 5, b"b"), Kind.GRANTED)
-
-    def test_a_claim_keeps_others_out(self) -> None:
-        """A claim is renewed by its taker alone, ends in time, and stands against no ballot that has won elsewhere."""
-        self.claim(place(1), 1, b"a", lease=2.0)
-        self.clock.advance(1.5)
-        self.assertEqual(self.claim(place(1), 2, b"b"), Kind.HELD)
-        self.assertEqual(self.claim(place(1), 3, b"a"), Kind.GRANTED)
-        self.clock.advance(1.5)
-        self.assertEqual(self.claim(place(1), 4, b"b"), Kind.HELD)
-        self.clock.advance(0.5)
-        self.assertEqual(self.claim(place(1), 4, b"b"), Kind.GRANTED)
-        self.assertEqual(self.confirm(place(1), 5, b"c"), Kind.GRANTED)
-
     def test_what_was_accepted_is_told(self) -> None:
         """A later claimant is told what to complete, once the one before it has had a second to finish."""
         self.claim(place(1), 1, b"a", lease=100.0)
@@ -255,12 +201,6 @@ class SeatTests(SynchronousTestCase):
         reply = unpack_reply(told[0], Event.PREPARE)  # type: ignore[index]
         assert reply is not None
         self.assertEqual((reply.accepted, reply.value), (Ballot(1, b"a"), b"a"))
-
-    def test_numbers_are_bounded(self) -> None:
-        """A claimant cannot use up the ballots of a tuple."""
-        self.assertEqual(self.claim(place(1), 2**48 - 1), Kind.OUTBID)
-        self.assertEqual(self.claim(place(1), 1), Kind.GRANTED)
-        self.assertEqual(self.confirm(place(1), 2**48 - 1), Kind.OUTBID)
 
     @settings(max_examples=300, deadline=None, derandomize=True, database=None)
     @given(foreign=FOREIGN, noise=st.binary(max_size=60))

@@ -36,16 +36,6 @@ class TakesTests(SynchronousTestCase):
         """So it is with records that are replicated by whole nodes, some of which die, over a wire that loses some."""
         self._checked(Trial(1, 15, 0.1, True, nodes=10))
 
-    def test_replay(self) -> None:
-        """The same seed makes the same run, to the last datagram."""
-        digests = []
-        for _ in range(2):
-            trial = LightTrial(5, 40, 0.2, True)
-            trial.play()
-            trial.stop()
-            digests.append(trial.board.digest())
-        self.assertEqual(digests[0], digests[1])
-
     def test_members_that_lost_their_memory_keep_silent(self) -> None:
         """A member that comes back without its votes has no say about older tuples, so none is confirmed twice."""
         for seed in range(30, 32):
