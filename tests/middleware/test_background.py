@@ -53,14 +53,6 @@ class BackgroundTests(SynchronousTestCase):
         self.assertNoResult(sleep)
         self.assertEqual(self.runs, [])
 
-    def test_sleep(self) -> None:
-        """Who sleeps is woken in time."""
-        sleep = self.chores.sleep(1.0)
-        self.clock.advance(0.9)
-        self.assertNoResult(sleep)
-        self.clock.advance(0.2)
-        self.successResultOf(sleep)
-
     def test_fork_hears_only_accidents(self) -> None:
         """The weather and a refusal end work quietly, anything else is logged."""
         for error in (NoAnswer("x"), Refused("x"), ZeroDivisionError()):

@@ -65,15 +65,6 @@ class PathCacheTests(SynchronousTestCase):
         self.cache.put(self.key, copied(self.key, 2 * half), 9.0, 9.0)
         self.assertIsNotNone(self.cache.get(self.key, 9.0))
 
-    def test_a_new_copy_replaces_the_old_one(self) -> None:
-        """The copy that came last is the one under its key, for its own time; one that is not kept leaves none."""
-        newer = copied(self.key, 2)
-        self.cache.put(self.key, copied(self.key), 30.0, 0.0)
-        self.cache.put(self.key, newer, 9.0, 0.0)
-        self.assertEqual(self.cache.get(self.key, 8.9), newer)
-        self.cache.put(self.key, copied(self.key, MAX_BYTES), 30.0, 8.9)
-        self.assertIsNone(self.cache.get(self.key, 8.9))
-
     def held(self, keys: list[bytes]) -> list[int]:
         """Which of ``keys`` have a copy, by number; each of these is then read, in that order."""
         return [number for number, key in enumerate(keys) if self.cache.get(key, 0.0) is not None]

@@ -8,7 +8,7 @@ import time
 from twisted.internet.base import ReactorBase
 from twisted.internet.error import AlreadyCalled, AlreadyCancelled
 from twisted.internet.interfaces import IDelayedCall, IReactorTime
-from twisted.trial.unittest import SkipTest, SynchronousTestCase
+from twisted.trial.unittest import SynchronousTestCase
 from zope.interface.verify import verifyObject
 
 from middleware.entangled.clock import HeapClock, boot_time, use_monotonic_time
@@ -67,10 +67,6 @@ class HeapClockTests(SynchronousTestCase):
         self.assertRaises(AlreadyCancelled, gone.reset, 1)
         self.assertEqual(self.clock.getDelayedCalls(), [])
 
-    def test_refuses_the_past(self) -> None:
-        """A negative delay is an error of the caller."""
-        self.assertRaises(ValueError, self.clock.callLater, -1, self.called.append, 1)
-
     def test_exception_passes(self) -> None:
         """An exception of a call reaches whoever moves the time, and the clock stands at that call."""
         self.clock.callLater(1, int, "x")
@@ -120,12 +116,8 @@ class MonotonicTests(SynchronousTestCase):
         before = boot_time()()
         self.assertLessEqual(before, ReactorBase.seconds())
         self.assertLess(ReactorBase.seconds(), before + 1.0)
-
-    def test_boot_time_counts_suspension(self) -> None:
-        """Where the system counts the seconds in which it was suspended, so does the clock of leases and timers."""
-        if not hasattr(time, "CLOCK_BOOTTIME"):
-            raise SkipTest("no CLOCK_BOOTTIME here")
-        self.assertAlmostEqual(boot_time()(), time.clock_gettime(time.CLOCK_BOOTTIME), 1)
+        if hasattr(time, "CLOCK_BOOTTIME"):  # it counts the seconds in which the machine was suspended
+            self.assertAlmostEqual(boot_time()(), time.clock_gettime(time.CLOCK_BOOTTIME), 1)
 
     def test_leap(self) -> None:
         """After a suspension the clock has moved on, and what came due meanwhile is done once, late."""

@@ -57,16 +57,6 @@ class WriteConcernTests(ConcernCase):
         self.assertEqual((error.acknowledged, error.needed), (2, 3))
         self.assertEqual(self.done(fleet, fleet.nodes[3].put(KEY, "c", b"x", "team", "one")) >= 1, True)
 
-    def test_the_minority_stays_one(self) -> None:
-        """However small the rest looks to it, a cut-off node takes itself for a minority while the cut may heal."""
-        fleet = self.fleet(5)
-        self.cut(fleet, 4)
-        fleet.run(60.0)
-        self.assertEqual(len(fleet.nodes[4].overlay.roster), 0)
-        self.failure(fleet, fleet.nodes[4].put(KEY, "a", b"x"), NotAcknowledged)
-        self.failure(fleet, fleet.nodes[4].get(KEY), Unavailable)
-        self.assertGreaterEqual(self.done(fleet, fleet.nodes[0].put(KEY, "a", b"x")), 3)
-
     def test_one_after_the_other_may_die(self) -> None:
         """A majority that is in touch goes on without the dead, until two of five are left; then writes still work."""
         fleet = self.fleet(5)
@@ -74,15 +64,6 @@ class WriteConcernTests(ConcernCase):
             fleet.nodes[place].vanish()
             fleet.run(50.0)
         self.assertEqual(self.done(fleet, fleet.nodes[0].put(KEY, "a", b"x")), 2)
-
-    def test_what_failed_spreads_when_all_are_back(self) -> None:
-        """A write without a majority is not forgotten: its owner brings it to the others when they are back."""
-        fleet = self.fleet(3)
-        self.cut(fleet, 0)
-        self.failure(fleet, fleet.nodes[0].put(KEY, "a", b"x"), NotAcknowledged)
-        fleet.board.heal()
-        fleet.run(20.0)
-        self.assertEqual(self.values(fleet, 2), [b"x"])
 
 
 class CompareAndSetTests(ConcernCase):
@@ -256,18 +237,6 @@ class AbsenceTests(ConcernCase):
         node.join([])
         fleet.run(31.0)
         return node
-
-    def test_numbers_outlive_a_restart(self) -> None:
-        """A node that does not hold its own records numbers on after a restart, past what it ever gave."""
-        fleet = self.fleet(2)
-        numbers = [self.done(fleet, fleet.nodes[0].put(KEY, "a", b"x")).sequence for _ in range(3)]
-        fleet.nodes[0].vanish()
-        for one in fleet.stores[0].records():
-            fleet.stores[0].discard(one.slot)
-        fleet.restart(0, [1])
-        fleet.run(1.0)
-        made = fleet.nodes[0]._owner.next(KEY, "b", b"x", "team")
-        self.assertGreater(made.sequence, max(numbers))
 
     def test_what_is_given_on_keeps_its_age(self) -> None:
         """A record that is handed on lives as long as it would have where it came from, and no longer."""

@@ -30,10 +30,6 @@ class IdentityTest(SynchronousTestCase):
         self.assertEqual(len(DOG.node_id), ID_BYTES)
         self.assertNotEqual(DOG.node_id, CAT.node_id)
 
-    def test_same_seed_same_node(self) -> None:
-        """A node that kept its seed is the same node after a restart."""
-        self.assertEqual(Identity(b"\1" * 32), DOG)
-
     def test_signatures(self) -> None:
         """A signature stands for one message of one node; anything else is refused, whatever its length."""
         signature = DOG.sign(b"sit")

@@ -42,12 +42,6 @@ class KeepsakeTests(SynchronousTestCase):
         self.assertEqual(len(self.store), 0)
         self.assertNotIn(record("b").slot, self.copies)
 
-    def test_an_older_version_may_follow(self) -> None:
-        """Where the view falls back to an older record, so does the copy."""
-        self.copies.keep(KEY, [record("a", 2)], 0.0)
-        self.copies.keep(KEY, [record("a", 1)], 0.0)
-        self.assertEqual(self.store.get(KEY), [record("a", 1)])
-
     def test_what_is_held_is_left_alone(self) -> None:
         """A slot that the node holds as a replica is neither copied nor let go of."""
         self.store.put(record("a"), 5.0)

@@ -142,12 +142,6 @@ class ReplicaTests(SynchronousTestCase):
                 self.clock.advance(0.01)
                 self.assertIn("the disk is full", str(self.failureResultOf(answer, Refused).value))
 
-    def test_full(self) -> None:
-        """A full store says so to the writer."""
-        for number in range(50):
-            self.stored(record(str(number)))
-        self.assertRaises(Refused, self.stored, record("one more"))
-
     def test_lease_runs_out(self) -> None:
         """A lease ends one ttl after the last sign of its owner; a team record makes nobody silent."""
         self.stored(record(lifetime="leased"), record("t"))

@@ -150,14 +150,3 @@ class StreamsTests(SynchronousTestCase):
         self.clock.advance(OPEN_TTL + 0.1)
         self.assertTrue(self.publisher._answer_open(peers[-1], CAMERA))
         self.assertTrue(self.publisher.is_wanted(CAMERA))
-
-    def test_stop(self) -> None:
-        """After the stop nothing is left on the clock, and a frame that still comes is not sent."""
-        self.viewer.look(self.to_publisher, CAMERA, self.see)
-        self.clock.advance(0.1)
-        for endpoint, streams in self.ends:
-            streams.stop()
-            endpoint.stop()
-        self.publisher.offer(CAMERA, 1, b"x")
-        self.clock.advance(0.1)
-        self.assertEqual(self.clock.getDelayedCalls(), [])
