@@ -11,7 +11,6 @@ from middleware.entangled.errors import NoAnswer, Refused
 
 
 async def wait(deferred: Deferred[int]) -> int:
-    """The result of ``deferred``."""
     return await deferred
 
 
@@ -65,7 +64,6 @@ class FirstTests(SynchronousTestCase):
         self.asked: list[Deferred[int]] = [Deferred() for _ in range(3)]
 
     def begin(self, needed: int) -> Deferred[list[int]]:
-        """Wait for ``needed`` of three."""
         return Deferred.fromCoroutine(first(needed, [wait(d) for d in self.asked]))
 
     def test_enough(self) -> None:

@@ -15,8 +15,6 @@ from middleware.entangled.clock import HeapClock, boot_time, use_monotonic_time
 
 
 class HeapClockTests(SynchronousTestCase):
-    """Behaviour of ``HeapClock``."""
-
     def setUp(self) -> None:
         """Make a clock and a list of what was called."""
         self.clock = HeapClock()
@@ -26,15 +24,6 @@ class HeapClockTests(SynchronousTestCase):
         """Clock and call provide what Twisted's interfaces ask for."""
         self.assertTrue(verifyObject(IReactorTime, self.clock))
         self.assertTrue(verifyObject(IDelayedCall, self.clock.callLater(1, self.called.append, 1)))
-
-    def test_calls_in_order(self) -> None:
-        """Calls come by time, and at the same time in the order in which they were scheduled."""
-        for delay, name in [(2.0, "c"), (1.0, "a"), (2.0, "d"), (1.0, "b")]:
-            self.clock.callLater(delay, self.called.append, name)
-        self.clock.advance(1.5)
-        self.assertEqual(self.called, ["a", "b"])
-        self.clock.advance(0.5)
-        self.assertEqual(self.called, ["a", "b", "c", "d"])
 
     def test_call_sees_its_own_moment(self) -> None:
         """A call that runs during a long step sees the moment for which it was scheduled, and what it adds runs too."""
@@ -106,8 +95,6 @@ class HeapClockTests(SynchronousTestCase):
 
 
 class MonotonicTests(SynchronousTestCase):
-    """Behaviour of ``use_monotonic_time``."""
-
     def test_reactors_run_on_boot_time(self) -> None:
         """After the call every reactor measures with the clock that nobody sets; a second call changes nothing."""
         self.patch(ReactorBase, "seconds", ReactorBase.__dict__["seconds"])

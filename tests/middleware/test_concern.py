@@ -6,13 +6,11 @@ from typing import Any
 
 from twisted.internet.defer import Deferred
 
-from middleware.entangled import record
 from middleware.entangled.errors import Conflict, NotAcknowledged, Unavailable
 from middleware.entangled.kademlia.distance import closest
 from middleware.entangled.kademlia.overlay import K
 from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import TOLERATED_ABSENCE, TOMBSTONE_TTL, Record, hashed_key
-from middleware.entangled.replication import handover
 from middleware.entangled.replication.owner import Concern
 from middleware.entangled.replication.reader import ReadConcern
 from middleware.entangled.replication.replica import CACHED, SURE
@@ -25,16 +23,13 @@ class ConcernCase(FleetCase):
     """A few words for what most tests do."""
 
     def cut(self, fleet: Fleet, *places: int) -> None:
-        """Cut these nodes off from all others."""
         fleet.board.partition([fleet.address(place) for place in places])
 
     def failure(self, fleet: Fleet, work: Any, kind: type[Exception], within: float = 3.0) -> Any:
-        """The exception with which ``work`` fails."""
         fleet.run(within)
         return self.failureResultOf(work, kind).value
 
     def values(self, fleet: Fleet, place: int, concern: Any = "majority", key: bytes = KEY) -> list[bytes | None]:
-        """What a node reads."""
         return [r.value for r in self.done(fleet, fleet.nodes[place].get(key, concern))]
 
 
@@ -110,7 +105,6 @@ class ReadConcernTests(ConcernCase):
         self.reader: EntangledNode = self.world.nodes[self.order[-1]]
 
     def sent(self) -> int:
-        """Datagrams so far."""
         return self.world.board.counters["sent"]
 
     def test_fast_costs_two_datagrams(self) -> None:
@@ -169,13 +163,6 @@ class ReadConcernTests(ConcernCase):
             self.world.nodes[place].vanish()
         error = self.failure(self.world, self.reader.get(KEY, "fast"), Unavailable)
         self.assertEqual((error.answered, error.needed), (3, 5))
-
-    def test_the_unsure_do_not_count(self) -> None:
-        """Replicas that have yet to catch up do not count in a majority read."""
-        for place in self.order[:4]:
-            self.world.nodes[place].replica.is_sure = lambda: False
-        error = self.failure(self.world, self.reader.get(KEY), Unavailable)
-        self.assertEqual((error.answered, error.needed), (4, 5))
 
 
 class NewcomerTests(ConcernCase):
@@ -237,18 +224,6 @@ class AbsenceTests(ConcernCase):
         node.join([])
         fleet.run(31.0)
         return node
-
-    def test_what_is_given_on_keeps_its_age(self) -> None:
-        """A record that is handed on lives as long as it would have where it came from, and no longer."""
-        fleet = self.fleet(2)
-        owner = fleet.identity(7)
-        made = Record(KEY, "a", owner.public, 1, "team", 60.0, b"x").signed(owner)
-        fleet.nodes[0].replica.keep(made)
-        fleet.run(30.0)
-        self.assertEqual(len(fleet.stores[1].get(KEY)), 1)
-        fleet.run(31.0)
-        self.assertEqual(fleet.stores[1].get(KEY), [])
-        self.assertLess(handover.MEND, record.TEAM_TTL)
 
 
 class WatchNumberTests(ConcernCase):

@@ -131,7 +131,6 @@ class GivingTests(FleetCase):
         self.assertEqual([r.name for r in peer.replica.held(more.key)], ["a", "b"])
 
     def reconcile(self, fleet: Fleet, handover: Any, peer: EntangledNode) -> None:
-        """Let one node compare with another."""
         fleet.run(0.5)
         self.done(fleet, Deferred.fromCoroutine(handover._reconcile(peer.contact)), 0.5)
 

@@ -67,7 +67,6 @@ def digests() -> list[str]:
 
 class InvariantTests(SynchronousTestCase):
     def found(self, seed: int) -> list[str]:
-        """The violations of one schedule."""
         schedule = Schedule(seed)
         return schedule.run([Records(schedule)])
 

@@ -11,7 +11,6 @@ OTHER = hashed_key("others")
 
 class LeaseTests(FleetCase):
     def names(self, fleet: Fleet, key: bytes = KEY, place: int = 0) -> list[str]:
-        """What one node holds there."""
         return [record.name for record in fleet.nodes[place].store.get(key, tombstones=True)]
 
     def told(self, fleet: Fleet, place: int, seconds: float) -> list[float]:

@@ -78,8 +78,6 @@ def _number(path: Path, node: ast.AST) -> float:
 
 
 class PageTests(FleetCase):
-    """The page."""
-
     def test_figures(self) -> None:
         """Every cap that the page names is that of the code."""
         rows = ROW.findall(PAGE.read_text(encoding="utf-8"))

@@ -31,11 +31,9 @@ class Replaced(MemoryStore):
 
 class MajorityCase(FleetCase):
     def cut(self, fleet: Fleet, *places: int) -> None:
-        """Cut these off from all others."""
         fleet.board.partition([fleet.address(place) for place in places])
 
     def joined(self, fleet: Fleet, count: int, known: int) -> None:
-        """So many newcomers join through one node."""
         for _ in range(count):
             place = len(fleet.nodes)
             fleet.nodes.append(fleet.made(place))
@@ -178,8 +176,6 @@ class CutTests(MajorityCase):
 
 
 class StartTests(MajorityCase):
-    """Everybody becomes sure in the end."""
-
     def test_a_liar_makes_no_members_up(self) -> None:
         """A newcomer counts nobody as absent whom only one of those that it asks names."""
         fleet = self.fleet(3)

@@ -25,7 +25,6 @@ class NodeCase(FleetCase):
     """A few words for what most tests do."""
 
     def values(self, fleet: Fleet, place: int, key: bytes = KEY, within: float = 3.0) -> list[bytes | None]:
-        """What a node finds under ``key``."""
         return [record.value for record in self.done(fleet, fleet.nodes[place].get(key), within)]
 
     def watched(self, node: EntangledNode, **options: Any) -> list[list[bytes | None]]:

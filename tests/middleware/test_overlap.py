@@ -13,10 +13,7 @@ MANY = 40
 
 
 class OverlapTests(FleetCase):
-    """Behaviour of ``Overlap``, asked by another node."""
-
     def setUp(self) -> None:
-        """Three nodes with a few records."""
         super().setUp()
         self.whole: Fleet = self.fleet(3)
         for number in range(MANY):
@@ -25,7 +22,6 @@ class OverlapTests(FleetCase):
         self.whole.run(1.0)
 
     def ask(self, method: str, *arguments: object) -> Any:
-        """What node 2 says to node 1."""
         to = self.whole.nodes[2].contact
         return self.done(self.whole, self.whole.nodes[1].endpoint.ask(to, method, *arguments), 0.1)
 

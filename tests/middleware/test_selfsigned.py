@@ -38,7 +38,6 @@ class TlsTests(SynchronousTestCase):
         self.server = Tls(server_context(PEM), is_server=True)
 
     def shake(self) -> None:
-        """Let both ends greet."""
         said = self.client.opening()
         while not (self.client.is_open and self.server.is_open):
             _, answer = self.server.received(said)

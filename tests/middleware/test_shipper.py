@@ -30,16 +30,13 @@ class ShipperTests(FleetCase):
         self.there: Contact = self.world.nodes[1].contact
 
     def record(self, number: int, size: int = 50) -> Record:
-        """A record of the writer's."""
         identity: Identity = self.world.nodes[0].identity
         return Record(KEY, f"{number}", identity.public, number + 1, "team", TEAM_TTL, b"x" * size).signed(identity)
 
     def stored(self, *records: Record) -> list[Deferred[object]]:
-        """Store them all at once."""
         return [Deferred.fromCoroutine(self.shipper.store(self.there, record)) for record in records]
 
     def count_questions(self) -> None:
-        """Note how many records each question brings."""
         replica, answer = self.world.nodes[1].replica, Replica.answer_store
 
         def counted(peer: Contact, packed: list[object], *left: Any) -> object:

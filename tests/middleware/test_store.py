@@ -34,7 +34,6 @@ def record(
     key: bytes = KEY,
     lifetime: Lifetime = "team",
 ) -> Record:
-    """A record that its owner signed."""
     return Record(key, name, owner.public, sequence, lifetime, 60.0, value).signed(owner)
 
 
@@ -54,7 +53,8 @@ class StoreContract(_Case):
         self.store = self.make(100)
 
     def test_empty(self) -> None:
-        """A new store holds nothing and has nothing to let go of."""
+        """A new store says that it is new, holds nothing and has nothing to let go of."""
+        self.assertEqual((self.store.origin, self.store.rotten, len(self.store.epoch)), ("new", 0, 8))
         self.assertEqual(len(self.store), 0)
         self.assertEqual(self.store.get(KEY), [])
         self.assertIsNone(self.store.slot(Slot(KEY, DOG.public, "state")))
@@ -65,13 +65,6 @@ class StoreContract(_Case):
         self.assertEqual(self.store.records(), [])
         self.assertIsNone(self.store.noted("seed"))
 
-    def test_put_and_get(self) -> None:
-        """What was put is found under its key and in its slot."""
-        self.assertTrue(self.store.put(record(), FOREVER))
-        self.assertEqual(self.store.get(KEY), [record()])
-        self.assertEqual(self.store.slot(record().slot), record())
-        self.assertEqual(self.store.get(hashed_key("tasks")), [])
-
     def test_order_of_a_key(self) -> None:
         """The records of a key come in the order of owner and name, however they were put."""
         records = [record("b", owner=CAT), record("a"), record("c", owner=CAT), record("b")]
@@ -81,16 +74,16 @@ class StoreContract(_Case):
         self.assertEqual(self.store.records(), records)
         self.assertEqual(self.store.owned(DOG.public), [record("a"), record("b")])
 
-    def test_answer_is_a_copy(self) -> None:
-        """Whoever changes a list that it got does not change the store."""
-        self.store.put(record(), FOREVER)
+    def test_put_and_remove(self) -> None:
+        """What was put is found under its key and in its slot; a tombstone empties it to readers, and older ones lose.
+
+        A reader that changes a list that it got does not change the store.
+        """
+        self.assertTrue(self.store.put(record(), FOREVER))
         self.store.get(KEY, tombstones=True).clear()
         self.store.get(KEY).clear()
         self.assertEqual(self.store.get(KEY), [record()])
-
-    def test_tombstone(self) -> None:
-        """A deleted slot is empty to readers, and known to those who ask for tombstones."""
-        self.store.put(record(), FOREVER)
+        self.assertEqual(self.store.get(hashed_key("tasks")), [])
         gone = record(sequence=2, value=None)
         self.assertTrue(self.store.put(gone, FOREVER))
         self.assertEqual(self.store.get(KEY), [])
@@ -120,8 +113,8 @@ class StoreContract(_Case):
         store = self.make(2)
         store.put(record("a"), 1.0)
         store.put(record("b"), FOREVER)
-        error = self.assertRaises(Refused, store.put, record("c"), FOREVER)
-        self.assertIn("store full", str(error))
+        line = str(self.assertRaises(Full, store.put, record("c"), FOREVER))
+        self.assertIn(f"store full: it holds 2 of 2 rows, {store.usage.bytes} of {MAX_BYTES} bytes", line)
         self.assertTrue(store.put(record("b", sequence=2), FOREVER))
         self.assertFalse(store.put(record("a"), 2.0))
         store.expire(2.0)
@@ -134,16 +127,6 @@ class StoreContract(_Case):
         self.assertTrue(store.put(record("b", value=None), FOREVER))
         self.assertRaises(Refused, store.put, record("c", value=None), FOREVER)
         self.assertTrue(store.put(record("a", sequence=2, value=None), FOREVER))
-
-    def test_figures_of_a_refusal(self) -> None:
-        """The writer that is refused learns how many rows and bytes there are and may be."""
-        store = self.make(2, 1000)
-        store.put(record("a"), FOREVER)
-        store.put(record("b"), FOREVER)
-        size = 2 * weight(record("a"))
-        line = str(self.assertRaises(Full, store.put, record("c"), FOREVER))
-        self.assertIn(f"2 of 2 rows, {size} of 1000 bytes", line)
-        self.assertNotIn("\n", line)
 
     def test_bytes_are_counted(self) -> None:
         """The bytes held are those of the fields of all records, whatever came, changed and went."""
@@ -260,10 +243,6 @@ class StoreContract(_Case):
         self.successResultOf(self.store.written())
         self.assertEqual(self.store.trouble, "")
 
-    def test_made_now(self) -> None:
-        """A store that was just made says so, has no rotten rows and has an epoch of eight bytes."""
-        self.assertEqual((self.store.origin, self.store.rotten, len(self.store.epoch)), ("new", 0, 8))
-
     def test_discard(self) -> None:
         """A slot that is discarded is empty, whatever its lifetime was, and its room is free; others stay."""
         store = self.make(2)
@@ -277,20 +256,13 @@ class StoreContract(_Case):
         self.assertEqual(store.expire(FOREVER), [record("a")])
 
     def test_notes(self) -> None:
-        """A note is kept under its name, and the last one counts."""
-        self.store.note("seed", b"one")
-        self.store.note("seed", b"two")
-        self.store.note("seed", b"two")
+        """A note is kept under its name, and the last one counts; a store may be closed again."""
+        for value in (b"one", b"two", b"two"):
+            self.store.note("seed", value)
         self.store.note("contacts", b"")
-        self.assertEqual(self.store.noted("seed"), b"two")
-        self.assertEqual(self.store.noted("contacts"), b"")
-
-    def test_close_twice(self) -> None:
-        """A store may be closed again, which changes nothing."""
-        self.store.put(record(), FOREVER)
         for _ in range(2):
+            self.assertEqual((self.store.noted("seed"), self.store.noted("contacts")), (b"two", b""))
             self.store.close()
-            self.assertEqual((self.store.records(), self.store.trouble), ([record()], ""))
 
 
 class MemoryStoreTest(StoreContract, SynchronousTestCase):

@@ -30,11 +30,9 @@ class StreamsTests(SynchronousTestCase):
         self.ages: list[float] = []
 
     def at(self, n: int) -> Address:
-        """Where the n-th end listens."""
         return Address("10.0.0.1", 7000 + n)
 
     def opened(self, n: int) -> tuple[Endpoint, Streams]:
-        """One end."""
         endpoint = Endpoint(
             Identity(bytes([n]) * 32), TEAM, self.board.network(*self.at(n)), self.clock, random.Random(n)
         )
@@ -47,12 +45,10 @@ class StreamsTests(SynchronousTestCase):
             endpoint.stop()
 
     def see(self, sequence: int, frame: bytes, age: float) -> None:
-        """Take note of a frame."""
         self.frames.append((sequence, frame))
         self.ages.append(age)
 
     def part(self, sequence: int, number: int, count: int, part: bytes, age_ms: int = 0) -> None:
-        """One part arrives."""
         self.viewer._answer_part(self.to_publisher, CAMERA, sequence, number, count, part, age_ms)
 
     def test_frames_arrive_whole(self) -> None:

@@ -26,11 +26,9 @@ class SwarmNodeTests(FleetCase):
         return [(device.name, device.joined) for device, _ in devices_of(records)]
 
     def submitted(self, fleet: SwarmFleet, task: Task = TASK) -> Task:
-        """A task as it was published."""
         return self.done(fleet, Deferred.fromCoroutine(fleet.nodes[0].submit(task)), 5.0)
 
     def asked(self, fleet: SwarmFleet, method: str, *arguments: object) -> Deferred[Any]:
-        """A call of dog1 to dog0."""
         to = fleet.nodes[0].entangled.contact
         return fleet.nodes[1].entangled.endpoint.ask(to, method, *arguments, changes=True)
 

@@ -11,8 +11,6 @@ from tests.fleet import FleetCase, SwarmFleet
 
 
 class GaugeTests(FleetCase):
-    """Behaviour of ``Gauge``."""
-
     def setUp(self) -> None:
         super().setUp()
         self.team: SwarmFleet = self.swarm(3, weather=Weather(delay_s=0.01))
@@ -20,7 +18,6 @@ class GaugeTests(FleetCase):
         self.gauge: Gauge = self.team.nodes[0].gauge
 
     def links(self) -> dict[str, dict[str, Any]]:
-        """By the uuid of the peer."""
         return {each["id"]: each for each in self.gauge.links()}
 
     def test_answer_at_once(self) -> None:

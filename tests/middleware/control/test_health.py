@@ -10,8 +10,6 @@ from tests.fleet import FleetCase
 
 
 class HealthTests(FleetCase):
-    """Behaviour of ``health`` and ``links``."""
-
     def test_health(self) -> None:
         """A node says whom it knows, what it holds and may hold, and that nobody refused it."""
         fleet = self.fleet(3)

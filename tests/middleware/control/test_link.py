@@ -8,8 +8,6 @@ from middleware.entangled.control.link import link
 
 
 class LinkTests(SynchronousTestCase):
-    """Behaviour of ``link``."""
-
     def test_near_and_steady_is_a_hundred(self) -> None:
         """A peer on the same LAN that answers each question at once has all points."""
         self.assertEqual(link([0.002, 0.0021, 0.0019, 0.002], False).score, 100)

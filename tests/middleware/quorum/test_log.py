@@ -17,7 +17,6 @@ from tests.middleware.consensus.lease.test_lease_codec import ANYTHING, MEMBERS
 
 
 def entered(log: Log[str], task_id: str, now: float) -> Register | None:
-    """A new register, if there was room."""
     register = log.blank(now)
     return register if log.enter(task_id, register, now) else None
 

@@ -19,13 +19,10 @@ LOW, MID = Ballot(1, b"a"), Ballot(2, b"b")
 
 
 def reply(kind: Kind, counter: int = 9, accepted: Ballot = NONE, value: bytes | None = None) -> Reply:
-    """What a member tells that promised ``counter``."""
     return Reply(kind, Ballot(counter, b""), accepted=accepted, value=value)
 
 
 class ConcludeTests(SynchronousTestCase):
-    """How a round ends."""
-
     def test_conclude(self) -> None:
         """Promises win, the highest accepted value is completed, one that a majority accepted is decided, else lost."""
         yes, held = reply(Kind.GRANTED), Reply(Kind.HELD, Ballot(4, b""), remaining=2.5)
@@ -54,8 +51,6 @@ class ConcludeTests(SynchronousTestCase):
 
 
 class DecideTests(SynchronousTestCase):
-    """Behaviour of ``decide``, with the acceptors of both users."""
-
     def decide(self, seed: int, use: Use) -> set[Any]:
         """What three proposers are told of one register, while losses and restarts come between their questions."""
         rng, now = random.Random(seed), 0.0

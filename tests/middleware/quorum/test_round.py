@@ -29,16 +29,13 @@ class RoundTests(SynchronousTestCase):
         self.asked: list[tuple[float, int, Deferred[Any]]] = []
 
     def ask(self, place: int) -> Deferred[Any]:
-        """Note that a member is asked."""
         self.asked.append((self.clock.seconds(), place, Deferred()))
         return self.asked[-1][2]
 
     def round(self, size: int = 3, short: float = PAUSE) -> Round:
-        """A question to the first members."""
         return Round([Tally(size)], self.ask, decoded, self.clock, 0.5, short)
 
     def answer(self, number: int, reply: Reply) -> None:
-        """Answer the question of that number."""
         self.asked[number][2].callback(pack_reply(reply))
 
     def test_decided_by_a_majority(self) -> None:

@@ -24,8 +24,6 @@ OWN = b"own"
 
 
 class ResolveTests(SynchronousTestCase):
-    """Behaviour of ``Council.resolve``."""
-
     def setUp(self) -> None:
         self.clock, self.rng = HeapClock(), random.Random(1)
         self.contacts = [Contact(Identity(bytes([n]) * 32).public, Address("10.0.0.1", 7000 + n)) for n in range(3)]
@@ -36,7 +34,6 @@ class ResolveTests(SynchronousTestCase):
         self.council = Council(self.ask, self.clock, self.rng, Background(self.clock))
 
     def ask(self, contact: Contact, method: str, arguments: tuple[object, ...]) -> Deferred[Any]:
-        """Ask the member that has that seat."""
         number = self.contacts.index(contact)
         if number in self.silent:
             return fail(NoAnswer("it is silent"))
@@ -50,7 +47,6 @@ class ResolveTests(SynchronousTestCase):
         seat.answer_confirm(PEER, KEY, places, seat.incarnation, counter, taker, taker)
 
     def resolve(self, value: bytes | None) -> bytes | None:
-        """What the council decides, in time."""
         found: list[bytes | None] = []
         Deferred.fromCoroutine(self.council.resolve(self.posted, OWN, value)).addCallback(found.append)
         self.clock.advance(30.0)

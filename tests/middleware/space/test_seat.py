@@ -49,34 +49,26 @@ FOREIGN: Any = st.recursive(
 
 
 def place(number: int, name: str = "t") -> Place:
-    """One of many places."""
     return Place(KEY, ME.public, f"{name}{number}", number.to_bytes(8, "big"))
 
 
 def record(name: str, value: bytes | None, sequence: int = 1) -> Record:
-    """A record of the space, unsigned."""
     return Record(KEY, name, ME.public, sequence, "team", 60.0, value, bytes([sequence]) * 64)
 
 
 def tuple_record(where: Place, sequence: int = 1) -> Record:
-    """The record of a tuple at ``where``."""
     return record(where.name, packed_tuple(where.mark, ("x",), [Member(PEER, b"i" * 8)]), sequence)
 
 
 class Exposed:
-    """Takes down what a seat exposes."""
-
     def __init__(self) -> None:
         self.methods: dict[str, Callable[..., object]] = {}
 
     def expose(self, name: str, answer: Callable[..., object], changes: bool = False) -> None:
-        """Take it down."""
         self.methods[name] = answer
 
 
 class SeatTests(SynchronousTestCase):
-    """Behaviour of ``Seat``."""
-
     def setUp(self) -> None:
         self.clock = HeapClock()
         self.store = MemoryStore()
@@ -87,12 +79,10 @@ class SeatTests(SynchronousTestCase):
         return Seat(Exposed(), self.store, self.clock, random.Random(seed))
 
     def claim(self, where: Place, counter: int = 1, taker: bytes = b"a", lease: float = 2.0) -> Kind:
-        """What the member answers to a claim."""
         answer: Any = self.seat.answer_claim(PEER, KEY, [where.packed()], self.seat.incarnation, counter, taker, lease)
         return self._kind(answer, Event.PREPARE)
 
     def confirm(self, where: Place, counter: int = 1, taker: bytes = b"a") -> Kind:
-        """What the member answers to a confirm."""
         life = self.seat.incarnation
         answer: Any = self.seat.answer_confirm(PEER, KEY, [where.packed()], life, counter, taker, taker)
         return self._kind(answer, Event.ACCEPT)
@@ -221,8 +211,6 @@ class SeatTests(SynchronousTestCase):
 
 
 class PostingTests(SynchronousTestCase):
-    """Behaviour of ``posting`` and ``standing``."""
-
     def test_round_trip(self) -> None:
         """A tuple and a note come back from their records as they were."""
         council = (Member(PEER, b"i" * 8),)

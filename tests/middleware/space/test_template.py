@@ -37,8 +37,6 @@ FOREIGN = st.recursive(
 
 
 class TemplateTests(SynchronousTestCase):
-    """Behaviour of ``template_of``, ``where`` and ``matches``."""
-
     def test_values_match_their_like_only(self) -> None:
         """One, 1.0 and True are three different values, and None is one as well."""
         self.assertTrue(template_of(["a", 1, None, b"x"]).matches(("a", 1, None, b"x")))
