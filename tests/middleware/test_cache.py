@@ -25,26 +25,21 @@ class PathCacheTests(SynchronousTestCase):
             self.assertEqual(self.cache.get(self.key, lives - 0.1), copied(self.key))
             self.assertIsNone(self.cache.get(self.key, lives))
 
-    def test_strange_times(self) -> None:
-        """A copy that has no time left, or none that is a number, is not kept."""
-        for ttl in (0.0, -1.0, float("nan")):
-            self.cache.put(self.key, copied(self.key), ttl, 0.0)
+    def test_what_is_not_kept(self) -> None:
+        """A copy that has no time left, or none that is a number, or is too large, is not kept, nor the one before."""
+        for ttl, size in ((0.0, 1), (-1.0, 1), (float("nan"), 1), (9.0, MAX_BYTES)):
+            self.cache.put(self.key, copied(self.key), 9.0, 0.0)
+            self.cache.put(self.key, copied(self.key, size), ttl, 0.0)
             self.assertIsNone(self.cache.get(self.key, 0.0))
 
-    def test_bounded(self) -> None:
-        """Keys and bytes are bounded, and what was not read for longest goes first."""
+    def test_keys_are_bounded(self) -> None:
+        """There is an end to keys, and what was not read for longest goes first."""
         keys = [hashed_key(str(number)) for number in range(MAX_KEYS + 1)]
         for key in keys[:-1]:
             self.cache.put(key, copied(key), 9.0, 0.0)
         self.cache.get(keys[0], 0.0)
         self.cache.put(keys[-1], copied(keys[-1]), 9.0, 0.0)
-        self.assertIsNone(self.cache.get(keys[1], 0.0))
-        self.assertIsNotNone(self.cache.get(keys[0], 0.0))
-        self.cache.put(self.key, copied(self.key, MAX_BYTES + 1), 9.0, 0.0)
-        self.assertIsNone(self.cache.get(self.key, 0.0))
-        self.cache.put(self.key, copied(self.key, MAX_BYTES - 200), 9.0, 0.0)
-        self.assertIsNone(self.cache.get(keys[-1], 0.0))
-        self.assertIsNotNone(self.cache.get(self.key, 0.0))
+        self.assertEqual(self.held(keys[:3]), [0, 2])
 
     def test_bytes_are_counted(self) -> None:
         """Copies fill the cache to the byte; beyond, the least recently read one goes, and what goes frees its room."""

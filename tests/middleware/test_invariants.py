@@ -84,15 +84,6 @@ class InvariantTests(SynchronousTestCase):
                     blind.append(bug)
         self.assertEqual(blind, [])
 
-    def test_replay(self) -> None:
-        """The same seed gives the same run, datagram by datagram."""
-        digests = []
-        for _ in range(2):
-            schedule = Schedule(7)
-            schedule.run([Records(schedule)])
-            digests.append(schedule.fleet.board.digest())
-        self.assertEqual(digests[0], digests[1])
-
     def test_all_workloads(self) -> None:
         """A schedule of all workloads breaks no invariant: records, tuples, hostile datagrams, failing disks."""
         self.assertEqual({seed: found for seed in (7,) if (found := run(seed, ALL).found)}, {})
@@ -140,12 +131,6 @@ class InvariantTests(SynchronousTestCase):
         self.assertIn(
             f"--seed {SHRUNK} --only tuples --keep {','.join(map(str, left.trim.keep))} --calm", line(SHRUNK, left.trim)
         )
-
-    def test_shrunk_in_no_time(self) -> None:
-        """Where there is no time to shrink it, what is left is the whole."""
-        whole = run(2, ("leases",), "the token is not stored")
-        left = least(whole, "the token is not stored", lambda: True)
-        self.assertEqual((left.outcome, left.runs, left.trim.keep), (whole, 0, None))
 
     def test_jobs(self) -> None:
         """Several processes give the same outcomes in the same order as one."""

@@ -189,22 +189,6 @@ class TeamRecordTests(NodeCase):
         self.assertEqual(self.values(fleet, 5), [b"do it"])
         self.assertEqual(len(fleet.stores[5].get(KEY, tombstones=True)), 2)
 
-    def test_restart_brings_them_back(self) -> None:
-        """After all nodes were off at once, what their stores kept is there again, and no lease is."""
-        fleet = self.fleet(3)
-        self.done(fleet, fleet.nodes[1].put(KEY, "task", b"do it"))
-        fleet.nodes[1].put(KEY, "state", b"here", "leased")
-        fleet.run(1.0)
-        for node in fleet.nodes:
-            node.vanish()
-        fleet.run(5.0)
-        before = fleet.nodes[2].contact
-        for place in range(3):
-            fleet.restart(place)
-        fleet.run(3.0)
-        self.assertEqual(self.values(fleet, 2), [b"do it"])
-        self.assertEqual(fleet.nodes[2].contact, before)
-
 
 class WatchTests(NodeCase):
     def test_changes_are_pushed(self) -> None:

@@ -243,18 +243,6 @@ class StoreContract(_Case):
         self.successResultOf(self.store.written())
         self.assertEqual(self.store.trouble, "")
 
-    def test_discard(self) -> None:
-        """A slot that is discarded is empty, whatever its lifetime was, and its room is free; others stay."""
-        store = self.make(2)
-        store.put(record("a"), FOREVER)
-        store.put(record("b", lifetime="leased"), FOREVER)
-        self.assertTrue(store.discard(record("a").slot))
-        self.assertFalse(store.discard(record("a").slot))
-        self.assertEqual(store.get(KEY), [record("b", lifetime="leased")])
-        self.assertTrue(store.put(record("a"), 5.0))
-        self.assertTrue(store.discard(record("b").slot))
-        self.assertEqual(store.expire(FOREVER), [record("a")])
-
     def test_notes(self) -> None:
         """A note is kept under its name, and the last one counts; a store may be closed again."""
         for value in (b"one", b"two", b"two"):

@@ -8,10 +8,10 @@ and ``True`` are three values, and only predicates that compare take ``int`` and
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from operator import ge, gt, le, lt
-from typing import Final, TypeGuard
+from typing import Any, Final, TypeGuard
 
 import msgpack
 
@@ -25,7 +25,7 @@ MAX_TUPLE = 600
 """Bytes of a tuple or template as msgpack; a record must hold it beside its council."""
 MAX_CHOICES = 32
 OPERATORS = ("<", "<=", ">", ">=", "!=", "in", "prefix")
-_COMPARE: Final = {"<": lt, "<=": le, ">": gt, ">=": ge}
+_COMPARE: Final[dict[str, Callable[[Any, Any], bool]]] = {"<": lt, "<=": le, ">": gt, ">=": ge}
 _TYPES: Final = (bool, bytes, float, int, str)
 
 
@@ -60,7 +60,7 @@ class Predicate:
                 return value.startswith(operand)
             return isinstance(value, bytes) and isinstance(operand, bytes) and value.startswith(operand)
         is_ordered = _are_numbers(value, operand) or (type(value) is type(operand) and isinstance(value, str | bytes))
-        return is_ordered and bool(_COMPARE[self.operator](value, operand))
+        return is_ordered and _COMPARE[self.operator](value, operand)
 
 
 Field = Value | Wildcard | type | Predicate
