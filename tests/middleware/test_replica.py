@@ -41,7 +41,7 @@ class Alone:
     """The neighbours of a node that knows nobody."""
 
     is_responsible = staticmethod(lambda key: True)
-    nearest = staticmethod(lambda target: [])
+    nearest = staticmethod(lambda target: list[Contact]())
     heard = left = staticmethod(lambda contact: None)
 
 
