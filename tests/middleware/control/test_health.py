@@ -1,12 +1,89 @@
-"""Tests of what a running node says of itself and of its links."""
+"""Tests of what a running node says of itself, and of how good it finds the ways to its peers."""
 
 from __future__ import annotations
 
+from typing import Any
+
 from twisted.internet.defer import Deferred
 
-from middleware.entangled.control.health import ASKED, health, links
+from middleware.entangled.contact import Contact
+from middleware.entangled.control.health import ASKED, FEW, IDLE, Gauge, health, links
 from middleware.entangled.network.switchboard import Weather
-from tests.fleet import FleetCase
+from tests.fleet import FleetCase, SwarmFleet
+
+
+class GaugeTests(FleetCase):
+    def setUp(self) -> None:
+        super().setUp()
+        self.team: SwarmFleet = self.swarm(3, weather=Weather(delay_s=0.01))
+        self.team.run(3.0)
+        self.gauge: Gauge = self.team.nodes[0].gauge
+
+    def measured(self) -> dict[str, dict[str, Any]]:
+        return {each["id"]: each for each in self.gauge.links()}
+
+    def test_answer_at_once(self) -> None:
+        """The first answer has the ways, and no figures yet; a second later it has those of ten questions."""
+        first = self.measured()
+        self.assertEqual(set(first), {node.uuid for node in self.team.nodes[1:]})
+        for each in first.values():
+            self.assertEqual((each["way"], each["by"], each["round_trip"], each["loss"]), ("machine", "", None, None))
+        self.team.run(1.5)
+        for each in self.measured().values():
+            self.assertEqual((round(each["round_trip"], 3), each["loss"], round(each["jitter"], 4)), (0.02, 0.0, 0.0))
+            self.assertGreater(each["for"], 2.0)
+
+    def test_see_what_gets_worse(self) -> None:
+        """Loss that begins while it measures is seen within ten seconds."""
+        self.measured()
+        self.team.run(3.0)
+        self.team.board.weather = Weather(delay_s=0.01, loss=0.3)
+        losses = []
+        for _ in range(5):
+            self.team.run(2.0)
+            losses.append(max(each["loss"] or 0.0 for each in self.measured().values()))
+        self.assertEqual(losses[0] <= 0.5 and max(losses) > 0.1, True, losses)
+
+    def test_end_when_nobody_looks(self) -> None:
+        """Without anybody who asks it falls silent, and begins anew with the next one."""
+        asked: list[float] = []
+
+        def answer(peer: object, said: bytes) -> bytes:
+            asked.append(self.team.clock.seconds())
+            return said
+
+        self.team.nodes[1].entangled.endpoint.expose("ping", answer, changes=True)
+        self.team.run(10.0)
+        usual = len(asked)
+        self.measured()
+        self.team.run(10.0)
+        self.assertGreater(len(asked), 2 * usual + 15)
+        self.team.run(IDLE)
+        asked.clear()
+        self.team.run(10.0)
+        self.assertEqual(len(asked), usual)
+        self.assertEqual([each["loss"] for each in self.measured().values()], [None, None])
+
+    def test_many_peers_cost_no_more(self) -> None:
+        """However many peers a node has, it asks 10 questions a second, 100 in the beginning."""
+        large = self.swarm(24, weather=Weather(delay_s=0.003))
+        large.run(3.0)
+        asked: list[float] = []
+
+        def answer(peer: Contact, said: bytes) -> bytes:
+            asked.extend([large.clock.seconds()] * (peer.node_id.hex() == large.nodes[0].uuid))
+            return said
+
+        gauge = large.nodes[0].gauge
+        peers = {each["id"] for each in gauge.links()}
+        self.assertGreater(len(peers), 2 * FEW)
+        for node in large.nodes[1:]:
+            node.entangled.endpoint.expose("ping", answer, changes=True)
+        for seconds, most in ((1.0, 100.0), (2.0, 100.0), (5.0, 10.0)):
+            before = len(asked)
+            gauge.links()
+            large.run(seconds)
+            self.assertLess(len(asked) - before, most * seconds + 2 * len(peers), seconds)
 
 
 class HealthTests(FleetCase):
