@@ -93,7 +93,7 @@ class CutTests(MajorityCase):
             for place in (1, 2):
                 self.assertIs(self.values(fleet, place), Unavailable)
             fleet.nodes[1].vanish()
-            fleet.stores[1].origin = "kept"  # type: ignore[misc]
+            fleet.stores[1].origin = "kept"
         fleet.restart(1, [2])
         fleet.board.heal()
         fleet.run(10.0)
