@@ -241,6 +241,12 @@ class TupleSpaceTests(SpaceCase):
         fleet.run(95.0)
         self.assertEqual(self.done(fleet, a.read_all(("n", ANY))), [])
 
+    def test_single_node(self) -> None:
+        """A node that is all alone can use a space, and has nobody to ask."""
+        fleet, (a,) = self.spaces(1)
+        self.done(fleet, a.put(("x",)))
+        self.assertEqual(self.done(fleet, a.get(("x",))), ("x",))
+
     def test_wrong_use(self) -> None:
         """What is no tuple raises at once, before anything is sent, and a stopped space says that it is stopped."""
         fleet, (a, b) = self.spaces(2)
