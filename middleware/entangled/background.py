@@ -29,12 +29,12 @@ class Background:
             return lambda: None
 
         def run() -> None:
-            del self._waiting[call]
+            self._waiting.pop(call, None)
             work(*arguments)
 
         def cancel() -> None:
-            if call in self._waiting:
-                del self._waiting[call]
+            self._waiting.pop(call, None)
+            if call.active():
                 call.cancel()
 
         call = self._clock.callLater(delay, run)
@@ -69,7 +69,8 @@ class Background:
         """Cancel every timer."""
         self.is_stopped = True
         for call in self._waiting:
-            call.cancel()
+            if call.active():
+                call.cancel()
         self._waiting.clear()
 
 
