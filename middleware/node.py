@@ -54,7 +54,7 @@ if TYPE_CHECKING:
     from middleware.consensus.selection import Strategies
     from middleware.consensus.verdict import Verdict
     from middleware.consensus.view import View
-    from middleware.entangled.control.gauge import Gauge
+    from middleware.entangled.control.health import Gauge
     from middleware.tasks.councils import Councils
 
 CAMERA = "camera"
@@ -396,9 +396,9 @@ class SwarmNode(Service):
     def gauge(self) -> Gauge:
         """How good the ways to this node's peers are."""
         # Imported by the first who wants to know.
-        from middleware.entangled.control.gauge import Gauge
+        from middleware.entangled.control.health import Gauge
 
-        return Gauge(self.entangled, self.clock, self._chores.fork, self._chores.later)
+        return Gauge(self.entangled, self.clock, self._chores)
 
     @cached_property
     def _strategies(self) -> Strategies:

@@ -28,7 +28,7 @@ from middleware.consensus.bidding import check, party, scale, teller, tree
 from middleware.consensus.lease import lease_codec, lessee
 from middleware.deployment import confinement, deployment, frame, manifest, module, runner
 from middleware.diagnostics import survey
-from middleware.entangled.control import gauge, port
+from middleware.entangled.control import health, port
 from middleware.entangled.kademlia import detour, membership, roster
 from middleware.entangled.network import bundle, link, tcp, tunnel, websocket
 from middleware.entangled.replication import handover, pusher, replica, subscriber
@@ -192,7 +192,7 @@ FIGURES: Sequence[tuple[str, str]] = (
     ("web", f"`text`, 1 to {devices.MAX_MESSAGE} characters"),
     ("web", f"`seconds`, {devices.MIN_AWAY_S:g} to {devices.MAX_AWAY_S:g}, default {devices.AWAY_S:g}"),
     ("web", f"At most {live.MAX_VIEWERS} streams"),
-    ("web", f"nobody has asked for {gauge.IDLE:g} s"),
+    ("web", f"nobody has asked for {health.IDLE:g} s"),
     ("web", f"those with {survey.ENDING_S / 86_400:g} days or less come first"),
     ("web", f"A node keeps the last {rebuff.MAX_REBUFFS}, in memory"),
 )

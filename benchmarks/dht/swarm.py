@@ -16,7 +16,7 @@ from benchmarks.dht.contestant import HOST, Done, Got, Prevent
 from middleware.entangled.clock import use_monotonic_time
 from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.data.sqlite import SqliteStore
-from middleware.entangled.data.store import Durable
+from middleware.entangled.data.store import Durable, Store
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.network import Address
 from middleware.entangled.network.udp import UdpNetwork
@@ -69,7 +69,7 @@ class SwarmPeer:
 
     def start(self, port: int, known: int, done: Callable[[], None]) -> None:
         """Build the node and join."""
-        store = MemoryStore()
+        store: Store = MemoryStore()
         if self._folder:
             path = os.path.join(self._folder, f"{port}.sqlite")
             store = SqliteStore.open(path, time.monotonic(), deliver=reactor.callFromThread, durable=self._durable)

@@ -19,34 +19,6 @@ def cancel(timer: IDelayedCall | None) -> None:
         timer.cancel()
 
 
-class _Chore:
-    """Work that waits for its moment; with a ``period`` it is done again and again."""
-
-    __slots__ = ("_chores", "call", "_work", "_arguments", "_period")
-
-    def __init__(
-        self, chores: Background, work: Callable[..., object], arguments: tuple[object, ...], period: float = 0.0
-    ) -> None:
-        self._chores = chores
-        self._work = work
-        self._arguments = arguments
-        self._period = period
-        self.call: IDelayedCall | None = None
-
-    def run(self) -> None:
-        """Do it; only the clock calls this."""
-        if self._period:
-            self._chores._wait(self, self._period)
-        else:
-            self._chores._waiting.pop(self, None)
-        self._work(*self._arguments)
-
-    def cancel(self) -> None:
-        """Prevent it, where it has not been done."""
-        self._chores._waiting.pop(self, None)
-        cancel(self.call)
-
-
 class Background:
     """Timers and coroutines of one node; after ``stop`` none of them runs."""
 
@@ -54,18 +26,35 @@ class Background:
 
     def __init__(self, clock: IReactorTime) -> None:
         self._clock = clock
-        self._waiting: dict[_Chore, None] = {}
+        self._waiting: dict[IDelayedCall, None] = {}
         self.is_stopped = False
 
     def later(self, delay: float, work: Callable[..., object], *arguments: object) -> Callable[[], None]:
         """Call ``work`` after ``delay`` seconds; call what is returned to prevent it."""
-        chore = _Chore(self, work, arguments)
-        self._wait(chore, delay)
-        return chore.cancel
+        if self.is_stopped:
+            return lambda: None
+
+        def run() -> None:
+            self._waiting.pop(call, None)
+            work(*arguments)
+
+        def cancel() -> None:
+            self._waiting.pop(call, None)
+            if call.active():
+                call.cancel()
+
+        call = self._clock.callLater(delay, run)
+        self._waiting[call] = None
+        return cancel
 
     def every(self, period: float, work: Callable[[], object]) -> None:
         """Call ``work`` again and again, ``period`` seconds apart."""
-        self._wait(_Chore(self, work, (), period), period)
+
+        def again() -> None:
+            self.later(period, again)
+            work()
+
+        self.later(period, again)
 
     def sleep(self, seconds: float) -> Deferred[None]:
         """Fire after ``seconds``; never where the node stops before."""
@@ -85,13 +74,10 @@ class Background:
     def stop(self) -> None:
         """Cancel every timer."""
         self.is_stopped = True
-        for chore in list(self._waiting):
-            chore.cancel()
-
-    def _wait(self, chore: _Chore, delay: float) -> None:
-        if not self.is_stopped:
-            chore.call = self._clock.callLater(delay, chore.run)
-            self._waiting[chore] = None
+        for call in self._waiting:
+            if call.active():
+                call.cancel()
+        self._waiting.clear()
 
 
 async def until(enough: Callable[[list[Any]], bool], work: Iterable[Coroutine[Any, Any, Any]]) -> list[Any]:

@@ -92,17 +92,7 @@ class Record:
         return hashlib.blake2s(self._signed_bytes() + self.signature).digest()
 
     def _signed_bytes(self) -> bytes:
-        fields = [
-            b"swarm-record-1",
-            self.key,
-            self.name,
-            self.owner,
-            self.sequence,
-            self.lifetime,
-            self.ttl,
-            self.value,
-        ]
-        return bytes(msgpack.packb(fields))
+        return bytes(msgpack.packb([b"swarm-record-1", *self.packed()[:-1]]))
 
     def packed(self) -> list[object]:
         """The record as it stands in a message."""

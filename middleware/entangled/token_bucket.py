@@ -26,9 +26,9 @@ class TokenBucket:
         self._tokens -= amount
         return True
 
-    def give(self, amount: float = 1.0) -> None:
-        """Put back what was taken for nothing."""
-        self._tokens = min(self._size, self._tokens + amount)
+    def give(self) -> None:
+        """Put back one token that was taken for nothing."""
+        self._tokens = min(self._size, self._tokens + 1.0)
 
     def is_full(self, now: float) -> bool:
         """Whether it is as good as a new one."""

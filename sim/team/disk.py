@@ -45,11 +45,11 @@ class Disk(Memory):
         """Why the last commit failed; empty if it did not."""
         return self._trouble
 
-    def put(self, record: Record, expires_at: float, now: float | None = None) -> bool:
+    def put(self, record: Record, expires_at: float) -> bool:
         """Hold ``record`` if it beats what its slot holds; see ``Store.put``."""
         if self._trouble and record.beats(self.slot(record.slot)):
             raise _refusal(self._trouble)
-        return super().put(record, expires_at, now)
+        return super().put(record, expires_at)
 
     def written(self) -> Deferred[None]:
         """Fire once all that was put until now is safe; fail with ``Unwritable`` as soon as a commit fails."""

@@ -13,9 +13,9 @@ from middleware.entangled.errors import EntangledError
 from middleware.entangled.node import EntangledNode
 from middleware.entangled.quorum.acceptor import Event
 from middleware.entangled.record import Record
-from middleware.entangled.space.claim import Claim
 from middleware.entangled.space.posting import Place, Posted
 from middleware.entangled.space.take_codec import unpack_reply
+from middleware.entangled.space.taker import Claim
 from middleware.entangled.space.template import ANY, Field, Tuple
 from middleware.entangled.space.tuplespace import TupleSpace
 from sim.team import event

@@ -26,24 +26,19 @@ class Gate(OpenDoor):
         self.judged: list[bytes] = []
 
     def judge(self, public: bytes, shown: bytes) -> str:
-        """As the test says."""
         self.judged.append(public)
         return self.refused.get(public, "" if shown.startswith(b"pass") else FOREIGN)
 
     def admit(self, public: bytes, shown: bytes) -> str:
-        """As ``judge`` says."""
         return self.judge(public, shown)
 
     def may(self, public: bytes, method: str) -> bool:
-        """As the test says."""
         return (public, method) not in self.forbidden
 
     def may_store(self, slot: Slot) -> bool:
-        """As the test says."""
         return (slot.owner, slot.name) not in self.unwritable
 
     def may_stay(self, slot: Slot) -> bool:
-        """What may be written."""
         return self.may_store(slot)
 
     def authority(self, owner: bytes) -> Authority:
@@ -51,9 +46,7 @@ class Gate(OpenDoor):
         return Authority(self.refused.get(owner, ""))
 
     def certificate(self, owner: bytes) -> bytes:
-        """The same for all."""
         return self.shown
 
     def learn(self, owner: bytes, certificate: bytes) -> bool:
-        """As ``judge`` says."""
         return not self.judge(owner, certificate)

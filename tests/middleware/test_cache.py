@@ -1,11 +1,15 @@
-"""Tests of copies on the path; pure."""
+"""Tests of the copies that a node holds beside its records: on the path of lookups, and of what it watches."""
 
 from __future__ import annotations
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.entangled.record import Record, hashed_key
+from middleware.entangled.data.memory import MemoryStore
+from middleware.entangled.errors import NotRunning
+from middleware.entangled.identity import Identity
+from middleware.entangled.record import Record, Slot, hashed_key
 from middleware.entangled.replication.cache import MAX_AGE, MAX_BYTES, MAX_KEYS, PathCache
+from middleware.entangled.replication.keepsake import Keepsakes
 
 
 def copied(key: bytes, size: int = 1) -> list[Record]:
@@ -25,26 +29,21 @@ class PathCacheTests(SynchronousTestCase):
             self.assertEqual(self.cache.get(self.key, lives - 0.1), copied(self.key))
             self.assertIsNone(self.cache.get(self.key, lives))
 
-    def test_strange_times(self) -> None:
-        """A copy that has no time left, or none that is a number, is not kept."""
-        for ttl in (0.0, -1.0, float("nan")):
-            self.cache.put(self.key, copied(self.key), ttl, 0.0)
+    def test_what_is_not_kept(self) -> None:
+        """A copy that has no time left, or none that is a number, or is too large, is not kept, nor the one before."""
+        for ttl, size in ((0.0, 1), (-1.0, 1), (float("nan"), 1), (9.0, MAX_BYTES)):
+            self.cache.put(self.key, copied(self.key), 9.0, 0.0)
+            self.cache.put(self.key, copied(self.key, size), ttl, 0.0)
             self.assertIsNone(self.cache.get(self.key, 0.0))
 
-    def test_bounded(self) -> None:
-        """Keys and bytes are bounded, and what was not read for longest goes first."""
+    def test_keys_are_bounded(self) -> None:
+        """There is an end to keys, and what was not read for longest goes first."""
         keys = [hashed_key(str(number)) for number in range(MAX_KEYS + 1)]
         for key in keys[:-1]:
             self.cache.put(key, copied(key), 9.0, 0.0)
         self.cache.get(keys[0], 0.0)
         self.cache.put(keys[-1], copied(keys[-1]), 9.0, 0.0)
-        self.assertIsNone(self.cache.get(keys[1], 0.0))
-        self.assertIsNotNone(self.cache.get(keys[0], 0.0))
-        self.cache.put(self.key, copied(self.key, MAX_BYTES + 1), 9.0, 0.0)
-        self.assertIsNone(self.cache.get(self.key, 0.0))
-        self.cache.put(self.key, copied(self.key, MAX_BYTES - 200), 9.0, 0.0)
-        self.assertIsNone(self.cache.get(keys[-1], 0.0))
-        self.assertIsNotNone(self.cache.get(self.key, 0.0))
+        self.assertEqual(self.held(keys[:3]), [0, 2])
 
     def test_bytes_are_counted(self) -> None:
         """Copies fill the cache to the byte; beyond, the least recently read one goes, and what goes frees its room."""
@@ -65,15 +64,52 @@ class PathCacheTests(SynchronousTestCase):
         self.cache.put(self.key, copied(self.key, 2 * half), 9.0, 9.0)
         self.assertIsNotNone(self.cache.get(self.key, 9.0))
 
-    def test_a_new_copy_replaces_the_old_one(self) -> None:
-        """The copy that came last is the one under its key, for its own time; one that is not kept leaves none."""
-        newer = copied(self.key, 2)
-        self.cache.put(self.key, copied(self.key), 30.0, 0.0)
-        self.cache.put(self.key, newer, 9.0, 0.0)
-        self.assertEqual(self.cache.get(self.key, 8.9), newer)
-        self.cache.put(self.key, copied(self.key, MAX_BYTES), 30.0, 8.9)
-        self.assertIsNone(self.cache.get(self.key, 8.9))
-
     def held(self, keys: list[bytes]) -> list[int]:
         """Which of ``keys`` have a copy, by number; each of these is then read, in that order."""
         return [number for number, key in enumerate(keys) if self.cache.get(key, 0.0) is not None]
+
+
+DOG = Identity(b"\1" * 32)
+KEY = hashed_key("devices")
+
+
+def record(name: str, sequence: int = 1) -> Record:
+    """A lease; nobody looks at its signature here."""
+    return Record(KEY, name, DOG.public, sequence, "leased", 1.0, b"v", bytes(64))
+
+
+class ClosedStore(MemoryStore):
+    """A store that its owner has closed already."""
+
+    def discard(self, slot: Slot) -> bool:
+        raise NotRunning("closed")
+
+
+class KeepsakeTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.store = MemoryStore(3)
+        self.copies = Keepsakes(self.store)
+
+    def test_what_is_held_is_left_alone(self) -> None:
+        """A slot that the node holds as a replica is neither copied nor let go of."""
+        self.store.put(record("a"), 5.0)
+        self.copies.keep(KEY, [record("a", 2)], 0.0)
+        self.copies.keep(KEY, [], 0.0)
+        self.copies.release(record("a").slot)
+        self.assertEqual(self.store.get(KEY), [record("a")])
+        self.assertEqual(self.store.expire(5.0), [record("a")])
+
+    def test_full_store(self) -> None:
+        """Where there is no room for copies there are fewer; what is held for others stays."""
+        self.store.put(record("z"), 5.0)
+        self.copies.keep(KEY, [record(name) for name in "abc"], 0.0)
+        self.assertEqual([r.name for r in self.store.get(KEY)], ["a", "b", "z"])
+        self.copies.clear()
+        self.assertEqual([r.name for r in self.store.get(KEY)], ["z"])
+
+    def test_closed_store(self) -> None:
+        """A store that is closed already does not stand in the way of a stop."""
+        copies = Keepsakes(ClosedStore())
+        copies.keep(KEY, [record("a")], 0.0)
+        copies.clear()
+        self.assertNotIn(record("a").slot, copies)

@@ -23,23 +23,18 @@ class KnownDoor(OpenDoor):
         self.known: set[bytes] = set()
 
     def authority(self, owner: bytes) -> Authority:
-        """By what was learned."""
         return Authority("" if owner in self.known else FOREIGN)
 
     def certificate(self, owner: bytes) -> bytes:
-        """Of those that are known."""
         return owner if owner in self.known else b""
 
     def learn(self, owner: bytes, certificate: bytes) -> bool:
-        """Where it is the right one."""
         if owner == certificate:
             self.known.add(owner)
         return owner == certificate
 
 
 class Endpoint:
-    """Answers as the test says."""
-
     def __init__(self) -> None:
         self.door = KnownDoor()
         self.asked: list[list[bytes]] = []
@@ -47,11 +42,9 @@ class Endpoint:
         self.exposed: Any = None
 
     def expose(self, name: str, answer: Any) -> None:
-        """Keep it for the test."""
         self.exposed = answer
 
     def ask(self, contact: Contact, method: str, owners: list[bytes]) -> Deferred[Any]:
-        """Note the question."""
         self.asked.append(owners)
         answered: Deferred[Any] = self.answer(owners)
         return answered
@@ -63,27 +56,21 @@ def made() -> Any:
 
 
 def contact(number: int) -> Contact:
-    """Some peer."""
     return Contact(Identity(number.to_bytes(32)).public, Address("10.0.0.1", 1000 + number % 60_000))
 
 
 def owners(count: int) -> list[bytes]:
-    """Some keys."""
     return [number.to_bytes(32) for number in range(count)]
 
 
 class CertificateTests(SynchronousTestCase):
-    """One node's certificates."""
-
     def setUp(self) -> None:
-        """A door that knows nobody."""
         self.clock = HeapClock()
         self.endpoint = made()
         self.certificates = Certificates(self.endpoint, self.clock)
         self.door = self.endpoint.door
 
     def learn(self, which: list[bytes], peer: int = 1) -> None:
-        """Ask a peer."""
         self.successResultOf(Deferred.fromCoroutine(self.certificates.learn(contact(peer), which)))
 
     def test_asked_once_for_each(self) -> None:

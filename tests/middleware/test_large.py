@@ -34,7 +34,6 @@ class LargeTests(FleetCase):
             self.patch(module, "MAX_MEMBERS", MANY)
 
     def large(self, n: int = 24, weather: Weather = CALM) -> Fleet:
-        """A network that has found itself."""
         fleet = self.fleet(n, seed=3, weather=weather)
         fleet.run(20.0)
         self.assertTrue(all(node.overlay.is_large for node in fleet.nodes))
@@ -66,8 +65,8 @@ class LargeTests(FleetCase):
         """What a node finds closest to an id."""
         return self.done(fleet, node.find_node(target), 2.0)
 
-    def test_lookups_are_exact(self) -> None:
-        """Lookups are exact, over long ways too, while some let go of sessions that the others have yet."""
+    def test_a_lookup_finds_who_let_go_of_the_session(self) -> None:
+        """Lookups are exact over long ways, too, while some let go of sessions that the others have yet."""
         fleet = self.large(weather=Weather(0.08))
         node, target = fleet.nodes[0], self.far(fleet.nodes[0]).node_id
         others = [other.contact for other in fleet.nodes[1:]]

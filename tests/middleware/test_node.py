@@ -8,7 +8,7 @@ from typing import Any
 import msgpack
 
 from middleware.entangled.contact import Contact
-from middleware.entangled.errors import NoAnswer, NotRunning, Refused, TooLarge, Unavailable
+from middleware.entangled.errors import NoAnswer, NotRunning, Refused, TooLarge
 from middleware.entangled.kademlia.distance import closest
 from middleware.entangled.kademlia.overlay import K
 from middleware.entangled.network.switchboard import Weather
@@ -25,7 +25,6 @@ class NodeCase(FleetCase):
     """A few words for what most tests do."""
 
     def values(self, fleet: Fleet, place: int, key: bytes = KEY, within: float = 3.0) -> list[bytes | None]:
-        """What a node finds under ``key``."""
         return [record.value for record in self.done(fleet, fleet.nodes[place].get(key), within)]
 
     def watched(self, node: EntangledNode, **options: Any) -> list[list[bytes | None]]:
@@ -36,32 +35,20 @@ class NodeCase(FleetCase):
 
 
 class VerbTests(NodeCase):
-    def test_put_and_get(self) -> None:
-        """What one node puts, every node finds; a majority has it."""
+    def test_put_replace_and_remove(self) -> None:
+        """What nodes put under one key, each in its slot, all find, as it was put last; what is removed stays gone."""
         fleet = self.fleet(4)
         self.assertGreaterEqual(self.done(fleet, fleet.nodes[1].put(KEY, "state", b"one")), 3)
+        for node in fleet.nodes[:2]:
+            self.done(fleet, node.put(KEY, "state", b"two"))
         for place in range(4):
-            self.assertEqual(self.values(fleet, place), [b"one"])
-
-    def test_owners_do_not_disturb_each_other(self) -> None:
-        """Several owners write under one key, each in its slot, and the newest value of each is found."""
-        fleet = self.fleet(3)
-        for value in (b"old", b"new"):
-            for node in fleet.nodes[:2]:
-                node.put(KEY, "state", value)
-        fleet.run(1.0)
-        self.assertEqual(self.values(fleet, 2), [b"new", b"new"])
-
-    def test_remove(self) -> None:
-        """A removed record is gone for all and stays gone, and its slot can be filled again."""
-        fleet = self.fleet(3)
-        self.done(fleet, fleet.nodes[0].put(KEY, "state", b"one"))
+            self.assertEqual(self.values(fleet, place), [b"two", b"two"])
         self.done(fleet, fleet.nodes[0].remove(KEY, "state"))
-        self.assertEqual(self.values(fleet, 2), [])
-        fleet.run(60.0)
-        self.assertEqual(self.values(fleet, 1), [])
-        self.done(fleet, fleet.nodes[0].put(KEY, "state", b"two"))
         self.assertEqual(self.values(fleet, 2), [b"two"])
+        fleet.run(60.0)
+        self.assertEqual(self.values(fleet, 3), [b"two"])
+        self.done(fleet, fleet.nodes[0].put(KEY, "state", b"three"))
+        self.assertEqual(set(self.values(fleet, 2)), {b"two", b"three"})
 
     def test_a_node_alone(self) -> None:
         """A node alone keeps, finds and watches its own records, leases included."""
@@ -80,7 +67,10 @@ class VerbTests(NodeCase):
         for call in (lambda: node.put(b"x", "s", b""), lambda: node.get(b"x"), lambda: node.watch(b"x", print)):
             self.assertRaises(ValueError, call)
         node.stop()
-        for call in (lambda: node.put(KEY, "s", b""), lambda: node.get(KEY), lambda: node.watch(KEY, print)):
+        for call in (
+            *(lambda: node.put(KEY, "s", b""), lambda: node.get(KEY), lambda: node.watch(KEY, print)),
+            lambda: node.call(node.contact, "ping"),
+        ):
             self.assertRaises(NotRunning, call)
 
     def test_the_largest_record(self) -> None:
@@ -91,22 +81,6 @@ class VerbTests(NodeCase):
             fleet.nodes[0].put(KEY, name, bytes([place]) * (MAX_VALUE if place < 3 else 1))
         fleet.run(1.0)
         self.assertEqual(len(self.values(fleet, 1)), 12)
-
-    def test_no_majority(self) -> None:
-        """A record that no majority takes is not said to be stored; a read that nobody answers fails."""
-        fleet = self.fleet(4)
-        for place in (1, 2, 3):
-            fleet.board.kill(fleet.address(place))
-        stored, read = fleet.nodes[0].put(KEY, "state", b"one"), fleet.nodes[0].get(KEY)
-        fleet.run(4.0)
-        self.failureResultOf(stored, NoAnswer)
-        self.failureResultOf(read, Unavailable)
-
-    def test_find_node(self) -> None:
-        """A lookup finds the closest others."""
-        fleet = self.fleet(4)
-        target = fleet.nodes[2].identity.node_id
-        self.assertEqual(self.done(fleet, fleet.nodes[0].find_node(target))[0], fleet.nodes[2].contact)
 
     def test_earlier_life_is_stepped_over(self) -> None:
         """A node that lost its store writes over what its former life has left, even by the same number."""
@@ -200,17 +174,6 @@ class LeaseTests(NodeCase):
 
 
 class TeamRecordTests(NodeCase):
-    def test_outlive_the_writer(self) -> None:
-        """A team record is found when its writer is dead, also by a newcomer that the writer never saw."""
-        fleet = self.fleet(4)
-        self.done(fleet, fleet.nodes[3].put(KEY, "task", b"do it"))
-        fleet.nodes[3].vanish()
-        fleet.run(20.0)
-        fleet.add()
-        fleet.run(2.0)
-        self.assertEqual([r.value for r in fleet.stores[4].get(KEY)], [b"do it"])
-        self.assertEqual(self.values(fleet, 4), [b"do it"])
-
     def test_pass_from_hand_to_hand(self) -> None:
         """A record and a tombstone outlive every node that held them at first, one leaving after the other."""
         fleet = self.fleet(3)
@@ -226,22 +189,6 @@ class TeamRecordTests(NodeCase):
         self.assertEqual(self.values(fleet, 5), [b"do it"])
         self.assertEqual(len(fleet.stores[5].get(KEY, tombstones=True)), 2)
 
-    def test_restart_brings_them_back(self) -> None:
-        """After all nodes were off at once, what their stores kept is there again, and no lease is."""
-        fleet = self.fleet(3)
-        self.done(fleet, fleet.nodes[1].put(KEY, "task", b"do it"))
-        fleet.nodes[1].put(KEY, "state", b"here", "leased")
-        fleet.run(1.0)
-        for node in fleet.nodes:
-            node.vanish()
-        fleet.run(5.0)
-        before = fleet.nodes[2].contact
-        for place in range(3):
-            fleet.restart(place)
-        fleet.run(3.0)
-        self.assertEqual(self.values(fleet, 2), [b"do it"])
-        self.assertEqual(fleet.nodes[2].contact, before)
-
 
 class WatchTests(NodeCase):
     def test_changes_are_pushed(self) -> None:
@@ -255,18 +202,6 @@ class WatchTests(NodeCase):
         fleet.nodes[0].remove(KEY, "state")
         fleet.run(0.05)
         self.assertEqual(told, [[b"one"], [b"two"], []])
-
-    def test_stop(self) -> None:
-        """After its end a watch tells nothing."""
-        fleet = self.fleet(2)
-        told: list[object] = []
-        watch = fleet.nodes[1].watch(KEY, told.append)
-        fleet.run(0.5)
-        watch.stop()
-        watch.stop()
-        fleet.nodes[0].put(KEY, "state", b"one")
-        fleet.run(1.0)
-        self.assertEqual(told, [])
 
     def test_end_of_the_node_is_no_news(self) -> None:
         """A node that stops does not tell its own subscribers that everybody has left."""
@@ -370,12 +305,6 @@ class RpcTests(NodeCase):
         self.assertIn("argument 1 must be int", str(self.failureResultOf(text, Refused).value))
         self.failureResultOf(unknown, Refused)
         self.assertEqual(divide(client.contact, 1, 2), 0.5)
-
-    def test_only_a_running_node_calls(self) -> None:
-        """A node that was not started, or has ended, says so at once."""
-        fleet = self.fleet(2)
-        fleet.nodes[1].stop()
-        self.assertRaises(NotRunning, fleet.nodes[1].call, fleet.nodes[0].contact, "ping")
 
 
 class KeepTests(NodeCase):
@@ -491,18 +420,6 @@ class LargeFleetTests(NodeCase):
         self.assertLessEqual(replicas - {fleet.nodes[0].identity.node_id}, holders)
         self.assertEqual(told, [[b"do it"]])
 
-    def test_records_survive_a_slow_die_off(self) -> None:
-        """With their writer dead and half of the others dying one by one, the team's records are still found."""
-        fleet = self.fleet(20, seed=6)
-        for number in range(5):
-            fleet.nodes[19].put(hashed_key(f"task {number}"), "task", b"do it")
-        fleet.run(2.0)
-        for place in range(19, 9, -1):
-            fleet.nodes[place].vanish()
-            fleet.run(12.0)
-        for number in range(5):
-            self.assertEqual(self.values(fleet, number, hashed_key(f"task {number}")), [b"do it"])
-
 
 class JoinTests(NodeCase):
     def test_bootstrap_comes_later(self) -> None:
@@ -579,22 +496,8 @@ class WireTests(NodeCase):
         self.done(fleet, fleet.nodes[0].put(KEY, "state", b"one"))
         rng = random.Random(5)
         good = fleet.stores[0].get(KEY)[0].packed()
-        pieces: list[Any] = [
-            None,
-            5,
-            -1.5,
-            "x",
-            b"x",
-            KEY,
-            [],
-            [5],
-            [[]],
-            {},
-            [good[:7]],
-            [good, 5],
-            [None, "x"],
-            [1, 2],
-        ]
+        pieces: list[Any] = [None, 5, -1.5, "x", b"x", KEY, [], [5], [[]], {}]
+        pieces += [[good[:7]], [good, 5], [None, "x"], [1, 2]]
         before = [store.records() for store in fleet.stores.values()]
         for method in self.METHODS:
             for _ in range(25):
@@ -605,18 +508,6 @@ class WireTests(NodeCase):
         fleet.run(2.0)
         self.assertEqual(self.flushLoggedErrors(), [])
         self.assertEqual([store.records() for store in fleet.stores.values()], before)
-
-    def test_records_of_others(self) -> None:
-        """Nobody stores a record in the name of another without its signature, nor a lease of another at all."""
-        fleet = self.fleet(3)
-        owner = fleet.nodes[1].identity
-        forged = Record(KEY, "x", owner.public, 9, "team", 60.0, b"x", bytes(64))
-        leased = Record(KEY, "x", owner.public, 9, "leased", 60.0, b"x").signed(owner)
-        genuine = Record(KEY, "y", owner.public, 9, "team", 60.0, b"y").signed(owner)
-        packed = [r.packed() for r in (forged, leased, genuine)]
-        asked = fleet.nodes[2].endpoint.ask(fleet.nodes[0].contact, "store", packed, changes=True)
-        self.assertEqual(self.done(fleet, asked), [-1, -1, 0])
-        self.assertEqual(fleet.stores[0].get(KEY), [genuine])
 
     def test_half_a_message_is_none(self) -> None:
         """Where one of several records is malformed, none of them is stored."""

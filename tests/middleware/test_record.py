@@ -29,16 +29,6 @@ ANYTHING = st.recursive(
 
 
 class RecordTest(SynchronousTestCase):
-    def test_slot(self) -> None:
-        """A slot is key, owner and name; two owners never share one."""
-        self.assertEqual(record().slot, (KEY, DOG.public, "state"))
-        self.assertNotEqual(record().slot, record(owner=CAT).slot)
-
-    def test_tombstone(self) -> None:
-        """A record without a value is a tombstone; one with an empty value is not."""
-        self.assertTrue(record(value=None).is_tombstone)
-        self.assertFalse(record(value=b"").is_tombstone)
-
     def test_which_holds(self) -> None:
         """The higher sequence holds; of two with one sequence all replicas choose the same, and none beats itself."""
         one, other = record(value=b"1"), record(value=b"2")

@@ -1,10 +1,11 @@
-"""What becomes of a store whose file has rotted."""
+"""What becomes of a store whose file has rotted, or is of an older schema."""
 
 from __future__ import annotations
 
 import os
 import random
 import sqlite3
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
@@ -13,13 +14,13 @@ from twisted.trial.unittest import SynchronousTestCase
 from zope.interface import implementer
 
 from middleware.entangled.data.salvage import set_aside
+from middleware.entangled.data.schema import APPLICATION_ID, SCHEMA_VERSION, make
 from middleware.entangled.data.sqlite import SqliteStore
-from tests.middleware.test_store import DOG, FOREVER, record
+from tests.middleware.test_store import DOG, FOREVER, KEY, record
 
 
 class RottenFileTest(SynchronousTestCase):
     def setUp(self) -> None:
-        self.path = self.mktemp()
         self.lines: list[str] = []
 
         @implementer(ILogObserver)
@@ -28,6 +29,11 @@ class RottenFileTest(SynchronousTestCase):
 
         globalLogPublisher.addObserver(seen)
         self.addCleanup(globalLogPublisher.removeObserver, seen)
+        self.fill()
+
+    def fill(self) -> None:
+        """Leave a file with 200 records and a note."""
+        self.path = self.mktemp()
         store = SqliteStore.open(self.path, 0.0)
         self.epoch = store.epoch
         store.note("identity", DOG.seed)
@@ -56,43 +62,37 @@ class RottenFileTest(SynchronousTestCase):
         store.flush()
         return store
 
-    def test_header(self) -> None:
-        """A file whose header was overwritten is set aside, and the node starts empty and says so."""
-        self.overwrite(0, b"\x5a" * 100)
-        self.assertIsNone(self.opened_anew().noted("identity"))
-        self.assertIn("nothing in it could be saved", self.lines[-1])
-
-    def test_first_page(self) -> None:
-        """A file whose first page is gone is known as ours by what stands in the others."""
-        self.overwrite(0, random.Random(1).randbytes(4096))
-        self.opened_anew()
-
-    def test_application_id(self) -> None:
-        """A file whose header no longer says that it is ours is known by its tables, and its notes are saved."""
-        self.overwrite(68, b"\1\2\3\4")
-        self.assertEqual(self.opened_anew().noted("identity"), DOG.seed)
-
-    def test_pages(self) -> None:
-        """A file of which pages were overwritten is not served with holes; notes that are whole are saved."""
-        self.overwrite(4096 * 12, b"\xff" * 4096 * 4)
-        self.assertEqual(self.opened_anew().noted("identity"), DOG.seed)
-        self.assertIn("its notes were saved (identity", self.lines[-1])
-
-    def test_cut_short(self) -> None:
-        """A file of which the end is missing is set aside."""
-        os.truncate(self.path, os.path.getsize(self.path) // 2)
-        self.opened_anew()
-
-    def test_zeros(self) -> None:
-        """A file of which a card left nothing but zeros is set aside."""
-        Path(self.path).write_bytes(bytes(40_960))
-        self.opened_anew()
-
-    def test_without_tables(self) -> None:
-        """A file that says it is ours and has not our tables is set aside."""
+    def drop_table(self) -> None:
         with closing(sqlite3.connect(self.path)) as connection:
             connection.execute("DROP TABLE records")
-        self.opened_anew()
+
+    def rot_index(self) -> None:
+        with closing(sqlite3.connect(self.path)) as connection:
+            index = "SELECT rootpage FROM sqlite_schema WHERE type = 'index' AND tbl_name = 'records'"
+            (page,) = connection.execute(index).fetchone()
+        self.overwrite(4096 * (page - 1) + 4000, bytes(range(96)))
+
+    def test_damage(self) -> None:
+        """However a file is damaged it is set aside, not served with holes; the notes that are whole are saved."""
+        saved, lost = "its notes were saved (identity", "nothing in it could be saved"
+        damages: tuple[tuple[Callable[[], object], str], ...] = (
+            (lambda: self.overwrite(0, b"\x5a" * 100), lost),  # its header
+            (lambda: self.overwrite(0, random.Random(1).randbytes(4096)), ""),  # its first page
+            (lambda: self.overwrite(68, b"\1\2\3\4"), saved),  # the header does not say that it is ours
+            (lambda: self.overwrite(4096 * 12, b"\xff" * 4096 * 4), saved),
+            (lambda: os.truncate(self.path, os.path.getsize(self.path) // 2), ""),
+            (lambda: Path(self.path).write_bytes(bytes(40_960)), lost),  # what a card leaves that lost its pages
+            (self.drop_table, ""),
+            (self.rot_index, saved),  # it would still answer, but write wrongly
+        )
+        for damage, said in damages:
+            self.fill()
+            self.lines.clear()
+            damage()
+            store = self.opened_anew()
+            self.assertIn(said, self.lines[-1])
+            if said:
+                self.assertEqual(store.noted("identity"), DOG.seed if said == saved else None)
 
     def test_again(self) -> None:
         """A second rotten file does not take the name of the first, and the notes live on."""
@@ -120,14 +120,6 @@ class RottenFileTest(SynchronousTestCase):
         self.assertTrue(Path(self.path + ".rotten-1").exists())
         with closing(SqliteStore.open(self.path, 0.0)) as store:
             self.assertEqual((store.origin, len(store)), ("kept", 0))
-
-    def test_index(self) -> None:
-        """A file of which only the index rotted would still answer, but write wrongly; it is set aside."""
-        with closing(sqlite3.connect(self.path)) as connection:
-            index = "SELECT rootpage FROM sqlite_schema WHERE type = 'index' AND tbl_name = 'records'"
-            (page,) = connection.execute(index).fetchone()
-        self.overwrite(4096 * (page - 1) + 4000, bytes(range(96)))
-        self.assertEqual(self.opened_anew().noted("identity"), DOG.seed)
 
     def test_parts(self) -> None:
         """What belongs to a file is set aside with it, under a name that nothing bears yet."""
@@ -160,3 +152,50 @@ class RottenFileTest(SynchronousTestCase):
                 lost = 200 - len(store)
                 self.assertTrue(not lost or store.origin == "replaced" or store.rotten >= lost, (lost, store.rotten))
         self.assertEqual(seen, {"kept, False", "kept, True", "replaced, False"})
+
+
+OLD = """
+CREATE TABLE records(key BLOB, owner BLOB, name TEXT, sequence INTEGER, lifetime TEXT, ttl REAL, value BLOB,\
+ signature BLOB, PRIMARY KEY(key, owner, name)) WITHOUT ROWID;
+CREATE TABLE notes(name TEXT PRIMARY KEY, value BLOB);
+PRAGMA user_version = 1;
+PRAGMA journal_mode = WAL;
+"""
+
+
+class OldSchemaTest(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.path = self.mktemp()
+        self.kept = [record("a"), record("b", sequence=3, value=None), record("c", value=b"")]
+        rows: list[tuple[object, ...]] = [
+            (r.key, r.owner, r.name, r.sequence, r.lifetime, r.ttl, r.value, r.signature) for r in self.kept
+        ]
+        rows.append((b"no", b"record", "", 1, "", 1.0, b"", b""))
+        with closing(sqlite3.connect(self.path, isolation_level=None)) as connection:
+            connection.executescript(OLD + f"PRAGMA application_id = {APPLICATION_ID};")
+            connection.executemany("INSERT INTO records VALUES (?, ?, ?, ?, ?, ?, ?, ?)", rows)
+            connection.execute("INSERT INTO notes VALUES ('identity', ?)", (DOG.seed,))
+
+    def test_migrates(self) -> None:
+        """A file of the schema before this one is taken over whole, once, and its bad rows are set aside."""
+        for _ in range(2):
+            with closing(SqliteStore.open(self.path, 0.0)) as store:
+                self.assertEqual(store.get(KEY, tombstones=True), self.kept)
+                self.assertEqual((store.noted("identity"), store.origin, store.rotten), (DOG.seed, "kept", 0))
+                self.assertNotEqual(store.epoch, bytes(8))
+                store.put(record("a"), FOREVER)
+        with closing(sqlite3.connect(self.path)) as connection:
+            self.assertEqual(connection.execute("PRAGMA user_version").fetchone(), (SCHEMA_VERSION,))
+            self.assertEqual(connection.execute("SELECT count(*) FROM rotten").fetchone(), (1,))
+            names = connection.execute("SELECT name FROM sqlite_schema WHERE type = 'table' ORDER BY name").fetchall()
+        self.assertEqual(names, [("notes",), ("records",), ("rotten",)])
+
+    def test_all_or_nothing(self) -> None:
+        """A migration for which there is no room leaves the old file as it was, to be taken over later."""
+        with closing(sqlite3.connect(self.path, isolation_level=None)) as connection:
+            connection.text_factory = bytes
+            connection.execute("PRAGMA max_page_count = 1")
+            error = self.assertRaises(sqlite3.OperationalError, make, connection, 1)
+            self.assertIn("full", str(error))
+            self.assertFalse(connection.in_transaction)
+        self.test_migrates()

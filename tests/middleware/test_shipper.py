@@ -30,16 +30,13 @@ class ShipperTests(FleetCase):
         self.there: Contact = self.world.nodes[1].contact
 
     def record(self, number: int, size: int = 50) -> Record:
-        """A record of the writer's."""
         identity: Identity = self.world.nodes[0].identity
         return Record(KEY, f"{number}", identity.public, number + 1, "team", TEAM_TTL, b"x" * size).signed(identity)
 
     def stored(self, *records: Record) -> list[Deferred[object]]:
-        """Store them all at once."""
         return [Deferred.fromCoroutine(self.shipper.store(self.there, record)) for record in records]
 
     def count_questions(self) -> None:
-        """Note how many records each question brings."""
         replica, answer = self.world.nodes[1].replica, Replica.answer_store
 
         def counted(peer: Contact, packed: list[object], *left: Any) -> object:
@@ -56,7 +53,7 @@ class ShipperTests(FleetCase):
         self.assertEqual([self.successResultOf(verdict) for verdict in verdicts], [0] * FLOOD)
         self.assertEqual(self.asked, [1] + [ROOM // self.record(1).message_bytes] * 6 + [3])
         self.assertEqual(len(self.world.nodes[1].store.get(KEY)), FLOOD)
-        self.assertEqual(self.shipper._quays, {})
+        self.assertEqual(self.shipper._waiting, {})
 
     def test_what_is_handed_on_keeps_its_life(self) -> None:
         """A record of another is kept as long as whoever hands it on would have; an own one for a whole ttl."""
@@ -93,7 +90,7 @@ class ShipperTests(FleetCase):
         self.world.run(2 * PATIENCE + 0.1)
         for verdict in verdicts:
             self.failureResultOf(verdict, EntangledError)
-        self.assertEqual(self.shipper._quays, {})
+        self.assertEqual(self.shipper._waiting, {})
 
     def test_a_long_record_holds_up_nobody(self) -> None:
         """A record that needs a parcel goes by itself; a short one that comes after it is asked for at once."""

@@ -28,12 +28,10 @@ class StreamsTests(EndpointCase):
             each.stop()
 
     def see(self, sequence: int, frame: bytes, age: float) -> None:
-        """Take note of a frame."""
         self.frames.append((sequence, frame))
         self.ages.append(age)
 
     def part(self, sequence: int, number: int, count: int, part: bytes, age_ms: int = 0) -> None:
-        """One part arrives."""
         self.viewer._answer_part(self.to_publisher, CAMERA, sequence, number, count, part, age_ms)
 
     def test_frames_arrive_whole(self) -> None:

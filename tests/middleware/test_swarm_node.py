@@ -7,7 +7,6 @@ from typing import Any
 
 from twisted.internet.defer import Deferred
 
-from middleware.consensus.lease.lessee import Lessee
 from middleware.directory.presence import DEVICES, Device, devices_of
 from middleware.entangled.errors import NoAnswer, Refused
 from middleware.entangled.network.switchboard import Weather
@@ -27,11 +26,9 @@ class SwarmNodeTests(FleetCase):
         return [(device.name, device.joined) for device, _ in devices_of(records)]
 
     def submitted(self, fleet: SwarmFleet, task: Task = TASK) -> Task:
-        """A task as it was published."""
         return self.done(fleet, Deferred.fromCoroutine(fleet.nodes[0].submit(task)), 5.0)
 
     def asked(self, fleet: SwarmFleet, method: str, *arguments: object) -> Deferred[Any]:
-        """A call of dog1 to dog0."""
         to = fleet.nodes[0].entangled.contact
         return fleet.nodes[1].entangled.endpoint.ask(to, method, *arguments, changes=True)
 
@@ -43,39 +40,17 @@ class SwarmNodeTests(FleetCase):
             self.assertEqual(self.names(fleet, place), expected)
 
     def test_joining_at_the_same_moment(self) -> None:
-        """Those that come at one moment get different numbers all the same, also in rough weather."""
-        for seed, weather in ((1, Weather(0.005)), (2, Weather(0.005, 0.005)), (3, ROUGH), (4, ROUGH)):
-            fleet = self.swarm(5, seed, weather, pause=0.0)
-            fleet.run(20.0)
+        """Those that come at one moment get different numbers, a crowd in a second, and also in rough weather."""
+        for n, seed, weather, seconds in (
+            (21, 1, Weather(0.005), 1.0),
+            (5, 2, Weather(0.005, 0.005), 20.0),
+            (5, 3, ROUGH, 20.0),
+            (3, 4, Weather(delay_s=0.01, loss=0.5), 40.0),
+        ):
+            fleet = self.swarm(n, seed, weather, pause=0.0)
+            fleet.run(seconds)
             places = [node.presence.device.joined for node in fleet.nodes]
-            self.assertEqual(len(set(places)), 5, places)
-
-    def test_a_crowd_at_the_same_moment(self) -> None:
-        """Twenty that come at one moment are in order after a second: each steps behind all that stay ahead at once."""
-        fleet = self.swarm(21, weather=Weather(0.005), pause=0.0)
-        fleet.run(1.0)
-        places = [node.presence.device.joined for node in fleet.nodes]
-        self.assertEqual(len(set(places)), 21, places)
-
-    def test_joins_in_rough_weather(self) -> None:
-        """A device appears although its first questions were lost."""
-        for seed in range(4):
-            fleet = self.swarm(3, seed, Weather(delay_s=0.01, loss=0.5))
-            fleet.run(40.0)
-            self.assertEqual([node.presence.device.joined > 0 for node in fleet.nodes], [True] * 3, seed)
-
-    def test_replay(self) -> None:
-        """The same seed gives the same datagrams at the same moments, and another seed others."""
-        digests = []
-        for seed in (1, 1, 2):
-            fleet = self.swarm(4, seed, ROUGH)
-            fleet.nodes[1].watch_devices(lambda records: None, keep=True)
-            self.submitted(fleet)
-            fleet.nodes[2].vanish()
-            fleet.run(10.0)
-            digests.append(fleet.board.digest())
-        self.assertEqual(digests[0], digests[1])
-        self.assertNotEqual(digests[0], digests[2])
+            self.assertEqual(len({place for place in places if place > 0}), n, places)
 
     def test_place_is_kept(self) -> None:
         """A device that changes what it says of itself keeps its number; its messages reach everybody."""
@@ -137,58 +112,6 @@ class SwarmNodeTests(FleetCase):
         self.assertEqual(fleet.nodes[3].store.get(group_key("t1")), group[-1])
         self.assertEqual(len(fleet.nodes[3].store.get(TASKS)), 1)
 
-    def lessees(self, fleet: SwarmFleet, task: Task) -> list[Lessee]:
-        """The claimants of all nodes."""
-        return [node.lessee(task, lambda: None, 0) for node in fleet.nodes]
-
-    def test_one_holder_and_takeover(self) -> None:
-        """Of three that want a task one gets it; when it vanishes, another one does, with a higher token."""
-        fleet = self.swarm(4)
-        fleet.run(TASK.lease_ttl)
-        lessees = self.lessees(fleet, self.submitted(fleet))
-        for lessee in lessees[1:]:
-            lessee.want()
-        fleet.run(2.0)
-        (first,) = [n for n, lessee in enumerate(lessees) if lessee.lease]
-        token = lessees[first].token
-        lessees[first].release()
-        fleet.nodes[first].vanish()
-        for _ in range(60):
-            fleet.run(0.05)
-            self.assertLessEqual(len([lessee for lessee in lessees if lessee.lease]), 1)
-        (second,) = [lessee for lessee in lessees if lessee.lease]
-        self.assertGreater(second.token, token)
-        for lessee in lessees:
-            lessee.release()
-        fleet.run(2.0)
-
-    def test_council_member_comes_back(self) -> None:
-        """Two of three members that were restarted do not grant what they have granted before they forgot it."""
-        fleet = self.swarm(4)
-        fleet.run(TASK.lease_ttl)
-        task = self.submitted(fleet)
-        lessees = self.lessees(fleet, task)
-        outsider = next(n for n, node in enumerate(fleet.nodes) if node.entangled.contact not in task.council)
-        lessees[outsider].want()
-        fleet.run(0.5)
-        lease = lessees[outsider].lease
-        assert lease is not None
-        fleet.board.partition([fleet.address(outsider)])
-        for place in [n for n in range(4) if n != outsider][:2]:
-            fleet.nodes[place].vanish()
-            fleet.nodes[place] = fleet.made(place)
-            fleet.nodes[place].startService()
-        rival = fleet.nodes[next(n for n in range(4) if n != outsider)].lessee(task, lambda: None, 0)
-        rival.want()
-        while lessees[outsider].lease:
-            fleet.run(0.02)
-            self.assertFalse(rival.lease and lessees[outsider].lease)
-        fleet.run(4.0)
-        self.assertIsNotNone(rival.lease)
-        rival.release()
-        lessees[outsider].release()
-        fleet.run(2.0)
-
     def test_strange_tasks(self) -> None:
         """A claim on a task whose ttl or token no council grants is refused, not an accident."""
         fleet = self.swarm(2)
@@ -206,22 +129,10 @@ class SwarmNodeTests(FleetCase):
         """Claims with a wrong name, configuration, ballot, token or duration are refused, and crafted councils."""
         fleet = self.swarm(2)
         good = ["t", 1, 1, 1.0]
-        for place, bad in (
-            (0, "t" * 65),
-            (0, 5),
-            (1, 0),
-            (2, -1),
-            (2, 2**62),
-            (2, True),
-            (3, 0.0),
-            (3, 61.0),
-            (3, "1"),
-        ):
-            question = [*good[:place], bad, *good[place + 1 :]]
-            asked = self.asked(fleet, "lease.prepare", *question)
-            fleet.run(0.1)
-            self.failureResultOf(asked, Refused)
+        wrong: list[tuple[int, Any]] = [(0, "t" * 65), (0, 5), (1, 0), (2, -1), (2, 2**62), (2, True)]
+        wrong += [(3, 0.0), (3, 61.0), (3, "1")]
         for method, *question in (
+            *(("lease.prepare", *good[:place], bad, *good[place + 1 :]) for place, bad in wrong),
             ("lease.prepare", "t", 1, 1, float("nan")),
             ("lease.propose", "t", 1, 1, 0, 1.0),
             ("lease.release", "t", -1, 0.0),

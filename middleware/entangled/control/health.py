@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping
 from typing import Any
 
@@ -9,7 +10,9 @@ from twisted.internet.defer import Deferred, DeferredList
 from twisted.internet.interfaces import IReactorTime
 from twisted.internet.task import deferLater
 
+from middleware.entangled.background import Background
 from middleware.entangled.contact import Contact
+from middleware.entangled.control.link import link
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.network.network import is_relayed
 from middleware.entangled.node import EntangledNode
@@ -20,6 +23,13 @@ APART = 0.1
 LIMIT = 1.5
 MAX_LINKS = 32
 """Peers whose ways are measured: 32 x 10 questions in a second are 50 kB each way."""
+PACE = 1.0
+"""Seconds between two questions to a peer, after the first ``ASKED`` ones."""
+FEW = 10
+"""Peers up to which that holds; with more of them it goes slower, so that a node asks 10 questions a second at most,
+and 100 at the beginning: 1 and 10 kB each way."""
+IDLE = 12.0
+"""Seconds since the last who wanted to know after which it ends."""
 
 
 def health(node: EntangledNode) -> Mapping[str, Any]:
@@ -83,3 +93,64 @@ async def _times(node: EntangledNode, clock: IReactorTime, contact: Contact) -> 
         asked.append(Deferred.fromCoroutine(timed(node, clock, contact)))
         await deferLater(clock, APART)
     return [seconds for _, seconds in await DeferredList(asked, consumeErrors=True)]
+
+
+class Gauge:
+    """Measures the ways from ``node`` to its peers, only while somebody wants to know.
+
+    The first caller is answered at once, and gets more with each second.  Each peer is asked small questions: some in
+    quick succession, then one a second, until nobody has asked for a while.
+    """
+
+    def __init__(self, node: EntangledNode, clock: IReactorTime, chores: Background) -> None:
+        self._node = node
+        self._clock = clock
+        self._chores = chores
+        self._times: dict[bytes, deque[float | None]] = {}
+        self._turns = 0
+        self._wanted_at = float("-inf")
+        self._is_running = False
+
+    def links(self) -> list[dict[str, Any]]:
+        """The way to each peer and how good it is, as far as it is known by now; this also keeps it measuring.
+
+        Each is what ``way`` says, and ``loss``, ``round_trip`` and ``jitter`` (None: not known).
+        """
+        self._wanted_at = self._clock.seconds()
+        if not self._is_running:
+            self._is_running = True
+            self._turns = 0
+            self._times.clear()
+            self._turn()
+        return [{**way(self._node, self._clock, each), **self._figures(each)} for each in self._peers()]
+
+    def _figures(self, contact: Contact) -> dict[str, float | None]:
+        times = self._times.get(contact.public)
+        if not times:
+            return {"loss": None, "round_trip": None, "jitter": None}
+        found = link(list(times), False)
+        return {"loss": round(found.loss, 3), "round_trip": found.round_trip, "jitter": found.jitter}
+
+    def _peers(self) -> list[Contact]:
+        return sorted(self._node.overlay.contacts(), key=lambda contact: contact.node_id)[:MAX_LINKS]
+
+    def _turn(self) -> None:
+        if self._clock.seconds() - self._wanted_at > IDLE:
+            self._is_running = False
+            self._times.clear()
+            return
+        self._turns += 1
+        peers = self._peers()
+        here = {contact.public for contact in peers}
+        self._times = {public: times for public, times in self._times.items() if public in here}
+        for contact in peers:
+            # The first question to a peer opens the session, and takes longer.
+            is_met = self._node.endpoint.is_met(contact)
+            self._chores.fork(self._time(contact) if is_met else timed(self._node, self._clock, contact))
+        pause = APART if self._turns < ASKED else PACE
+        self._chores.later(pause * max(1.0, len(peers) / FEW), self._turn)
+
+    async def _time(self, contact: Contact) -> None:
+        seconds = await timed(self._node, self._clock, contact)
+        if self._is_running:
+            self._times.setdefault(contact.public, deque(maxlen=ASKED)).append(seconds)

@@ -177,10 +177,7 @@ class Arguments:
 
     def data(self, name: str) -> bytes:
         """Bytes, given as text or as ``{"base64": ...}``."""
-        try:
-            value = word.value(self._given.get(name))
-        except word.BadWord as error:
-            raise BadRequest(f"{name}: {error}") from error
+        value = self._value(name)
         if isinstance(value, str):
             return value.encode()
         if not isinstance(value, bytes):
@@ -209,13 +206,10 @@ class Arguments:
 
     def fields(self, name: str) -> list[Any]:
         """The fields of a tuple, or the arguments of a method."""
-        given = self._given.get(name)
-        if not isinstance(given, list):
+        value = self._value(name)
+        if not isinstance(value, list):
             raise BadRequest(f"{name}: must be a list")
-        try:
-            return [word.value(each) for each in given]
-        except word.BadWord as error:
-            raise BadRequest(f"{name}: {error}") from error
+        return value
 
     def template(self, name: str) -> list[Field]:
         """The fields of a template: a value, ``{"any": true}``, ``{"kind": "int"}`` or an operator with its operand."""
@@ -223,6 +217,12 @@ class Arguments:
         if not isinstance(given, list):
             raise BadRequest(f"{name}: must be a list")
         return [_field(each) for each in given]
+
+    def _value(self, name: str) -> Any:
+        try:
+            return word.value(self._given.get(name))
+        except word.BadWord as error:
+            raise BadRequest(f"{name}: {error}") from error
 
 
 def key_of(text: str) -> bytes:

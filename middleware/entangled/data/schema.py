@@ -67,18 +67,8 @@ class Contents:
 
 def row_of(record: Record) -> tuple[object, ...]:
     """``record`` in the order of ``FIELDS``."""
-    key, owner, name = record.slot
-    return (
-        key,
-        owner,
-        name,
-        record.sequence,
-        record.lifetime,
-        record.ttl,
-        record.signature,
-        _crc(record.packed()),
-        record.value,
-    )
+    crc = _crc(record.packed())
+    return *record.slot, record.sequence, record.lifetime, record.ttl, record.signature, crc, record.value
 
 
 def record_of(row: Sequence[Any]) -> Record | None:

@@ -15,7 +15,6 @@ from urllib.parse import quote
 from twisted.internet.defer import Deferred
 from twisted.logger import Logger
 
-from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.data.salvage import is_ours, saved_notes, set_aside
 from middleware.entangled.data.schema import (
     SELECT,
@@ -27,7 +26,7 @@ from middleware.entangled.data.schema import (
     open_rows,
     record_of,
 )
-from middleware.entangled.data.store import HOLD, MAX_BYTES, MAX_ROWS, Durable, Origin
+from middleware.entangled.data.store import HOLD, MAX_BYTES, MAX_ROWS, Durable, Origin, Store
 from middleware.entangled.data.writer import Deliver, Writer
 from middleware.entangled.errors import BadStore, NotRunning
 from middleware.entangled.record import Record, Slot
@@ -39,7 +38,7 @@ MAX_LOG = 4 * 2**20
 """Bytes to which the write-ahead log is cut after a flood of writes."""
 
 
-class SqliteStore(MemoryStore):
+class SqliteStore(Store):
     """A ``Store`` with the file ``path`` behind it; ``open`` makes one.
 
     While the file cannot be written (a full disk, say) reads go on, ``put`` raises ``Unwritable`` with the reason, and
@@ -122,12 +121,12 @@ class SqliteStore(MemoryStore):
             store.note(name, value)
         return store
 
-    def put(self, record: Record, expires_at: float, now: float | None = None) -> bool:
+    def put(self, record: Record, expires_at: float) -> bool:
         """Hold ``record`` if it beats what its slot holds; see ``Store.put``."""
         self._check_open()
         if self._writer.trouble and record.beats(self.slot(record.slot)):
             raise self._writer.refusal(self._writer.trouble)
-        return super().put(record, expires_at, now)
+        return super().put(record, expires_at)
 
     def written(self) -> Deferred[None]:
         """Fire when all that was put until now is in the file; fail with ``Unwritable`` if it cannot be written."""

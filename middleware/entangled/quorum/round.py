@@ -151,12 +151,12 @@ class Round:
             if timer is not None and timer.active():
                 timer.cancel()
 
-    def free_in(self, share: float = 0.5) -> float:
+    def free_in(self) -> float:
         """Seconds until a majority may be free to agree, as far as its members told.
 
-        A member counted somewhere between question and answer: after ``share`` of the time is the guess.
+        A member counted somewhere between question and answer: half way is the guess.
         """
-        free_at = {p: sent + share * (heard - sent) + left for p, (sent, heard, left) in self._heard.items()}
+        free_at = {p: (sent + heard) / 2 + left for p, (sent, heard, left) in self._heard.items()}
         # Of a silent member nothing is known; where all are silent, nothing is known against asking at once.
         unknown = math.inf if self.tally.replies else -math.inf
         waits = sorted(free_at.get(place, unknown) for place in range(self.tally.size))

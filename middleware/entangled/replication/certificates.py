@@ -13,7 +13,6 @@ from twisted.internet.interfaces import IReactorTime
 
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import EntangledError
-from middleware.entangled.record import Slot
 from middleware.entangled.wire.door import FOREIGN, Door
 from middleware.entangled.wire.endpoint import Endpoint
 
@@ -34,14 +33,6 @@ class Certificates:
         self._clock = clock
         self._unasked: dict[bytes, float] = {}
         endpoint.expose("certificates", self._answer_certificates)
-
-    def may_store(self, slot: Slot) -> bool:
-        """Whether the owner of ``slot`` may write there at present."""
-        return self.door.may_store(slot)
-
-    def may_stay(self, slot: Slot) -> bool:
-        """Whether what is held in ``slot`` may be held on and shown."""
-        return self.door.may_stay(slot)
 
     def lacking(self, contact: Contact, owners: Iterable[bytes]) -> list[bytes]:
         """Those of ``owners`` whose certificates this node has not seen, and may ask ``contact`` for."""

@@ -27,7 +27,6 @@ from middleware.entangled.replication.overlap import BITS, GROUPS, PLACES, Mark,
 from middleware.entangled.replication.owner import REPUBLISH, Owner
 from middleware.entangled.replication.replica import Replica, pages_of
 from middleware.entangled.replication.standing import ELDER, NOVICE, SURE, Standing
-from middleware.entangled.replication.store_reply import StoreReply
 from middleware.entangled.replication.watch import digest_of
 from middleware.entangled.wire.endpoint import Endpoint
 
@@ -115,7 +114,7 @@ class Handover:
         self._given.pop(contact.node_id, None)
         self._standings.pop(contact.node_id, None)
         heirs: dict[bytes, tuple[Contact, list[Record]]] = {}
-        for record in self._overlap.records():
+        for record in self._replica.team_records():
             nearest = self._overlay.responsible(record.key)
             if len(nearest) < K or all(c.node_id != self._own_id for c in nearest[:STEWARDS]):
                 continue
@@ -189,7 +188,7 @@ class Handover:
             if len(places) < PLACES or (after is not None and places[-1][0] <= after):
                 break
             after = places[-1][0]
-        wanted = [slot for slot, mark in theirs.items() if mark > mark_of(self._overlap.held(slot))]
+        wanted = [slot for slot, mark in theirs.items() if mark > mark_of(self._replica.shown(slot))]
         await self._fetch(contact, wanted)
         lacked = [record for record in mine if mark_of(record) > theirs.get(record.slot, (-1, b""))]
         await self._give_all(contact, lacked)
@@ -199,7 +198,7 @@ class Handover:
 
         So the longest life that any holder names is that of all: one that names a short one ends nothing.
         """
-        record = self._overlap.held(slot)
+        record = self._replica.shown(slot)
         if record is None or record.lifetime != "team" or mark_of(record) != mark:
             return
         if min(left, record.ttl) > self._replica.left(record) + LONGER:
@@ -221,7 +220,7 @@ class Handover:
         record = unpacked(fields)
         if record is None or record.slot != slot or type(left) is not float or record.lifetime != "team":
             return
-        if record.beats(self._overlap.held(slot)) and self._replica.is_genuine(record):
+        if record.beats(self._replica.shown(slot)) and self._replica.is_genuine(record):
             self._replica.keep(record, left)
 
     async def _give_lacking(self, contact: Contact, records: list[Record]) -> None:
@@ -247,9 +246,6 @@ class Handover:
             lives = [self._replica.left(record) for record in page]
             with suppress(Refused):
                 await self._overlay.ask(contact, "store", [r.packed() for r in page], lives, changes=True)
-
-    async def _give(self, contact: Contact, record: Record) -> StoreReply:
-        return await self._owner.store_at(contact, record, self._replica.left(record))
 
     async def _catch_up(self) -> None:
         """Reconcile with near nodes, so many that nothing acknowledged can be missed."""
@@ -317,7 +313,7 @@ class Handover:
         if others:
             self._chores.fork(self._reconcile(others[self._rng.randrange(len(others))]))
         now = self._clock.seconds()
-        records = self._overlap.records()
+        records = self._replica.team_records()
         slots = {record.slot for record in records}
         self._stored_at = {slot: at for slot, at in self._stored_at.items() if slot in slots}
         for record in records:
@@ -329,7 +325,9 @@ class Handover:
 
     async def _spread(self, record: Record) -> Any:
         targets = await self._overlay.holders(record.key)
-        return await first(len(targets), [self._give(c, record) for c in targets if c.node_id != self._own_id])
+        others = [contact for contact in targets if contact.node_id != self._own_id]
+        left = self._replica.left(record)
+        return await first(len(targets), [self._owner.store_at(contact, record, left) for contact in others])
 
 
 def _is_list_of(parts: object, kind: type) -> bool:

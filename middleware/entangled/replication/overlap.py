@@ -56,14 +56,6 @@ class Overlap:
         endpoint.expose("fetch", self._answer_fetch)
         endpoint.expose("lacking", self._answer_lacking)
 
-    def held(self, slot: Slot) -> Record | None:
-        """What the slot holds here, for others to see."""
-        return self._replica.shown(slot)
-
-    def records(self) -> list[Record]:
-        """The team records that are held here, tombstones included."""
-        return self._replica.team_records()
-
     def both(self, peer: Contact) -> tuple[list[list[Record]], list[Record]]:
         """What is held here and should be at the peer as well: by parts, and what should not be here any more."""
         groups: list[list[Record]] = [[] for _ in range(GROUPS)]
@@ -71,7 +63,7 @@ class Overlap:
         if self._near_version != self._overlay.roster.version or not self._overlay.is_complete:
             self._near.clear()
             self._near_version = self._overlay.roster.version
-        for record in self.records():
+        for record in self._replica.team_records():
             ids = self._near.get(record.key)
             if ids is None:
                 ids = self._near[record.key] = [c.node_id for c in self._overlay.responsible(record.key)]
@@ -134,7 +126,7 @@ class Overlap:
             slot = slot_unpacked(place)
             if slot is None:
                 raise Refused("a slot is a key, an owner and a name")
-            record = self.held(slot)
+            record = self._replica.shown(slot)
             size += 0 if record is None else record.message_bytes
             if page and size > PAGE_BYTES:
                 break
@@ -147,7 +139,7 @@ class Overlap:
         for place in places[:PLACES]:
             if not (isinstance(place, list) and [type(part) for part in place] == [bytes, bytes, str, int, bytes]):
                 raise Refused("a place is a key, an owner, a name, a number and a signature's first bytes")
-            answer.append((place[3], place[4]) > mark_of(self.held(Slot(*place[:3]))))
+            answer.append((place[3], place[4]) > mark_of(self._replica.shown(Slot(*place[:3]))))
         return answer
 
     # -- inside -----------------------------------------------------------------------------------------------------

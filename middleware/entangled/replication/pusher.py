@@ -7,6 +7,7 @@ one watcher of one key are numbered without a gap, so that it notices what it mi
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
@@ -28,26 +29,19 @@ MAX_WATCHED = 10_000
 """Keys that are watched here at the same time."""
 
 
+@dataclass(slots=True)
 class _Watcher:
     """Who watches, until when, and the number of the last push to it."""
 
-    __slots__ = ("contact", "until", "number")
-
-    def __init__(self, contact: Contact, until: float) -> None:
-        self.contact = contact
-        self.until = until
-        self.number = 0
+    contact: Contact
+    until: float
+    number: int = 0
 
 
 class Pusher:
     """The watchers of the keys that one replica holds."""
 
-    def __init__(
-        self,
-        endpoint: Endpoint,
-        clock: IReactorTime,
-        chores: Background,
-    ) -> None:
+    def __init__(self, endpoint: Endpoint, clock: IReactorTime, chores: Background) -> None:
         self._endpoint = endpoint
         self._clock = clock
         self._chores = chores

@@ -7,7 +7,7 @@ takes longer than nearly all answers in this team is not waited for: others are 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from twisted.internet.defer import Deferred
 
@@ -29,15 +29,12 @@ CATCHING_UP, CATCHING_UP_STEP = 1.5, 0.1
 MAX_PAGES = 2000
 
 
-class Answer:
+class Answer(NamedTuple):
     """What one replica said: its records, tombstones included, what that is worth, and whom it knows nearer."""
 
-    __slots__ = ("records", "worth", "nearer")
-
-    def __init__(self, records: list[Record], worth: int, nearer: list[Contact]) -> None:
-        self.records = records
-        self.worth = worth
-        self.nearer = nearer
+    records: list[Record]
+    worth: int
+    nearer: list[Contact]
 
 
 class Reader:

@@ -10,7 +10,6 @@ import math
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Sequence
 from functools import wraps
-from typing import Protocol
 
 from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
@@ -19,6 +18,7 @@ from middleware.entangled.background import Background
 from middleware.entangled.contact import Contact
 from middleware.entangled.data.store import Store
 from middleware.entangled.errors import OWNER_FULL, Full, Refused
+from middleware.entangled.kademlia.overlay import Overlay
 from middleware.entangled.listeners import Listeners
 from middleware.entangled.record import KEY_BYTES, Record, Signed, Slot, unpacked
 from middleware.entangled.replication.cache import PathCache
@@ -43,22 +43,6 @@ UNSURE, SURE, CACHED = 0, 1, 2
 """What an answer is worth: of a replica that has yet to catch up, of one that has, a copy from the path."""
 
 
-class Neighbours(Protocol):
-    """The nodes that a replica knows, and notifies of those that it hears from."""
-
-    def is_responsible(self, key: bytes) -> bool:
-        """Say whether this node is one of the closest to ``key``."""
-
-    def nearest(self, target: bytes) -> list[Contact]:
-        """Return the known nodes closest to ``target``, this one not included."""
-
-    def heard(self, contact: Contact) -> None:
-        """Take note of a peer that stores, watches or is alive."""
-
-    def left(self, contact: Contact) -> None:
-        """Take note of a peer that leaves in order."""
-
-
 class Replica:
     """The records of others, held for them; ``keepsakes`` are the node's own copies, which nobody else gets to see.
 
@@ -71,19 +55,19 @@ class Replica:
     """
 
     def __init__(
-        self, store: Store, endpoint: Endpoint, neighbours: Neighbours, clock: IReactorTime, chores: Background
+        self, store: Store, endpoint: Endpoint, overlay: Overlay, clock: IReactorTime, chores: Background
     ) -> None:
         self.keepsakes = Keepsakes(store)
         self._store = store
         self._endpoint = endpoint
-        self._neighbours = neighbours
+        self._overlay = overlay
         self._clock = clock
         self.pusher = Pusher(endpoint, clock, chores)
         self.cache = PathCache()
         self._signed = Signed()
         self.certificates = Certificates(endpoint, clock)
-        self.may_store: Callable[[Slot], bool] = self.certificates.may_store
-        self.may_stay: Callable[[Slot], bool] = self.certificates.may_stay
+        self.may_store: Callable[[Slot], bool] = endpoint.door.may_store
+        self.may_stay: Callable[[Slot], bool] = endpoint.door.may_stay
         self._authorities: dict[bytes, Authority] = {}
         self.is_sure: Callable[[], bool] = lambda: True
         self._doubtful: set[bytes] = set()
@@ -177,7 +161,7 @@ class Replica:
         ``left`` are the seconds that each is to be kept, where it does not come from its owner.  The peer is asked for
         certificates that are not known here.
         """
-        self._neighbours.heard(peer)
+        self._overlay.heard(peer)
         records = [record for record in map(unpacked, packed) if record is not None]
         lives = [None] * len(packed) if left is None else [_checked_life(life) for life in left]
         if len(records) < len(packed) or len(lives) != len(packed):
@@ -210,10 +194,10 @@ class Replica:
         cached = self.cache.get(key, self._clock.seconds()) if is_nothing and not wants_sure else None
         if cached:
             return [[record.packed() for record in cached if self.may_store(record.slot)], None, CACHED]
-        is_aside = not is_nothing and not wants_sure and not self._neighbours.is_responsible(key)
+        is_aside = not is_nothing and not wants_sure and not self._overlay.is_responsible(key)
         if not (is_nothing or is_aside):
             return [page, following, self._worth()]
-        near = [contact.packed() for contact in self._neighbours.nearest(key) if contact.node_id != peer.node_id]
+        near = [contact.packed() for contact in self._overlay.nearest(key) if contact.node_id != peer.node_id]
         return [page, following, UNSURE if is_aside else self._worth(), near]
 
     def answer_cache(self, peer: Contact, key: bytes, packed: list[object], ttl: float) -> None:
@@ -229,16 +213,16 @@ class Replica:
 
         Answers the number of the last push, and the first page (None where ``digest`` is that of what is held).
         """
-        self._neighbours.heard(peer)
+        self._overlay.heard(peer)
         number = self.pusher.watched(_checked_key(key), peer, ttl)
-        return [number, None if digest == digest_of(self.held(key)) else self.first_page(key)]
+        return [number, None if digest == digest_of(self.held(key)) else list(self._page(key, None))]
 
     def answer_alive(self, peer: Contact, lease: float, digest: bytes) -> None:
         """ALIVE: extend the leases of ``peer``; where what is held differs from what it says twice, tell it.
 
         Where nothing is held, they have run out here though the peer lives: it is told at once.
         """
-        self._neighbours.heard(peer)
+        self._overlay.heard(peer)
         held = self._leased(peer.public)
         self._store.extend(peer.public, self._clock.seconds() + min(float(lease), MAX_LEASE))
         if digest == digest_of(held):
@@ -261,7 +245,7 @@ class Replica:
         self.on_silent(peer.public)
         self.pusher.forget(peer)
         self._doubtful.discard(peer.node_id)
-        self._neighbours.left(peer)
+        self._overlay.left(peer)
 
     def _refusal(self, record: Record, peer: Contact) -> StoreReply | None:
         if not self.may_store(record.slot):
@@ -328,10 +312,6 @@ class Replica:
     def _leased(self, owner: bytes) -> list[Record]:
         """What is held of ``owner`` on lease."""
         return [r for r in self._store.owned(owner) if r.lifetime == "leased" and r.slot not in self.keepsakes]
-
-    def first_page(self, key: bytes) -> list[object]:
-        """The first page of what is held under ``key``, and where the next one begins."""
-        return list(self._page(key, None))
 
     def _worth(self) -> int:
         return SURE if self.is_sure() else UNSURE

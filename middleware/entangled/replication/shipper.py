@@ -22,22 +22,8 @@ MAX_WAITING = 2048
 """Records that wait for one replica."""
 
 
-class _Quay:
-    """What waits for one replica while it is asked."""
-
-    __slots__ = ("waiting",)
-
-    def __init__(self) -> None:
-        self.waiting: deque[tuple[Record, Deferred[object]]] = deque()
-
-    def load(self) -> list[tuple[Record, Deferred[object]]]:
-        """The next of those that wait, as many as one datagram carries."""
-        room = ROOM
-        load: list[tuple[Record, Deferred[object]]] = []
-        while self.waiting and (self.waiting[0][0].message_bytes <= room or not load):
-            load.append(self.waiting.popleft())
-            room -= load[-1][0].message_bytes
-        return load
+Waiting = deque[tuple[Record, Deferred[object]]]
+"""The records that wait for one replica, and who is told what becomes of them."""
 
 
 class Shipper:
@@ -46,7 +32,7 @@ class Shipper:
     def __init__(self, overlay: Overlay, chores: Background) -> None:
         self._overlay = overlay
         self._chores = chores
-        self._quays: dict[bytes, _Quay] = {}
+        self._waiting: dict[bytes, Waiting] = {}
 
     async def store(self, contact: Contact, record: Record, left: float | None = None) -> object:
         """What ``contact`` says to ``record`` (see STORE); raises what asking it raises.
@@ -57,49 +43,49 @@ class Shipper:
             return (await self._asked(contact, [record], [left]))[0]
         if record.message_bytes > ROOM:
             return (await self._asked(contact, [record]))[0]  # it goes as a parcel, and takes its time
-        quay = self._quays.get(contact.node_id)
-        if quay is not None:
-            if len(quay.waiting) >= MAX_WAITING:
+        waiting = self._waiting.get(contact.node_id)
+        if waiting is not None:
+            if len(waiting) >= MAX_WAITING:
                 raise Crowded(f"too many records wait for {contact.address}; put more slowly")
             verdict: Deferred[object] = Deferred()
-            quay.waiting.append((record, verdict))
+            waiting.append((record, verdict))
             return await verdict
-        quay = self._quays[contact.node_id] = _Quay()
+        waiting = self._waiting[contact.node_id] = deque()
         try:
             verdicts = await self._asked(contact, [record])
         except NoAnswer:
-            self._rush(quay, contact)
+            self._rush(waiting, contact)
             raise
         finally:
-            self._next(quay, contact)
+            self._next(waiting, contact)
         return verdicts[0]
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
-    def _next(self, quay: _Quay, contact: Contact) -> None:
+    def _next(self, waiting: Waiting, contact: Contact) -> None:
         """The question has ended: send the next one, if anything waits for it."""
-        if quay.waiting:
-            self._chores.fork(self._ship(quay, contact))
+        if waiting:
+            self._chores.fork(self._ship(waiting, contact))
         else:
-            del self._quays[contact.node_id]
+            del self._waiting[contact.node_id]
 
-    def _rush(self, quay: _Quay, contact: Contact) -> None:
+    def _rush(self, waiting: Waiting, contact: Contact) -> None:
         """Let nobody wait any longer for one that is silent: each gets its own chance now."""
-        while quay.waiting:
-            self._chores.fork(self._deliver(contact, quay.load()))
+        while waiting:
+            self._chores.fork(self._deliver(contact, _take_load(waiting)))
 
-    async def _ship(self, quay: _Quay, contact: Contact) -> None:
+    async def _ship(self, waiting: Waiting, contact: Contact) -> None:
         try:
-            await self._deliver(contact, quay.load())
+            await self._deliver(contact, _take_load(waiting))
         except NoAnswer:
-            self._rush(quay, contact)
+            self._rush(waiting, contact)
         finally:
-            self._next(quay, contact)
+            self._next(waiting, contact)
 
     async def _deliver(self, contact: Contact, load: list[tuple[Record, Deferred[object]]]) -> None:
         """Ask with these records, and tell each of those who wait; raises ``NoAnswer``, too."""
         try:
-            verdicts = await self._asked(contact, [record for record, _ in load])
+            answers = await self._asked(contact, [record for record, _ in load])
         except Refused as error:
             if len(load) == 1:
                 load[0][1].errback(error)
@@ -107,13 +93,13 @@ class Shipper:
                 for one in load:
                     self._chores.fork(self._deliver(contact, [one]))
         except EntangledError as error:
-            for _, waiting in load:
-                waiting.errback(error)
+            for _, verdict in load:
+                verdict.errback(error)
             if isinstance(error, NoAnswer):
                 raise
         else:
-            for (_, waiting), verdict in zip(load, verdicts, strict=True):
-                waiting.callback(verdict)
+            for (_, verdict), answer in zip(load, answers, strict=True):
+                verdict.callback(answer)
 
     async def _asked(self, contact: Contact, records: list[Record], *lives: list[float]) -> list[object]:
         packed = [record.packed() for record in records]
@@ -121,3 +107,13 @@ class Shipper:
         if not isinstance(answer, list) or len(answer) != len(records):
             raise Refused(f"{contact.address} does not take the record")
         return answer
+
+
+def _take_load(waiting: Waiting) -> list[tuple[Record, Deferred[object]]]:
+    """Take the next of those that wait, as many as one datagram carries."""
+    room = ROOM
+    load: list[tuple[Record, Deferred[object]]] = []
+    while waiting and (waiting[0][0].message_bytes <= room or not load):
+        load.append(waiting.popleft())
+        room -= load[-1][0].message_bytes
+    return load

@@ -64,19 +64,12 @@ class Subscriber:
 
     def watch(self, key: bytes, changed: Changed, keep: bool) -> Watch:
         """Begin a watch; see ``EntangledNode.watch``."""
-        watch = Watch(key, changed, self, self._own_id, keep)
+        watch = Watch(key, changed, self._forget_watch, self._own_id, keep)
         self._watches.append(watch)
         watch.view.replace(self._own_id, self._replica.held(key))
         self._settle(watch)
         self._chores.fork(self._renew(watch))
         return watch
-
-    def unwatch(self, watch: Watch) -> None:
-        """Forget ``watch``; replicas forget it by themselves when it is not renewed."""
-        if watch in self._watches:
-            self._watches.remove(watch)
-            if watch.keep:
-                self._copy(watch.key)
 
     def refresh(self, watch: Watch) -> None:
         """Ask every holder of the key now whether it holds anything else than what is believed."""
@@ -126,6 +119,13 @@ class Subscriber:
                 self._settle(watch)
 
     # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _forget_watch(self, watch: Watch) -> None:
+        """Forget ``watch``; replicas forget it by themselves when it is not renewed."""
+        if watch in self._watches:
+            self._watches.remove(watch)
+            if watch.keep:
+                self._copy(watch.key)
 
     def _settle(self, watch: Watch) -> None:
         try:

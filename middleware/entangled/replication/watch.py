@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterable
-from typing import Protocol
 
 from middleware.entangled.identity import node_id
 from middleware.entangled.record import Record, Slot
@@ -84,22 +83,22 @@ class View:
         return sorted(live, key=lambda r: (r.owner, r.name))
 
 
-class Renewer(Protocol):
-    """Who keeps a watch alive; the node hands itself in."""
-
-    def unwatch(self, watch: Watch) -> None:
-        """End ``watch``."""
-
-
 class Watch:
     """One subscription to one key; ``records`` is what is known now.
 
     ``asked`` are the node ids of the replicas that were asked to push; nobody else is believed.  ``keep`` says whether
     what is known is to be kept in the node's own store as well.  ``pushed`` is the number of each replica's last push,
-    ``due_at`` when the replicas of a large network are asked again.
+    ``due_at`` when the replicas of a large network are asked again.  ``unwatch`` is called at the end.
     """
 
-    def __init__(self, key: bytes, changed: Changed, renewer: Renewer, own_id: bytes = b"", keep: bool = False) -> None:
+    def __init__(
+        self,
+        key: bytes,
+        changed: Changed,
+        unwatch: Callable[[Watch], None],
+        own_id: bytes = b"",
+        keep: bool = False,
+    ) -> None:
         self.key = key
         self.view = View(own_id)
         self.records: list[Record] = []
@@ -108,7 +107,7 @@ class Watch:
         self.due_at = 0.0
         self.keep = keep
         self._changed = changed
-        self._renewer = renewer
+        self._unwatch = unwatch
 
     def settle(self) -> None:
         """Merge the view again and tell the subscriber, if anything is different from what it knows."""
@@ -126,4 +125,4 @@ class Watch:
     def stop(self) -> None:
         """End the subscription; nothing is told any more."""
         self._changed = lambda _records: None
-        self._renewer.unwatch(self)
+        self._unwatch(self)

@@ -6,19 +6,19 @@ import random
 import zlib
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from typing import Any, Protocol
+from dataclasses import dataclass, field
+from typing import Any
 
-from twisted.internet import defer
-from twisted.internet.defer import Deferred, FirstError, gatherResults
+from twisted.internet.defer import Deferred, FirstError, fail, gatherResults, maybeDeferred
 from twisted.internet.interfaces import IReactorTime
 
 from middleware.entangled.background import Background, first
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import EntangledError, NoAnswer, Refused
 from middleware.entangled.kademlia.distance import closest
+from middleware.entangled.listeners import Listeners
 from middleware.entangled.quorum.ballot import Ballot
 from middleware.entangled.quorum.proposer import Outcome, Result
-from middleware.entangled.space.claim import Claim, ClaimLost
 from middleware.entangled.space.council import Council
 from middleware.entangled.space.keeper import Keeper
 from middleware.entangled.space.peer import Peer
@@ -37,12 +37,65 @@ LEASED_RETRY = 0.5
 CONTEST_RETRY = (0.02, 0.08)
 SILENT_RETRY = (0.2, 0.6)
 MAX_REMEMBERED = 10_000
+OVER = "the claim was confirmed or released before"
 
 
-class Waits(Protocol):
-    """Whoever waits for a take."""
+class ClaimLost(Refused):
+    """The tuple was taken by another; what was done about it must not count."""
 
-    is_over: bool
+
+class Wait:
+    """One call that waits for a tuple; ``is_over`` when it was answered, cancelled or timed out."""
+
+    def __init__(self) -> None:
+        self.is_over = False
+        self.deferred: Deferred[Any] = Deferred(lambda _: self.end())
+        self.on_end = Listeners[[]]()
+
+    def end(self) -> None:
+        """Let whoever works for this call know that nobody waits any more."""
+        if not self.is_over:
+            self.is_over = True
+            self.on_end()
+
+
+@dataclass
+class Claim:
+    """The sole right to take a tuple, until ``deadline`` (seconds of the own clock); then others may claim it.
+
+    Confirm it when the work is done.  Whoever does neither that nor renew loses it, which is how a tuple comes back
+    from a taker that died.
+    """
+
+    posted: Posted
+    ballot: Ballot
+    lease: float
+    deadline: float
+    _taker: Taker = field(repr=False)
+    is_over: bool = False
+
+    @property
+    def fields(self) -> Tuple:
+        """The tuple."""
+        return self.posted.fields
+
+    def confirm(self) -> Deferred[Tuple]:
+        """Take the tuple for good; fires when the council has decided.
+
+        Fails with ``ClaimLost`` where it decided for another, which can happen only after the deadline.  Cancelled
+        meanwhile, the tuple is put back should the council decide for us.
+        """
+        return fail(ClaimLost(OVER)) if self.is_over else self._taker.confirm(self)
+
+    def release(self) -> None:
+        """Give the tuple back at once."""
+        if not self.is_over:
+            self.is_over = True
+            self._taker.release(self)
+
+    def renew(self) -> Deferred[None]:
+        """Hold the tuple for another lease from now; fails with ``ClaimLost``, or ``NoAnswer`` while time is left."""
+        return fail(ClaimLost(OVER)) if self.is_over else Deferred.fromCoroutine(self._taker.renew(self))
 
 
 class Taker:
@@ -119,7 +172,7 @@ class Taker:
         node = self._node
         if contact.node_id == node.identity.node_id:
             answer = getattr(node.seat, method.replace("decree.", "answer_"))
-            return defer.maybeDeferred(answer, node.contact, *arguments)
+            return maybeDeferred(answer, node.contact, *arguments)
         # A member may have moved since the tuple was put; its key is still the same.
         return node.endpoint.ask(node.newest(contact), method, *arguments, changes=method != "decree.enrol")
 
@@ -160,9 +213,8 @@ class Taker:
             self._counters[one.place] = max(ballot.counter, outcome.counter)
             if outcome.result is Result.WON and outcome.value is None:
                 deadline = sent + lease * (1.0 - MARGIN)
-                claim = Claim(one, ballot, lease, deadline, self._confirm, self._release, self._renew)
-                claims.append(claim)
-                self._expire(claim)
+                claims.append(Claim(one, ballot, lease, deadline, self))
+                self._expire(claims[-1])
             elif outcome.result is Result.WON:
                 # A taker died while it was confirming: what it began is completed in its name.
                 self._chores.fork(self._complete(one, outcome.value))
@@ -172,7 +224,7 @@ class Taker:
         _trim(self._not_before)
         return claims, any(outcome.result is Result.SILENT for outcome in outcomes)
 
-    async def decide(self, claims: Sequence[Claim], wait: Waits | None = None) -> list[bool]:
+    async def decide(self, claims: Sequence[Claim], wait: Wait | None = None) -> list[bool]:
         """Confirm claims of one ballot and say of each whether the tuple is ours.
 
         Goes on until the council has decided, for nobody else may take meanwhile what it may have given to us; what
@@ -191,7 +243,7 @@ class Taker:
         except FirstError as error:  # the node stops
             error.subFailure.raiseException()
 
-    async def _settled(self, claim: Claim, outcome: Outcome, wait: Waits | None) -> bool:
+    async def _settled(self, claim: Claim, outcome: Outcome, wait: Wait | None) -> bool:
         taker, place = claim.ballot.proposer, claim.posted.place
         winner = taker if outcome.result is Result.WON else outcome.value
         if winner is None:
@@ -259,6 +311,37 @@ class Taker:
 
     # -- claims that somebody holds ---------------------------------------------------------------------------------
 
+    def confirm(self, claim: Claim) -> Deferred[Tuple]:
+        """Have the council decide on a claim; what it decides for a call that was cancelled is put back."""
+        wait = Wait()
+
+        async def work() -> None:
+            [won] = await self.decide([claim], wait)
+            if wait.is_over:
+                return
+            if won:
+                wait.deferred.callback(claim.fields)
+            else:
+                wait.deferred.errback(ClaimLost("the tuple was taken by another after the lease on it had ended"))
+
+        self._chores.fork(work())
+        return wait.deferred
+
+    def release(self, claim: Claim) -> None:
+        """Give up a claim, and tell its council."""
+        self._council.release([claim.posted], claim.ballot)
+        self._free(claim.posted.place)
+
+    async def renew(self, claim: Claim) -> None:
+        """Lease the tuple of a claim anew; raises ``ClaimLost`` and ``NoAnswer``."""
+        sent = self._clock.seconds()
+        [outcome] = await self._council.renew([claim.posted], claim.ballot, claim.lease)
+        if outcome.result is Result.SILENT:
+            raise NoAnswer("too little of the council answers to renew the lease")
+        if outcome.result is not Result.WON or outcome.value is not None:
+            raise ClaimLost("the tuple was claimed by another after the lease on it had ended")
+        claim.deadline = sent + claim.lease * (1.0 - MARGIN)
+
     def _expire(self, claim: Claim) -> None:
         """Give up ``claim`` when its time is over, unless it was renewed."""
         left = claim.deadline - self._clock.seconds()
@@ -272,49 +355,6 @@ class Taker:
     def _free(self, place: Place) -> None:
         self.held.discard(place)
         self._freed(place)
-
-    def _confirm(self, claim: Claim) -> Deferred[Tuple]:
-        class Cancelled:
-            is_over = False
-
-        def cancel(_: object) -> None:
-            Cancelled.is_over = True
-
-        result: Deferred[Tuple] = Deferred(cancel)
-
-        async def work() -> None:
-            [won] = await self.decide([claim], Cancelled)
-            if Cancelled.is_over:
-                return
-            if won:
-                result.callback(claim.fields)
-            else:
-                result.errback(ClaimLost("the tuple was taken by another after the lease on it had ended"))
-
-        if claim.is_over:
-            return defer.fail(ClaimLost("the claim was confirmed or released before"))
-        self._chores.fork(work())
-        return result
-
-    def _release(self, claim: Claim) -> None:
-        if not claim.is_over:
-            claim.is_over = True
-            self._council.release([claim.posted], claim.ballot)
-            self._free(claim.posted.place)
-
-    def _renew(self, claim: Claim) -> Deferred[None]:
-        async def work() -> None:
-            if claim.is_over:
-                raise ClaimLost("the claim was confirmed or released before")
-            sent = self._clock.seconds()
-            [outcome] = await self._council.renew([claim.posted], claim.ballot, claim.lease)
-            if outcome.result is Result.SILENT:
-                raise NoAnswer("too little of the council answers to renew the lease")
-            if outcome.result is not Result.WON or outcome.value is not None:
-                raise ClaimLost("the tuple was claimed by another after the lease on it had ended")
-            claim.deadline = sent + claim.lease * (1.0 - MARGIN)
-
-        return Deferred.fromCoroutine(work())
 
 
 def _trim(remembered: dict[Place, Any]) -> None:

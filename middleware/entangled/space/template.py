@@ -8,9 +8,10 @@ and ``True`` are three values, and only predicates that compare take ``int`` and
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final, TypeGuard
+from operator import ge, gt, le, lt
+from typing import Any, Final, TypeGuard
 
 import msgpack
 
@@ -24,8 +25,8 @@ MAX_TUPLE = 600
 """Bytes of a tuple or template as msgpack; a record must hold it beside its council."""
 MAX_CHOICES = 32
 OPERATORS = ("<", "<=", ">", ">=", "!=", "in", "prefix")
-_TYPES: Final[dict[str, type]] = {"bool": bool, "bytes": bytes, "float": float, "int": int, "str": str}
-_VALUE, _ANY, _TYPE, _PREDICATE = range(4)
+_COMPARE: Final[dict[str, Callable[[Any, Any], bool]]] = {"<": lt, "<=": le, ">": gt, ">=": ge}
+_TYPES: Final = (bool, bytes, float, int, str)
 
 
 class BadTuple(LocalError):
@@ -58,10 +59,8 @@ class Predicate:
             if isinstance(value, str) and isinstance(operand, str):
                 return value.startswith(operand)
             return isinstance(value, bytes) and isinstance(operand, bytes) and value.startswith(operand)
-        order = _order(value, operand)
-        if order is None:
-            return False
-        return {"<": order < 0, "<=": order <= 0, ">": order > 0, ">=": order >= 0}[self.operator]
+        is_ordered = _are_numbers(value, operand) or (type(value) is type(operand) and isinstance(value, str | bytes))
+        return is_ordered and _COMPARE[self.operator](value, operand)
 
 
 Field = Value | Wildcard | type | Predicate
@@ -82,10 +81,6 @@ class Template:
         """Whether the tuple ``values`` has what this template asks for."""
         return len(values) == len(self.fields) and all(map(_fits, self.fields, values))
 
-    def packed(self) -> list[object]:
-        """The template as it stands in a message; ``template_unpacked`` reads it."""
-        return [_packed_field(field) for field in self.fields]
-
 
 def where(operator: str, operand: Value | Sequence[Value]) -> Predicate:
     """A predicate over one field: ``where("<", 5)``, ``where("in", ("a", "b"))``, ``where("prefix", "job-")``.
@@ -95,9 +90,17 @@ def where(operator: str, operand: Value | Sequence[Value]) -> Predicate:
     """
     if isinstance(operand, Sequence) and not isinstance(operand, str | bytes):
         operand = tuple(operand)
-    problem = _predicate_problem(operator, operand)
-    if problem:
-        raise BadTuple(problem)
+    if operator not in OPERATORS:
+        raise BadTuple(f"operator {operator!r}: only {' '.join(OPERATORS)} are known")
+    if operator == "in":
+        if not isinstance(operand, tuple) or len(operand) > MAX_CHOICES or not all(map(is_value, operand)):
+            raise BadTuple(f"in: takes a sequence of at most {MAX_CHOICES} values")
+    elif not is_value(operand):
+        raise BadTuple(f"{operator}: {operand!r} is no value")
+    elif operator == "prefix" and not isinstance(operand, str | bytes):
+        raise BadTuple("prefix: takes a str or bytes")
+    elif operator in _COMPARE and (operand is None or isinstance(operand, bool)):
+        raise BadTuple(f"{operator}: {operand!r} has no order")
     return Predicate(operator, operand)
 
 
@@ -108,15 +111,12 @@ def template_of(fields: Sequence[Field] | Template) -> Template:
     _check_count(fields)
     for place, field in enumerate(fields):
         lawful = (
-            isinstance(field, Wildcard | Predicate)
-            or (isinstance(field, type) and field in _TYPES.values())
-            or is_value(field)
+            isinstance(field, Wildcard | Predicate) or (isinstance(field, type) and field in _TYPES) or is_value(field)
         )
         if not lawful:
             raise BadTuple(f"field {place}: {field!r} is no value, ANY, type or predicate")
-    template = Template(tuple(fields))
-    _check_size(template.packed())
-    return template
+    _check_size([_packed_field(field) for field in fields])
+    return Template(tuple(fields))
 
 
 def tuple_of(fields: Sequence[Value]) -> Tuple:
@@ -150,40 +150,15 @@ def tuple_unpacked(fields: object) -> Tuple:
     return tuple(fields)
 
 
-def template_unpacked(fields: object) -> Template:
-    """The template in a decoded message; raises ``Malformed`` and nothing else."""
-    if not isinstance(fields, list) or not 0 < len(fields) <= MAX_FIELDS:
-        raise Malformed("not a template")
-    return Template(tuple(_unpacked_field(field) for field in fields))
-
-
-def _unpacked_field(packed: object) -> Field:
-    match packed:
-        case [int(kind), *_] if isinstance(kind, bool):
-            pass  # True would match 1
-        case [0, value] if is_value(value):
-            return value
-        case [1]:
-            return ANY
-        case [2, str(name)] if name in _TYPES:
-            return _TYPES[name]
-        case [3, str(operator), operand]:
-            if isinstance(operand, list):
-                operand = tuple(operand)  # what it holds is looked at next
-            if _is_operand(operand) and not _predicate_problem(operator, operand):
-                return Predicate(operator, operand)
-    raise Malformed("not a field of a template")
-
-
 def _packed_field(field: Field) -> list[object]:
+    """The field as it counts against ``MAX_TUPLE``."""
     if isinstance(field, Wildcard):
-        return [_ANY]
+        return [1]
     if isinstance(field, type):
-        return [_TYPE, field.__name__]
+        return [2, field.__name__]
     if isinstance(field, Predicate):
-        operand = list(field.operand) if isinstance(field.operand, tuple) else field.operand
-        return [_PREDICATE, field.operator, operand]
-    return [_VALUE, field]
+        return [3, field.operator, field.operand]
+    return [0, field]
 
 
 def _fits(field: Field, value: Value) -> bool:
@@ -204,33 +179,6 @@ def _are_numbers(a: object, b: object) -> bool:
     return type(a) in (int, float) and type(b) in (int, float)
 
 
-def _order(a: Value, b: Value) -> int | None:
-    """Less, equal or greater as -1, 0 or 1; None where the two have no order."""
-    if isinstance(a, int | float) and isinstance(b, int | float) and _are_numbers(a, b):
-        return (a > b) - (a < b)
-    if isinstance(a, str) and isinstance(b, str):
-        return (a > b) - (a < b)
-    if isinstance(a, bytes) and isinstance(b, bytes):
-        return (a > b) - (a < b)
-    return None
-
-
-def _predicate_problem(operator: object, operand: object) -> str:
-    """What is wrong with a predicate, or an empty text."""
-    if operator not in OPERATORS:
-        return f"operator {operator!r}: only {' '.join(OPERATORS)} are known"
-    if operator == "in":
-        lawful = isinstance(operand, tuple) and len(operand) <= MAX_CHOICES and all(map(is_value, operand))
-        return "" if lawful else f"in: takes a sequence of at most {MAX_CHOICES} values"
-    if not is_value(operand):
-        return f"{operator}: {operand!r} is no value"
-    if operator == "prefix":
-        return "" if isinstance(operand, str | bytes) else "prefix: takes a str or bytes"
-    if operator != "!=" and (operand is None or isinstance(operand, bool)):
-        return f"{operator}: {operand!r} has no order"
-    return ""
-
-
 def _check_count(fields: Sequence[object]) -> None:
     if isinstance(fields, str | bytes) or not isinstance(fields, Sequence):
         raise BadTuple(f"{fields!r}: give the fields as a tuple or list")
@@ -242,10 +190,6 @@ def _check_size(fields: list[object]) -> None:
     size = len(msgpack.packb(fields))
     if size > MAX_TUPLE:
         raise TooLarge(f"tuple of {size} bytes; at most {MAX_TUPLE} fit, so put the bulk under a key of its own")
-
-
-def _is_operand(operand: object) -> TypeGuard[Value | Tuple]:
-    return is_value(operand) or (isinstance(operand, tuple) and all(map(is_value, operand)))
 
 
 def _is_text(text: str) -> bool:

@@ -16,13 +16,11 @@ from twisted.logger import Logger
 
 from middleware.entangled.background import Background
 from middleware.entangled.errors import EntangledError, NoAnswer, NotRunning, WeatherError
-from middleware.entangled.listeners import Listeners
-from middleware.entangled.space.claim import Claim
 from middleware.entangled.space.keeper import Keeper
 from middleware.entangled.space.peer import Peer
 from middleware.entangled.space.posting import Place, space_key, standing
 from middleware.entangled.space.shelf import Shelf
-from middleware.entangled.space.taker import Taker
+from middleware.entangled.space.taker import Claim, Taker, Wait
 from middleware.entangled.space.template import Field, Template, Tuple, Value, template_of, tuple_of
 
 COUNCIL = 3
@@ -35,21 +33,6 @@ T = TypeVar("T")
 
 class NoTuple(WeatherError):
     """No matching tuple came within the time-out."""
-
-
-class Wait:
-    """One blocking call; ``is_over`` when it was answered, cancelled or timed out."""
-
-    def __init__(self) -> None:
-        self.is_over = False
-        self.deferred: Deferred[Any] = Deferred(lambda _: self.end())
-        self.on_end = Listeners[[]]()
-
-    def end(self) -> None:
-        """Let whoever works for this call know that nobody waits any more."""
-        if not self.is_over:
-            self.is_over = True
-            self.on_end()
 
 
 class TupleSpace:

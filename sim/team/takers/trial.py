@@ -10,8 +10,8 @@ from middleware.entangled.errors import EntangledError
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.switchboard import Weather
 from middleware.entangled.node import EntangledNode
-from middleware.entangled.space.claim import Claim
 from middleware.entangled.space.posting import Posted, posting
+from middleware.entangled.space.taker import Claim
 from middleware.entangled.space.template import ANY, Tuple
 from middleware.entangled.space.tuplespace import TupleSpace
 from sim.team.takers.witness import Witness

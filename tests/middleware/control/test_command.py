@@ -34,7 +34,6 @@ class CommandTests(SynchronousTestCase):
         self.said = ""
 
     def ask(self, path: Path, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
-        """A node, played."""
         self.requests.append(request)
         yield from self.replies
 
@@ -49,7 +48,6 @@ class CommandTests(SynchronousTestCase):
         return code, output.getvalue()
 
     def request(self, line: str) -> dict[str, Any]:
-        """The request that a command line makes."""
         self.run_command(line)
         return self.requests[-1]
 

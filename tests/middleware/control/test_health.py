@@ -1,17 +1,94 @@
-"""Tests of what a running node says of itself and of its links."""
+"""Tests of what a running node says of itself, and of how good it finds the ways to its peers."""
 
 from __future__ import annotations
 
-from twisted.internet.defer import Deferred
+from typing import Any
 
-from middleware.entangled.control.health import ASKED, health, links
+from twisted.internet.defer import Deferred
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.entangled.contact import Contact
+from middleware.entangled.control.health import ASKED, FEW, IDLE, Gauge, health, links
+from middleware.entangled.control.link import link
 from middleware.entangled.network.switchboard import Weather
-from tests.fleet import FleetCase
+from tests.fleet import FleetCase, SwarmFleet
+
+
+class GaugeTests(FleetCase):
+    def setUp(self) -> None:
+        super().setUp()
+        self.team: SwarmFleet = self.swarm(3, weather=Weather(delay_s=0.01))
+        self.team.run(3.0)
+        self.gauge: Gauge = self.team.nodes[0].gauge
+
+    def measured(self) -> dict[str, dict[str, Any]]:
+        return {each["id"]: each for each in self.gauge.links()}
+
+    def test_answer_at_once(self) -> None:
+        """The first answer has the ways, and no figures yet; a second later it has those of ten questions."""
+        first = self.measured()
+        self.assertEqual(set(first), {node.uuid for node in self.team.nodes[1:]})
+        for each in first.values():
+            self.assertEqual((each["way"], each["by"], each["round_trip"], each["loss"]), ("machine", "", None, None))
+        self.team.run(1.5)
+        for each in self.measured().values():
+            self.assertEqual((round(each["round_trip"], 3), each["loss"], round(each["jitter"], 4)), (0.02, 0.0, 0.0))
+            self.assertGreater(each["for"], 2.0)
+
+    def test_see_what_gets_worse(self) -> None:
+        """Loss that begins while it measures is seen within ten seconds."""
+        self.measured()
+        self.team.run(3.0)
+        self.team.board.weather = Weather(delay_s=0.01, loss=0.3)
+        losses = []
+        for _ in range(5):
+            self.team.run(2.0)
+            losses.append(max(each["loss"] or 0.0 for each in self.measured().values()))
+        self.assertEqual(losses[0] <= 0.5 and max(losses) > 0.1, True, losses)
+
+    def test_end_when_nobody_looks(self) -> None:
+        """Without anybody who asks it falls silent, and begins anew with the next one."""
+        asked: list[float] = []
+
+        def answer(peer: object, said: bytes) -> bytes:
+            asked.append(self.team.clock.seconds())
+            return said
+
+        self.team.nodes[1].entangled.endpoint.expose("ping", answer, changes=True)
+        self.team.run(10.0)
+        usual = len(asked)
+        self.measured()
+        self.team.run(10.0)
+        self.assertGreater(len(asked), 2 * usual + 15)
+        self.team.run(IDLE)
+        asked.clear()
+        self.team.run(10.0)
+        self.assertEqual(len(asked), usual)
+        self.assertEqual([each["loss"] for each in self.measured().values()], [None, None])
+
+    def test_many_peers_cost_no_more(self) -> None:
+        """However many peers a node has, it asks 10 questions a second, 100 in the beginning."""
+        large = self.swarm(24, weather=Weather(delay_s=0.003))
+        large.run(3.0)
+        asked: list[float] = []
+
+        def answer(peer: Contact, said: bytes) -> bytes:
+            asked.extend([large.clock.seconds()] * (peer.node_id.hex() == large.nodes[0].uuid))
+            return said
+
+        gauge = large.nodes[0].gauge
+        peers = {each["id"] for each in gauge.links()}
+        self.assertGreater(len(peers), 2 * FEW)
+        for node in large.nodes[1:]:
+            node.entangled.endpoint.expose("ping", answer, changes=True)
+        for seconds, most in ((1.0, 100.0), (2.0, 100.0), (5.0, 10.0)):
+            before = len(asked)
+            gauge.links()
+            large.run(seconds)
+            self.assertLess(len(asked) - before, most * seconds + 2 * len(peers), seconds)
 
 
 class HealthTests(FleetCase):
-    """Behaviour of ``health`` and ``links``."""
-
     def test_health(self) -> None:
         """A node says whom it knows, what it holds and may hold, and that nobody refused it."""
         fleet = self.fleet(3)
@@ -31,3 +108,33 @@ class HealthTests(FleetCase):
         self.assertEqual(len(live["times"]), ASKED)
         self.assertEqual({round(seconds, 3) for seconds in live["times"]}, {0.04})
         self.assertEqual((set(dead["times"]), dead["relayed"]), ({None}, False))
+
+
+class LinkTests(SynchronousTestCase):
+    def test_scores(self) -> None:
+        """A steady peer on the same LAN has all points, one that answers at all has one, a silent one none."""
+        rows: list[tuple[list[float | None], bool, int]] = [
+            ([0.002, 0.0021, 0.0019, 0.002], False, 100),
+            ([0.4, 0.9, None, None, None, None], True, 1),
+            ([None] * 10, False, 0),
+        ]
+        for times, is_relayed, score in rows:
+            self.assertEqual(link(times, is_relayed).score, score)
+        self.assertEqual((link([None], False).loss, link([None], False).round_trip), (1.0, None))
+
+    def test_a_second_try_counts_as_a_loss(self) -> None:
+        """An answer that came so late that it was asked for twice is a loss, and does not spoil the round trip."""
+        found = link([0.002] * 8 + [0.055, 0.11], False)
+        self.assertEqual((found.loss, found.round_trip), (0.2, 0.002))
+        found = link([0.1] * 8 + [0.26, None], False)
+        self.assertEqual((round(found.loss, 3), found.round_trip), (0.2, 0.1))
+
+    def test_each_trouble_costs(self) -> None:
+        """Loss, delay, jitter and a relay each take points, and more of it takes more."""
+        best = link([0.002] * 10, False).score
+        lossy = [link([0.002] * (10 - n) + [None] * n, False).score for n in (1, 2, 3)]
+        late = [link([seconds] * 10, False).score for seconds in (0.05, 0.1, 0.2)]
+        shaky = [link([0.02 - by, 0.02 + by] * 5, False).score for by in (0.005, 0.01)]
+        for scores in (lossy, late, shaky, [link([0.002] * 10, True).score]):
+            self.assertEqual([best, *scores], sorted([best, *scores], reverse=True))
+            self.assertLess(scores[0], best)

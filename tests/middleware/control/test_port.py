@@ -16,8 +16,6 @@ from tests.fleet import Fleet
 
 
 class Listener:
-    """A reactor's ``listenUNIX``, played."""
-
     def __init__(self, refuses: bool = False) -> None:
         self.refuses = refuses
         self.listening: list[str] = []
@@ -32,7 +30,6 @@ class Listener:
         return self
 
     def stopListening(self) -> None:
-        """Stop."""
         self.listening.clear()
 
 
@@ -47,22 +44,18 @@ class ControlTests(SynchronousTestCase):
         self.addCleanup(self.port.stopService)
 
     def verbs(self) -> Verbs:
-        """The verbs of node 0."""
         self.made += 1
         return Verbs.of(self.fleet.nodes[0], self.fleet.clock, self.fleet.rng(0))
 
     def opened(self) -> tuple[ControlProtocol, StringTransport]:
-        """A connection."""
         connection, transport = self.listener.factory.buildProtocol(None), StringTransport()
         connection.makeConnection(transport)
         return connection, transport
 
     def lines(self, transport: StringTransport) -> list[dict[str, Any]]:
-        """What came back so far."""
         return [json.loads(line) for line in transport.value().splitlines()]
 
     def ask(self, verb: object, **given: Any) -> dict[str, Any]:
-        """One request, to its end."""
         connection, transport = self.opened()
         connection.dataReceived(json.dumps({"verb": verb, "with": given}).encode() + b"\n")
         self.fleet.run(3.0)
@@ -72,7 +65,6 @@ class ControlTests(SynchronousTestCase):
         return lines[0]
 
     def answer(self, verb: str, **given: Any) -> Any:
-        """The answer to one request."""
         line = self.ask(verb, **given)
         self.assertIn("answer", line)
         return line["answer"]

@@ -49,21 +49,16 @@ class Member:
         self.restart(0.0)
 
     def restart(self, now: float) -> None:
-        """Begin another process."""
         self.acceptor = Acceptor(Log(self.store, self.use.codec, lambda *_: False, now), self.use.terms)
 
     def prepare(self, ballot: Ballot, now: float, reserve: float = 0.0, configuration: int = FIRST) -> Reply:
-        """Ask for a promise."""
         return self.acceptor.prepare(self.use.key, configuration, ballot, TTL, now, reserve)
 
     def lease(self, ballot: Ballot, token: int, now: float, configuration: int = FIRST) -> Reply:
-        """Ask for a lease."""
         return self.acceptor.lease(self.use.key, configuration, ballot, token, TTL, now)
 
     def accept(self, ballot: Ballot, value: Any, now: float, configuration: int = FIRST) -> Reply:
-        """Ask to accept a value."""
         return self.acceptor.accept(self.use.key, configuration, ballot, value, now)
 
     def release(self, ballot: Ballot, now: float, rest: float = 0.0) -> Reply:
-        """Give a ballot back."""
         return self.acceptor.release(self.use.key, ballot, now, rest)

@@ -36,8 +36,6 @@ GIVEN_BACK = {"promised": MID, "spent": HIGH}
 
 
 class TableTests(SynchronousTestCase):
-    """Behaviour of ``TABLE``."""
-
     def test_every_row(self) -> None:
         """Each state, event and stand of a ballot gives the answer and the next state of its row."""
         for (state, event, stand), (kind, after) in TABLE.items():
@@ -95,7 +93,6 @@ class ReachableTests(SynchronousTestCase):
         self.assertGreater(self.explore(LEASE, tuple(self.questions(LEASE))), 2000)
 
     def questions(self, use: Use) -> Iterator[tuple[str, Any, int]]:
-        """Everything that is asked: (event, ballot, token)."""
         ballots = [use.ballot(number, name) for number in (1, 2) for name in (0, 1)]
         for ballot in ballots:
             yield "prepare", ballot, 0
@@ -194,8 +191,6 @@ class ReachableTests(SynchronousTestCase):
 
 
 class NumberTests(SynchronousTestCase):
-    """Numbers that one proposer invents."""
-
     def test_numbers_are_bounded(self) -> None:
         """The highest ballots and tokens there are get no promise, so that others can still propose (N1)."""
         for use in (TAKE, LEASE):

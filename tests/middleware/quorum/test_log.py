@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import random
-
 import msgpack
 from hypothesis import given, settings
 from twisted.trial.unittest import SynchronousTestCase
@@ -19,7 +17,6 @@ from tests.middleware.consensus.lease.test_lease_codec import ANYTHING, MEMBERS
 
 
 def entered(log: Log[str], task_id: str, now: float) -> Register | None:
-    """A new register, if there was room."""
     register = log.blank(now)
     return register if log.enter(task_id, register, now) else None
 
@@ -57,15 +54,10 @@ class LogTests(SynchronousTestCase):
         assert back is not None
         self.assertEqual(CODEC.pack({"t": back}), CODEC.pack({"t": entry}))
         self.assertEqual(back.until, 102.0)
-
-    def test_released_lease_is_not_leased_again(self) -> None:
-        """What was given back before the restart holds nobody up after it."""
-        entry = granted(self.log, "t", 7, 0.0)
-        entry.holder = NONE
+        entry.holder = NONE  # what was given back holds nobody up
         self.log.keep("t")
         back = self.opened(100.0).get("t")
-        assert back is not None
-        self.assertEqual(back.until, 0.0)
+        self.assertEqual(back and back.until, 0.0)
 
     def test_longest_ttl_is_remembered(self) -> None:
         """The longest lease ever granted is known after a restart: so long may others rely on what was forgotten."""
@@ -106,15 +98,6 @@ class LogTests(SynchronousTestCase):
         self.patch(module, "MAX_REGISTERS", 1)
         granted(self.log, "t", 1, 0.0).configuration = FIRST + 1
         self.assertIsNone(entered(self.log, "u", 1e9))
-
-    def test_many_tasks(self) -> None:
-        """Hundreds of tasks are all back after a restart, whatever their names."""
-        names = [f"{random.Random(n).randbytes(4).hex()} ü" for n in range(300)]
-        for number, name in enumerate(names, start=1):
-            granted(self.log, name, number, 0.0)
-        back = self.opened()
-        tokens = [entry.token for name in names if (entry := back.get(name)) is not None]
-        self.assertEqual(tokens, list(range(1, 301)))
 
     @settings(max_examples=200, deadline=None, derandomize=True, database=None)
     @given(ANYTHING)

@@ -9,7 +9,7 @@ from typing import Any
 from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.entangled.quorum.ballot import Ballot
+from middleware.entangled.quorum.ballot import NONE, Ballot
 from middleware.entangled.quorum.proposer import Outcome, Result, conclude, decide
 from middleware.entangled.quorum.register import Kind, Reply
 from middleware.entangled.quorum.round import Tally
@@ -18,60 +18,39 @@ from tests.middleware.quorum.members import LEASE, TAKE, Member, Use
 LOW, MID = Ballot(1, b"a"), Ballot(2, b"b")
 
 
+def reply(kind: Kind, counter: int = 9, accepted: Ballot = NONE, value: bytes | None = None) -> Reply:
+    return Reply(kind, Ballot(counter, b""), accepted=accepted, value=value)
+
+
 class ConcludeTests(SynchronousTestCase):
-    """How a round ends."""
-
-    def _came(self, *replies: Reply | None) -> Outcome | None:
-        tally = Tally(3)
-        for place, reply in enumerate(replies):
-            tally.add(place, reply)
-        return conclude(tally) if tally.is_decided else None
-
-    def test_majority_wins(self) -> None:
-        """Two promises of three win, without waiting for the third answer."""
-        self.assertIsNone(self._came(Reply(Kind.GRANTED, Ballot(1, b""))))
-        self.assertEqual(self._came(*[Reply(Kind.GRANTED, Ballot(1, b""))] * 2), Outcome(Result.WON, None, 1))
-
-    def test_highest_accepted_value_must_be_completed(self) -> None:
-        """Of what the promising members have accepted, the value of the highest ballot is the one to go on with."""
-        old, new = (
-            Reply(Kind.GRANTED, Ballot(9, b""), accepted=LOW, value=b"old"),
-            Reply(Kind.GRANTED, Ballot(9, b""), accepted=MID, value=b"new"),
-        )
-        self.assertEqual(self._came(old, new), Outcome(Result.WON, b"new", 9))
-        self.assertEqual(self._came(Reply(Kind.GRANTED, Ballot(9, b"")), old), Outcome(Result.WON, b"old", 9))
-
-    def test_what_a_majority_accepted_is_decided(self) -> None:
-        """Two members that accepted one ballot settle it, whatever they answered."""
-        told = Reply(Kind.OUTBID, Ballot(9, b""), accepted=LOW, value=b"x")
-        self.assertEqual(self._came(told, told), Outcome(Result.DECIDED, b"x", 9))
-        self.assertEqual(
-            self._came(*[Reply(Kind.GRANTED, Ballot(1, b""), accepted=LOW, value=b"x")] * 2),
-            Outcome(Result.DECIDED, b"x", 1),
-        )
-
-    def test_the_same_value_under_two_ballots_is_not_yet_decided(self) -> None:
-        """Two acceptances under different ballots are no majority for either."""
-        a, b = (
-            Reply(Kind.OUTBID, Ballot(9, b""), accepted=LOW, value=b"x"),
-            Reply(Kind.OUTBID, Ballot(9, b""), accepted=MID, value=b"x"),
-        )
-        outcome = self._came(a, b)
-        self.assertEqual(outcome and outcome.result, Result.OUTBID)
-
-    def test_lost_rounds(self) -> None:
-        """A round is lost when a majority cannot be had any more: leased, outbid or silent."""
-        leased = Reply(Kind.HELD, Ballot(4, b""), remaining=2.5)
-        self.assertIsNone(self._came(leased))
-        self.assertEqual(self._came(leased, None), Outcome(Result.HELD, None, 4, 2.5))
-        self.assertEqual(self._came(leased, Reply(Kind.OUTBID, Ballot(7, b""))), Outcome(Result.OUTBID, None, 7, 2.5))
-        self.assertEqual(self._came(None, None), Outcome(Result.SILENT))
-        self.assertEqual(self._came(None, Reply(Kind.UNPREPARED), None), Outcome(Result.SILENT))
+    def test_conclude(self) -> None:
+        """Promises win, the highest accepted value is completed, one that a majority accepted is decided, else lost."""
+        yes, held = reply(Kind.GRANTED), Reply(Kind.HELD, Ballot(4, b""), remaining=2.5)
+        old, new = reply(Kind.GRANTED, 9, LOW, b"old"), reply(Kind.GRANTED, 9, MID, b"new")
+        outbid = reply(Kind.OUTBID, 9, LOW, b"x")
+        rows: list[tuple[list[Reply | None], Outcome | None]] = [
+            ([yes], None),
+            ([yes, yes], Outcome(Result.WON, None, 9)),
+            ([old, new], Outcome(Result.WON, b"new", 9)),
+            ([yes, old], Outcome(Result.WON, b"old", 9)),
+            ([outbid, outbid], Outcome(Result.DECIDED, b"x", 9)),
+            ([old, old], Outcome(Result.DECIDED, b"old", 9)),
+            # The same value under two ballots is not decided.
+            ([outbid, reply(Kind.OUTBID, 9, MID, b"x")], Outcome(Result.OUTBID, None, 9)),
+            ([held], None),
+            ([held, None], Outcome(Result.HELD, None, 4, 2.5)),
+            ([held, reply(Kind.OUTBID, 7)], Outcome(Result.OUTBID, None, 7, 2.5)),
+            ([None, None], Outcome(Result.SILENT)),
+            ([None, Reply(Kind.UNPREPARED), None], Outcome(Result.SILENT)),
+        ]
+        for replies, outcome in rows:
+            tally = Tally(3)
+            for place, each in enumerate(replies):
+                tally.add(place, each)
+            self.assertEqual(conclude(tally) if tally.is_decided else None, outcome, replies)
 
 
 class DecideTests(SynchronousTestCase):
-    """Behaviour of ``decide``, with the acceptors of both users."""
-
     def decide(self, seed: int, use: Use) -> set[Any]:
         """What three proposers are told of one register, while losses and restarts come between their questions."""
         rng, now = random.Random(seed), 0.0

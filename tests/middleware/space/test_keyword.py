@@ -13,8 +13,6 @@ from tests.fleet import FleetCase
 
 
 class WordsTests(SynchronousTestCase):
-    """Behaviour of ``words``."""
-
     def test_names(self) -> None:
         """A name is parted at everything but letters and digits, without regard to case, each word once."""
         for name, wanted in [
@@ -35,8 +33,6 @@ class WordsTests(SynchronousTestCase):
 
 
 class KeywordsTests(FleetCase):
-    """Behaviour of ``Keywords``."""
-
     def test_search(self) -> None:
         """What was published is found by any of its words, in any case, and by all of several; others are not."""
         fleet = self.fleet(5)

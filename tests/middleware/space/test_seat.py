@@ -1,4 +1,4 @@
-"""Tests of what a council member answers, keeps and forgets, and of what stands in records."""
+"""Tests of what a council member answers, keeps and forgets, of what stands in records, and of what is completed."""
 
 from __future__ import annotations
 
@@ -9,13 +9,14 @@ from typing import Any
 import msgpack
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from twisted.internet.defer import Deferred
+from twisted.internet.defer import Deferred, fail, maybeDeferred
 from twisted.trial.unittest import SynchronousTestCase
 
+from middleware.entangled.background import Background
 from middleware.entangled.clock import HeapClock
 from middleware.entangled.contact import Contact
 from middleware.entangled.data.memory import MemoryStore
-from middleware.entangled.errors import Refused
+from middleware.entangled.errors import NoAnswer, Refused
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.network import Address
 from middleware.entangled.quorum import log as module
@@ -23,6 +24,7 @@ from middleware.entangled.quorum.acceptor import Event
 from middleware.entangled.quorum.ballot import Ballot
 from middleware.entangled.quorum.register import Kind
 from middleware.entangled.record import Record
+from middleware.entangled.space.council import Council
 from middleware.entangled.space.posting import (
     Member,
     Place,
@@ -49,34 +51,26 @@ FOREIGN: Any = st.recursive(
 
 
 def place(number: int, name: str = "t") -> Place:
-    """One of many places."""
     return Place(KEY, ME.public, f"{name}{number}", number.to_bytes(8, "big"))
 
 
 def record(name: str, value: bytes | None, sequence: int = 1) -> Record:
-    """A record of the space, unsigned."""
     return Record(KEY, name, ME.public, sequence, "team", 60.0, value, bytes([sequence]) * 64)
 
 
 def tuple_record(where: Place, sequence: int = 1) -> Record:
-    """The record of a tuple at ``where``."""
     return record(where.name, packed_tuple(where.mark, ("x",), [Member(PEER, b"i" * 8)]), sequence)
 
 
 class Exposed:
-    """Takes down what a seat exposes."""
-
     def __init__(self) -> None:
         self.methods: dict[str, Callable[..., object]] = {}
 
     def expose(self, name: str, answer: Callable[..., object], changes: bool = False) -> None:
-        """Take it down."""
         self.methods[name] = answer
 
 
 class SeatTests(SynchronousTestCase):
-    """Behaviour of ``Seat``."""
-
     def setUp(self) -> None:
         self.clock = HeapClock()
         self.store = MemoryStore()
@@ -87,12 +81,10 @@ class SeatTests(SynchronousTestCase):
         return Seat(Exposed(), self.store, self.clock, random.Random(seed))
 
     def claim(self, where: Place, counter: int = 1, taker: bytes = b"a", lease: float = 2.0) -> Kind:
-        """What the member answers to a claim."""
         answer: Any = self.seat.answer_claim(PEER, KEY, [where.packed()], self.seat.incarnation, counter, taker, lease)
         return self._kind(answer, Event.PREPARE)
 
     def confirm(self, where: Place, counter: int = 1, taker: bytes = b"a") -> Kind:
-        """What the member answers to a confirm."""
         life = self.seat.incarnation
         answer: Any = self.seat.answer_confirm(PEER, KEY, [where.packed()], life, counter, taker, taker)
         return self._kind(answer, Event.ACCEPT)
@@ -101,21 +93,6 @@ class SeatTests(SynchronousTestCase):
         reply = unpack_reply(answer[0], event)
         assert reply is not None
         return reply.kind
-
-    def test_votes_survive_a_restart(self) -> None:
-        """The next life on the same store is the same member: what was accepted and what is leased still holds."""
-        life = self.seat.incarnation
-        self.claim(place(1))
-        self.confirm(place(1))
-        self.claim(place(2), lease=5.0)
-        self.clock.advance(100.0)
-        self.seat = self.made(2)
-        self.assertEqual(self.seat.incarnation, life)
-        vote = self.seat.vote(place(1))
-        self.assertEqual(vote and vote.value, b"a")
-        self.assertEqual(self.claim(place(2), 2, b"b"), Kind.HELD)
-        self.clock.advance(5.0)
-        self.assertEqual(self.claim(place(2), 2, b"b"), Kind.GRANTED)
 
     def test_lost_memory_is_another_life(self) -> None:
         """A member whose store is empty or rotten has another incarnation, and refuses what counts on the old one."""
@@ -146,11 +123,6 @@ class SeatTests(SynchronousTestCase):
         for question in wrong:
             self.assertRaises(Refused, self.seat.answer_claim, PEER, *question)
         self.assertRaises(Refused, self.seat.answer_confirm, PEER, KEY, [where], life, 1, b"a", b"")
-        self.assertEqual(len(self.seat), 0)
-
-    def test_confirm_needs_a_claim(self) -> None:
-        """A confirm of what was never promised here is refused and not remembered."""
-        self.assertEqual(self.confirm(place(1)), Kind.UNPREPARED)
         self.assertEqual(len(self.seat), 0)
 
     def test_nothing_is_promised_about_what_is_over(self) -> None:
@@ -210,40 +182,6 @@ class SeatTests(SynchronousTestCase):
         disk.callback(None)
         self.assertEqual(self._kind(self.successResultOf(answer), Event.PREPARE), Kind.GRANTED)
 
-    def test_release(self) -> None:
-        """A released lease lets the next one in; what was released is over, and nobody releases for another."""
-        self.claim(place(1), lease=50.0)
-        self.release(place(1), 1, b"b")
-        self.assertEqual(self.claim(place(1), 2, b"b"), Kind.HELD)
-        self.release(place(1), 1, b"a")
-        self.assertEqual((self.confirm(place(1)), self.claim(place(1))), (Kind.OUTBID, Kind.OUTBID))
-        self.assertEqual(self.claim(place(1), 2, b"b"), Kind.GRANTED)
-
-    def release(self, where: Place, counter: int, taker: bytes) -> None:
-        """Give a claim back."""
-        self.seat.answer_release(PEER, KEY, [where.packed()], self.seat.incarnation, counter, taker)
-
-    def test_lower_ballots(self) -> None:
-        """What is lower than what was promised gets no promise and is not accepted, nor after a restart."""
-        self.claim(place(1), 5, b"b", lease=0.5)
-        for _ in range(2):
-            self.clock.advance(1.0)
-            self.assertEqual((self.claim(place(1), 4, b"a"), self.confirm(place(1), 5, b"a")), (Kind.OUTBID,) * 2)
-            self.seat = self.made(2)
-        self.assertEqual(self.confirm(place(1), 5, b"b"), Kind.GRANTED)
-
-    def test_a_claim_keeps_others_out(self) -> None:
-        """A claim is renewed by its taker alone, ends in time, and stands against no ballot that has won elsewhere."""
-        self.claim(place(1), 1, b"a", lease=2.0)
-        self.clock.advance(1.5)
-        self.assertEqual(self.claim(place(1), 2, b"b"), Kind.HELD)
-        self.assertEqual(self.claim(place(1), 3, b"a"), Kind.GRANTED)
-        self.clock.advance(1.5)
-        self.assertEqual(self.claim(place(1), 4, b"b"), Kind.HELD)
-        self.clock.advance(0.5)
-        self.assertEqual(self.claim(place(1), 4, b"b"), Kind.GRANTED)
-        self.assertEqual(self.confirm(place(1), 5, b"c"), Kind.GRANTED)
-
     def test_what_was_accepted_is_told(self) -> None:
         """A later claimant is told what to complete, once the one before it has had a second to finish."""
         self.claim(place(1), 1, b"a", lease=100.0)
@@ -255,12 +193,6 @@ class SeatTests(SynchronousTestCase):
         reply = unpack_reply(told[0], Event.PREPARE)  # type: ignore[index]
         assert reply is not None
         self.assertEqual((reply.accepted, reply.value), (Ballot(1, b"a"), b"a"))
-
-    def test_numbers_are_bounded(self) -> None:
-        """A claimant cannot use up the ballots of a tuple."""
-        self.assertEqual(self.claim(place(1), 2**48 - 1), Kind.OUTBID)
-        self.assertEqual(self.claim(place(1), 1), Kind.GRANTED)
-        self.assertEqual(self.confirm(place(1), 2**48 - 1), Kind.OUTBID)
 
     @settings(max_examples=300, deadline=None, derandomize=True, database=None)
     @given(foreign=FOREIGN, noise=st.binary(max_size=60))
@@ -281,8 +213,6 @@ class SeatTests(SynchronousTestCase):
 
 
 class PostingTests(SynchronousTestCase):
-    """Behaviour of ``posting`` and ``standing``."""
-
     def test_round_trip(self) -> None:
         """A tuple and a note come back from their records as they were."""
         council = (Member(PEER, b"i" * 8),)
@@ -326,3 +256,55 @@ class PostingTests(SynchronousTestCase):
             except (ValueError, OverflowError):
                 continue
             self.assertIsInstance(posting(record("t", packed)), Posted | Taken | None)
+
+
+OWN = b"own"
+
+
+class ResolveTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.clock, self.rng = HeapClock(), random.Random(1)
+        self.contacts = [Contact(Identity(bytes([n]) * 32).public, Address("10.0.0.1", 7000 + n)) for n in range(3)]
+        self.seats = [Seat(Exposed(), MemoryStore(), self.clock, self.rng) for _ in range(3)]
+        pairs = zip(self.contacts, self.seats, strict=True)
+        self.posted = Posted(place(1), ("x",), tuple(Member(contact, seat.incarnation) for contact, seat in pairs))
+        self.silent: set[int] = set()
+        self.council = Council(self.ask, self.clock, self.rng, Background(self.clock))
+
+    def ask(self, contact: Contact, method: str, arguments: tuple[object, ...]) -> Deferred[Any]:
+        number = self.contacts.index(contact)
+        if number in self.silent:
+            return fail(NoAnswer("it is silent"))
+        return maybeDeferred(getattr(self.seats[number], method.replace("decree.", "answer_")), PEER, *arguments)
+
+    def begin(self, number: int, counter: int, taker: bytes) -> None:
+        """Let one member accept a take, as if its taker had died then."""
+        seat = self.seats[number]
+        places: list[object] = [place(1).packed()]
+        seat.answer_claim(PEER, KEY, places, seat.incarnation, counter, taker, 1.0)
+        seat.answer_confirm(PEER, KEY, places, seat.incarnation, counter, taker, taker)
+
+    def resolve(self, value: bytes | None) -> bytes | None:
+        found: list[bytes | None] = []
+        Deferred.fromCoroutine(self.council.resolve(self.posted, OWN, value)).addCallback(found.append)
+        self.clock.advance(30.0)
+        return found[0]
+
+    def test_own_value_gives_way(self) -> None:
+        """A take that one member has accepted may be decided, so it is completed, whoever asks."""
+        self.begin(0, 1, b"a")
+        self.silent.add(2)
+        self.assertEqual(self.resolve(OWN), b"a")
+
+    def test_highest_ballot(self) -> None:
+        """Of two takes that were begun only the one under the higher ballot may be decided."""
+        self.begin(0, 2, b"b")
+        self.begin(1, 1, b"a")
+        self.silent.add(2)
+        self.assertEqual(self.resolve(None), b"b")
+
+    def test_nothing_was_begun(self) -> None:
+        """Where nothing was accepted the own value is decided, and without one nothing is, nor held."""
+        self.assertIsNone(self.resolve(None))
+        self.assertEqual(self.resolve(OWN), OWN)
+        self.assertEqual(self.resolve(b"late"), OWN)

@@ -30,8 +30,6 @@ FOREIGN: Any = st.recursive(
 
 
 class WireTests(SynchronousTestCase):
-    """Behaviour of ``pack_reply`` and ``unpack_reply``."""
-
     @settings(max_examples=100, deadline=None, derandomize=True, database=None)
     @given(reply=REPLIES, accepted=st.none() | st.integers(1, 2**48 - 1), name=st.binary(min_size=1, max_size=40))
     def test_round_trip(self, reply: Reply, accepted: int | None, name: bytes) -> None:
@@ -68,8 +66,6 @@ class WireTests(SynchronousTestCase):
 
 
 class NoteTests(SynchronousTestCase):
-    """Notes as the version before wrote them."""
-
     def test_old_notes(self) -> None:
         """What was promised, leased and accepted is read, and written as it was."""
         codec, key, owner = CODEC, b"k" * 20, b"o" * 32

@@ -15,9 +15,7 @@ from middleware.entangled.space.template import (
     ANY,
     OPERATORS,
     BadTuple,
-    Predicate,
     template_of,
-    template_unpacked,
     tuple_of,
     tuple_unpacked,
     where,
@@ -31,13 +29,6 @@ VALUES = (
     | st.text(st.characters(exclude_categories=["Cs"]), max_size=8)
     | st.binary(max_size=8)
 )
-PREDICATES = (
-    st.builds(lambda o, v: where(o, v), st.sampled_from(["<", "<=", ">", ">="]), st.integers(-9, 9) | st.text("ab"))
-    | st.builds(lambda v: where("!=", v), VALUES)
-    | st.builds(lambda v: where("in", v), st.lists(VALUES, max_size=4))
-    | st.builds(lambda v: where("prefix", v), st.text("ab", max_size=3) | st.binary(max_size=3))
-)
-FIELDS = VALUES | st.just(ANY) | st.sampled_from([int, float, str, bytes, bool]) | PREDICATES
 FOREIGN = st.recursive(
     VALUES | st.floats(),
     lambda inner: st.lists(inner, max_size=5) | st.dictionaries(VALUES, inner, max_size=2),
@@ -46,24 +37,18 @@ FOREIGN = st.recursive(
 
 
 class TemplateTests(SynchronousTestCase):
-    """Behaviour of ``template_of``, ``where`` and ``matches``."""
-
     def test_values_match_their_like_only(self) -> None:
         """One, 1.0 and True are three different values, and None is one as well."""
         self.assertTrue(template_of(["a", 1, None, b"x"]).matches(("a", 1, None, b"x")))
         for other in (1.0, True, "1", None):
             self.assertFalse(template_of([1]).matches((other,)))
 
-    def test_length_counts(self) -> None:
-        """A template matches tuples of its own length only."""
-        self.assertFalse(template_of([ANY]).matches(("a", "b")))
-        self.assertEqual(template_of([ANY, ANY]).arity, 2)
-
     def test_types_and_wildcards(self) -> None:
-        """A type takes exactly its own values, and ANY takes everything."""
+        """A type takes exactly its own values, ANY takes everything, and a template only tuples of its own length."""
         self.assertTrue(template_of([int, str, ANY]).matches((1, "a", None)))
         self.assertFalse(template_of([int]).matches((True,)))
         self.assertFalse(template_of([float]).matches((1,)))
+        self.assertFalse(template_of([ANY]).matches(("a", "b")))
 
     def test_predicates(self) -> None:
         """Each operator holds where it should, compares int with float, and holds for nothing it can't compare."""
@@ -102,18 +87,6 @@ class TemplateTests(SynchronousTestCase):
         self.assertRaises(TooLarge, tuple_of, ["x" * 700])
         self.assertRaises(TooLarge, template_of, [b"x" * 700])
 
-    def test_a_template_is_taken_as_it_is(self) -> None:
-        """A template that was made once may be given again."""
-        template = template_of([1, ANY])
-        self.assertIs(template_of(template), template)
-
-    @settings(max_examples=150, deadline=None, derandomize=True, database=None)
-    @given(fields=st.lists(FIELDS, min_size=1, max_size=6))
-    def test_round_trip(self, fields: list[Any]) -> None:
-        """Every template comes back from a message as it was."""
-        template = template_of(fields)
-        self.assertEqual(template_unpacked(msgpack.unpackb(msgpack.packb(template.packed()))), template)
-
     @settings(max_examples=150, deadline=None, derandomize=True, database=None)
     @given(fields=st.lists(VALUES, min_size=1, max_size=8))
     def test_tuple_round_trip(self, fields: list[Any]) -> None:
@@ -123,25 +96,10 @@ class TemplateTests(SynchronousTestCase):
         self.assertTrue(template_of(fields).matches(back))
 
     @settings(max_examples=300, deadline=None, derandomize=True, database=None)
-    @given(foreign=FOREIGN | st.lists(FOREIGN, max_size=4))
-    def test_decoders_are_total(self, foreign: Any) -> None:
-        """Anything gives a tuple or template that can be used, or ``Malformed`` and nothing else."""
+    @given(operator=st.sampled_from([*OPERATORS, "=", "like"]), foreign=FOREIGN | st.lists(FOREIGN, max_size=4))
+    def test_total(self, operator: str, foreign: Any) -> None:
+        """Anything is a tuple or ``Malformed``, and an operand or ``BadTuple``, and nothing else."""
         with contextlib.suppress(Malformed):
             self.assertIsInstance(tuple_unpacked(foreign), tuple)
-        try:
-            template = template_unpacked(foreign)
-        except Malformed:
-            return
-        self.assertIn(template.matches((1,) * template.arity), (True, False))
-
-    @settings(max_examples=200, deadline=None, derandomize=True, database=None)
-    @given(operator=st.sampled_from([*OPERATORS, "=", "", "like"]), operand=FOREIGN, value=VALUES)
-    def test_foreign_predicates(self, operator: str, operand: Any, value: Any) -> None:
-        """A predicate from the wire is lawful and answers for any value, or it is ``Malformed``."""
-        for kind in (3, True, 4, "3"):
-            try:
-                template = template_unpacked([[kind, operator, operand]])
-            except Malformed:
-                continue
-            self.assertIsInstance(template.fields[0], Predicate)
-            self.assertIn(template.matches((value,)), (True, False))
+        with contextlib.suppress(BadTuple):
+            self.assertIn(where(operator, foreign).holds(1), (True, False))

@@ -35,14 +35,14 @@ class DiskTests(SynchronousTestCase):
 
     def test_last_moment_goes_with_the_power(self) -> None:
         """What ``written`` confirmed is in the next life, what it did not is not, and a lease never is."""
-        self.disk.put(_record("safe"), 60.0, 0.0)
-        self.disk.put(_record("lease", lifetime="leased"), 60.0, 0.0)
+        self.disk.put(_record("safe"), 60.0)
+        self.disk.put(_record("lease", lifetime="leased"), 60.0)
         self.disk.note("fact", b"1")
         safe = self.disk.written()
         self.assertNoResult(safe)
         self.clock.advance(0.1)
         self.successResultOf(safe)
-        self.disk.put(_record("late"), 60.0, 0.1)
+        self.disk.put(_record("late"), 60.0)
         late = self.disk.written()
         self.disk.lose_power()
         self.clock.advance(1.0)
@@ -53,28 +53,28 @@ class DiskTests(SynchronousTestCase):
 
     def test_third_life_has_what_the_first_wrote(self) -> None:
         """What a disk held when its node began is still on it when the next one ends."""
-        self.disk.put(_record("old"), 60.0, 0.0)
+        self.disk.put(_record("old"), 60.0)
         self.clock.advance(1.0)
         second = self._reborn()
         self.assertEqual(self._names(next_life(second, Memory(), 1.0)), ["old"])
 
     def test_goodbye_writes_all(self) -> None:
         """A store that is closed has written what it could."""
-        self.disk.put(_record("last"), 60.0, 0.0)
+        self.disk.put(_record("last"), 60.0)
         self.disk.close()
         self.assertEqual(self._names(self._reborn()), ["last"])
 
     def test_full_disk_refuses_by_name_and_recovers(self) -> None:
         """While the disk is full, waiters are told, new records refused and old ones read; then all goes on."""
-        self.disk.put(_record("before"), 60.0, 0.0)
+        self.disk.put(_record("before"), 60.0)
         self.clock.advance(0.1)
         self.disk.is_full = True
-        self.disk.put(_record("owed"), 60.0, 0.1)
+        self.disk.put(_record("owed"), 60.0)
         owed = self.disk.written()
         self.clock.advance(0.1)
         self.failureResultOf(owed, Unwritable)
         self.assertIn("full", self.disk.trouble)
-        self.assertRaises(Unwritable, self.disk.put, _record("refused"), 60.0, 0.2)
+        self.assertRaises(Unwritable, self.disk.put, _record("refused"), 60.0)
         self.failureResultOf(self.disk.written(), Unwritable)
         self.assertEqual(self._names(self.disk), ["before", "owed"])
         self.disk.is_full = False
@@ -86,8 +86,8 @@ class DiskTests(SynchronousTestCase):
     def test_memory_outlives_the_power_but_for_leases(self) -> None:
         """Where a scenario has no disks, all but the leases is there in the next life."""
         memory = Memory()
-        memory.put(_record("team"), 60.0, 0.0)
-        memory.put(_record("lease", lifetime="leased"), 60.0, 0.0)
+        memory.put(_record("team"), 60.0)
+        memory.put(_record("lease", lifetime="leased"), 60.0)
         memory.note("fact", b"1")
         reborn = next_life(memory, Memory(), 5.0)
         self.assertEqual((self._names(reborn), reborn.noted("fact"), reborn.origin), (["team"], b"1", "kept"))
