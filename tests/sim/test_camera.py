@@ -1,4 +1,4 @@
-"""Tests of ``sim.robots.camera`` and ``sim.robots.mesh``."""
+"""Tests of ``sim.robots.camera``."""
 
 from __future__ import annotations
 

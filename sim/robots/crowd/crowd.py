@@ -13,8 +13,7 @@ import struct
 import numpy as np
 
 from sim.robots.crowd.ground import Floats, Ground
-from sim.robots.crowd.neighbour import Neighbours
-from sim.robots.crowd.ray import Disc, Rays
+from sim.robots.crowd.ray import Disc, Neighbours, Rays
 from sim.robots.dog import ACCELERATION, ANGULAR_ACCELERATION, BRAKING, LIMITS
 from sim.robots.scene import FOOTPRINT, SceneError
 from sim.robots.world import TICK, NotPossible, Target
