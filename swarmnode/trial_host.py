@@ -229,9 +229,8 @@ class Computer:
         member.call(public, done, order["limit_s"])
 
     def _do_path(self, order: Order) -> None:
-        """How peers are reached now."""
-        member = self._members[order["trial"]]
-        self._answer(order, paths=[member.path(bytes.fromhex(peer)) for peer in order["peers"]])
+        """How a peer is reached now."""
+        self._answer(order, path=self._members[order["trial"]].path(bytes.fromhex(order["peer"])))
 
     def _do_stop(self, order: Order) -> None:
         """End nodes without a word."""

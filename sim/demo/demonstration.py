@@ -28,7 +28,7 @@ from sim.demo.configuration import DOGS, JUDGE, YARD, Plan
 from sim.demo.experiment import Experiment, report, table
 from sim.demo.port import PortBusy
 from sim.demo.processes import RESTART_S, Team
-from sim.demo.stage import WEB_PORT, Trouble, arranged, fresh, has_tls
+from sim.demo.stage import WEB_PORT, Trouble, arranged, fresh, has_tls, say
 from sim.demo.story import present, told
 from sim.demo.visitor import PageError, Visitor
 
@@ -234,11 +234,6 @@ def _port(word: str) -> int:
     return int(word)
 
 
-def _say(line: str) -> None:
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
-
-
 async def _run(reactor: Any, wishes: argparse.Namespace) -> None:
     try:
         with fresh(wishes.run_dir.absolute()):
@@ -248,8 +243,8 @@ async def _run(reactor: Any, wishes: argparse.Namespace) -> None:
             if wishes.tls and not has_tls():
                 raise Trouble("--tls wants libraries that are missing; install them by: pip install 'swarm-node[tls]'")
             is_usual = not wishes.headless and wishes.web_port != 0
-            plan = arranged(folder, wishes.web_host, wishes.web_port, is_usual, _say, with_tls, wishes.robot)
-            demonstration = Demonstration(reactor, plan, wishes.seed, _say, wishes.lose == "link")
+            plan = arranged(folder, wishes.web_host, wishes.web_port, is_usual, say, with_tls, wishes.robot)
+            demonstration = Demonstration(reactor, plan, wishes.seed, say, wishes.lose == "link")
             reactor.addSystemEventTrigger("before", "shutdown", demonstration.stop)
 
             async def begun() -> None:
@@ -258,26 +253,26 @@ async def _run(reactor: Any, wishes: argparse.Namespace) -> None:
                     demonstration.watch()
                     await Deferred()
 
-            await judged(demonstration, begun, wishes.report, _say)
+            await judged(demonstration, begun, wishes.report, say)
     except (Trouble, PageError, PortBusy, OSError) as problem:
         sys.stderr.write(f"swarm demo: {problem}\n")
         raise SystemExit(2 if isinstance(problem, PortBusy) else 1) from None
 
 
 def _invite(demonstration: Demonstration, plan: Plan) -> None:
-    _say(f"The page: {demonstration.address}   (logs: {plan.run_dir}; end with Ctrl-C)")
+    say(f"The page: {demonstration.address}   (logs: {plan.run_dir}; end with Ctrl-C)")
     if demonstration.secure:
-        _say(f"Over TLS: {demonstration.secure}   (a browser warns until it trusts the team: docs/https.md)")
-    _say("If the node that serves it is lost, the page goes on at another: end the process of vaio, and see.")
+        say(f"Over TLS: {demonstration.secure}   (a browser warns until it trusts the team: docs/https.md)")
+    say("If the node that serves it is lost, the page goes on at another: end the process of vaio, and see.")
     if plan.web_host == LOOPBACK:
-        _say("For a phone or tablet in the same network, then over TLS as well: make demo WEB_HOST=0.0.0.0")
+        say("For a phone or tablet in the same network, then over TLS as well: make demo WEB_HOST=0.0.0.0")
     else:
         here, tls = os.uname().nodename, plan.tls_ports[0]
         also = f", https://{here}.local:{tls} (which the camera of a phone wants)" if tls else ""
-        _say(f"In the same network: http://{here}.local:{plan.web_port}{also}, or this machine's address;")
-        _say(f"the code to sign in with: {plan.code}.  For a phone there is a code to scan: Invite, on the page")
+        say(f"In the same network: http://{here}.local:{plan.web_port}{also}, or this machine's address;")
+        say(f"the code to sign in with: {plan.code}.  For a phone there is a code to scan: Invite, on the page")
         if not tls:
-            _say("The camera of a phone wants https, which is missing here: pip install 'swarm-node[tls]'")
+            say("The camera of a phone wants https, which is missing here: pip install 'swarm-node[tls]'")
 
 
 def main(arguments: Sequence[str] = tuple(sys.argv[1:])) -> None:

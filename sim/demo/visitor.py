@@ -7,16 +7,16 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from io import BytesIO
 from typing import Any
 
-from twisted.internet.defer import Deferred, succeed
-from twisted.internet.interfaces import IConsumer, IDelayedCall, IReactorTime
+from twisted.internet.defer import Deferred
+from twisted.internet.interfaces import IDelayedCall, IReactorTime
 from twisted.internet.protocol import Protocol, connectionDone
 from twisted.python.failure import Failure
-from twisted.web.client import Agent, readBody
+from twisted.web.client import Agent, FileBodyProducer, readBody
 from twisted.web.http_headers import Headers
-from twisted.web.iweb import IBodyProducer, IResponse
-from zope.interface import implementer
+from twisted.web.iweb import IResponse
 
 RETRY_S = 0.5
 LIMIT_S = 5.0
@@ -106,7 +106,7 @@ class Visitor:
     async def _ask(self, verb: bytes, path: str, content: dict[str, str] | None = None) -> dict[str, Any]:
         if content is None:
             await self._sign_in()
-        producer = None if content is None else _Body(json.dumps(content).encode())
+        producer = None if content is None else FileBodyProducer(BytesIO(json.dumps(content).encode()))
         asked = self._agent.request(verb, (self._address + path).encode(), self._headers(), producer)
         response = await asked.addTimeout(LIMIT_S, self._clock)
         body = await readBody(response).addTimeout(LIMIT_S, self._clock)
@@ -161,28 +161,6 @@ class Visitor:
         if isinstance(state, dict):
             before, self.state = self.state, state
             self._on_state(before, state)
-
-
-@implementer(IBodyProducer)
-class _Body:
-    """A body that is there as a whole."""
-
-    def __init__(self, content: bytes) -> None:
-        self.length = len(content)
-        self._content = content
-
-    def startProducing(self, consumer: IConsumer) -> Deferred[None]:
-        consumer.write(self._content)
-        return succeed(None)
-
-    def pauseProducing(self) -> None:
-        pass
-
-    def resumeProducing(self) -> None:
-        pass
-
-    def stopProducing(self) -> None:
-        pass
 
 
 class _Stream(Protocol):

@@ -17,27 +17,15 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
+from sim.demo.stage import say
+from sim.demo.trials import whole
 from sim.namespaces.internet import Internet
 from sim.namespaces.outcome import PLAIN, Outcome, promises
-from sim.namespaces.picture import drawn
-from sim.namespaces.report import table, written
+from sim.namespaces.report import drawn, table, written
 from sim.namespaces.room import refusal
 
 DOCUMENT = Path("docs/nat.md")
 PICTURE = "images/nat.svg"
-
-
-def whole(word: str) -> int:
-    """A number that is not negative, from the command line."""
-    if not (word.isdecimal() and len(word) <= 6):
-        raise argparse.ArgumentTypeError(f"must be a whole number from 0 on, is {word!r}")
-    return int(word)
-
-
-def say(line: str) -> None:
-    """Tell the person who waits."""
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
 
 
 async def run(count: int, lossy: int, seed: int) -> list[Outcome]:

@@ -21,6 +21,7 @@ from typing import Any
 
 from sim.demo.cast import CASTS, LOOPBACK, MOST_PORTS, Robot, chosen
 from sim.demo.configuration import BOOTSTRAP, DOGS, JUDGE, RESERVE, YARD, Place, Plan
+from sim.demo.stage import Trouble, fresh, say
 from sim.namespaces.internet import Internet, Site
 from sim.namespaces.kind import Kind
 from sim.namespaces.room import refusal
@@ -57,9 +58,7 @@ def planned(run_dir: Path, robot: str, places: dict[str, Place], code: str) -> P
         name: _cabled(each, places[name].yard) for name, each in chosen(robot, DOGS, run_dir, ports, YARD_PORT).items()
     }
     nodes = dict.fromkeys((BOOTSTRAP, RESERVE, *DOGS), NODE_PORT)
-    return Plan(
-        run_dir, "0.0.0.0", WEB_PORT, YARD_PORT, nodes, code, WEB_PORT, robots=robots, places=places
-    )  # fmt: skip
+    return Plan(run_dir, "0.0.0.0", WEB_PORT, YARD_PORT, nodes, code, WEB_PORT, robots=robots, places=places)
 
 
 def _cabled(robot: Robot, yard: str) -> Robot:
@@ -75,7 +74,6 @@ def inside(given: argparse.Namespace) -> None:
     from twisted.internet.task import react
 
     from sim.demo.demonstration import Demonstration, judged
-    from sim.demo.stage import Trouble, fresh
     from sim.demo.visitor import PageError
 
     ReactorBase.seconds = staticmethod(time.monotonic)
@@ -87,13 +85,13 @@ def inside(given: argparse.Namespace) -> None:
                 said = json.loads(sys.stdin.readline())
                 places = {name: Place(**{**each, "enter": tuple(each["enter"])}) for name, each in said.items()}
                 plan = planned(folder, given.robot, places, "over-there")
-                demonstration = Demonstration(reactor, plan, given.seed, _say, given.lose == "link")
+                demonstration = Demonstration(reactor, plan, given.seed, say, given.lose == "link")
                 reactor.addSystemEventTrigger("before", "shutdown", demonstration.stop)
 
                 async def begun() -> None:
-                    _say(f"{time.monotonic() - began:7.2f} s  the page lists all dogs: {demonstration.address}")
+                    say(f"{time.monotonic() - began:7.2f} s  the page lists all dogs: {demonstration.address}")
 
-                await judged(demonstration, begun, given.report, _say)
+                await judged(demonstration, begun, given.report, say)
         except (Trouble, PageError, OSError) as problem:
             sys.stderr.write(f"demo across namespaces: {problem}\n")
             raise SystemExit(1) from None
@@ -136,18 +134,13 @@ def main(arguments: Sequence[str] = tuple(sys.argv[1:])) -> int:
         for site in net.sites:
             net.weather(site, loss=given.loss)
         net.record(given.record)
-        _say(f"dog1 behind a router ({KINDS[0].meaning}), dog2 behind another ({KINDS[1].meaning}), dog3 at home")
+        say(f"dog1 behind a router ({KINDS[0].meaning}), dog2 behind another ({KINDS[1].meaning}), dog3 at home")
         command = [sys.executable, "-m", "sim.namespaces.demo", "--inside", *arguments]
         process = net.start(HOSTS[JUDGE], command, stdin=subprocess.PIPE, cwd=Path.cwd(), text=True)
         assert process.stdin is not None
         process.stdin.write(json.dumps({name: asdict(place) for name, place in places.items()}) + "\n")
         process.stdin.flush()
         return int(process.wait())
-
-
-def _say(line: str) -> None:
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
 
 
 if __name__ == "__main__":

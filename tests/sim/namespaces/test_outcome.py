@@ -8,9 +8,8 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from sim.namespaces.kind import Kind
 from sim.namespaces.matrix import plain_pairs, sites, special_pairs
-from sim.namespaces.outcome import LOSS, MATRIX, PLAIN, Outcome, cell, is_punchable, percentile, promises
-from sim.namespaces.picture import drawn
-from sim.namespaces.report import BEGIN, END, table, written
+from sim.namespaces.outcome import LOSS, MATRIX, PLAIN, Outcome, cell, is_punchable, promises
+from sim.namespaces.report import BEGIN, END, drawn, table, written
 
 
 def good(part: str = PLAIN) -> list[Outcome]:
@@ -62,9 +61,8 @@ class OutcomeTests(SynchronousTestCase):
             outcome.took_s = [None, None]
         self.assertEqual([one.is_kept for one in promises(blocked)], [False, True, False])
 
-    def test_percentile_and_cell(self) -> None:
-        """A percentile is one of the values; a cell names ways, median, worst, and how many failed."""
-        self.assertEqual(percentile([3.0, 1.0, 2.0, 4.0], 0.5), 2.0)
+    def test_cell(self) -> None:
+        """A cell names ways, median, worst, and how many failed."""
         some = [Outcome(PLAIN, "port", "port", [took], "direct") for took in (0.1, 0.3, None)]
         self.assertEqual(cell(some), "direct 0.20 (0.30), 1 of 3 fail")
         self.assertEqual((cell(some[2:]), cell([])), ("fails", ""))
