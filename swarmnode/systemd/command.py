@@ -155,7 +155,7 @@ class _Place:
         """Put the settings into the service's folder, and once the files that they name in their own folder."""
         settings, folder = Settings.load(path), Path(path).parent
         self._state.mkdir(mode=0o700, parents=True, exist_ok=True)
-        named = [settings.node.store, getattr(settings.node, "membership", "")]
+        named = [settings.node.store, settings.node.membership]
         for file in [Path(each) for each in named if each and each != IN_MEMORY]:
             try:
                 inside = file.relative_to(folder)
