@@ -17,6 +17,7 @@ from twisted.internet.defer import Deferred, inlineCallbacks
 from twisted.protocols import portforward
 from twisted.trial.unittest import TestCase
 
+from middleware.entangled.contact import Contact
 from middleware.entangled.errors import TunnelPortInUse
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.tcp import TcpCarrier
@@ -107,6 +108,14 @@ class TunnelTests(TestCase):
         return client
 
     @inlineCallbacks
+    def member(self, url: Url) -> Generator[Deferred[Any], Any, tuple[Endpoint, Contact, TunnelNetwork]]:
+        """An endpoint that has met the one where ``url`` leads, that one's contact, and its own tunnel."""
+        tunnel, _ = self.made(url)
+        client = self.endpoint(2, tunnel)
+        contact = yield client.greet(url.address, 4.0)
+        return client, contact, tunnel
+
+    @inlineCallbacks
     def greet(self, url: Url) -> Generator[Deferred[Any], Any, ssl.SSLSocket]:
         """One that has greeted by hand."""
         client = self.dialled(url)
@@ -122,11 +131,9 @@ class TunnelTests(TestCase):
     @inlineCallbacks
     def test_endpoints_talk(self) -> Generator[Deferred[Any], Any, None]:
         """Two endpoints greet, ask and answer through TLS, 1 MiB included; the first answer comes within a second."""
-        server, _, url = self.served()
-        tunnel, _ = self.made(url)
-        client = self.endpoint(2, tunnel)
+        _, _, url = self.served()
         began = time.monotonic()
-        contact = yield client.greet(url.address, 4.0)
+        client, contact, tunnel = yield self.member(url)
         answer = yield client.ask(contact, "echo", 42)
         self.assertEqual((contact.public, answer), (Identity(b"\x01" * 32).public, 42))
         self.assertLess(time.monotonic() - began, 1.0)
@@ -138,10 +145,8 @@ class TunnelTests(TestCase):
     @inlineCallbacks
     def test_bear_a_crowd(self) -> Generator[Deferred[Any], Any, None]:
         """Of five hundred dribblers few are borne, all are let go in time, and a member is served in between."""
-        server, tunnel, url = self.served()
-        client_tunnel, _ = self.made(url)
-        client = self.endpoint(2, client_tunnel)
-        contact = yield client.greet(url.address, 4.0)
+        _, tunnel, url = self.served()
+        client, contact, _ = yield self.member(url)
         crowd: set[socket.socket] = set()
         selector = selectors.DefaultSelector()
         for number in range(500):
@@ -198,10 +203,8 @@ class TunnelTests(TestCase):
     @inlineCallbacks
     def test_garbage(self) -> Generator[Deferred[Any], Any, None]:
         """Garbage instead of TLS, of the greeting, and of frames ends its own link alone; nothing is raised."""
-        server, tunnel, url = self.served()
-        client_tunnel, _ = self.made(url)
-        client = self.endpoint(2, client_tunnel)
-        contact = yield client.greet(url.address, 4.0)
+        _, tunnel, url = self.served()
+        client, contact, _ = yield self.member(url)
         dice = random.Random(3)
         for _ in range(20):
             plain = socket.create_connection((url.host, url.port), 5.0)
@@ -218,10 +221,8 @@ class TunnelTests(TestCase):
     @inlineCallbacks
     def test_slow_reader(self) -> Generator[Deferred[Any], Any, None]:
         """For who reads nothing little is kept, the rest is dropped, and others are served as fast as before."""
-        server, tunnel, url = self.served()
-        client_tunnel, _ = self.made(url)
-        client = self.endpoint(2, client_tunnel)
-        contact = yield client.greet(url.address, 4.0)
+        _, tunnel, url = self.served()
+        client, contact, _ = yield self.member(url)
         others = set(tunnel.peers)
         yield self.greet(url)
         yield self.until(lambda: len(tunnel.peers) == 2)
@@ -279,9 +280,7 @@ class TunnelTests(TestCase):
         front = REACTOR.listenTCP(0, factory, interface=HOST)
         self.addCleanup(front.stopListening)
         through = Url("wss", HOST, front.getHost().port)
-        client_tunnel, _ = self.made(through)
-        client = self.endpoint(2, client_tunnel)
-        contact = yield client.greet(through.address, 4.0)
+        client, contact, client_tunnel = yield self.member(through)
         yield client.ask(contact, "echo", 1)
         Forwarder.is_stuck = True
         calls = task.LoopingCall(client_tunnel.send, b"there?", through.address)
