@@ -49,12 +49,12 @@ class Traffic:
 
 
 class Capture:
-    """What passes ``interface`` of ``host`` between ``with`` and its end; ``traffic`` is there afterwards."""
+    """What passes the interface of ``host`` between ``with`` and its end; ``traffic`` is there afterwards."""
 
-    def __init__(self, net: Internet, host: str, file: Path, interface: str = WAN) -> None:
+    def __init__(self, net: Internet, host: str, file: Path) -> None:
         self.traffic: dict[str, Traffic] = {}
         self.file = file
-        arguments = [sys.executable, "-m", "sim.namespaces.capture", interface, str(file.absolute())]
+        arguments = [sys.executable, "-m", "sim.namespaces.capture", WAN, str(file.absolute())]
         self._process = net.start(host, arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
     def __enter__(self) -> Capture:

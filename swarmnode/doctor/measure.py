@@ -121,12 +121,12 @@ def team_of(settings: Settings) -> Team:
     return Team(secrets, mark, Certificate(member.not_before, member.not_after), kept.known)
 
 
-def on_lan(host: str = "*") -> list[Answer]:
+def on_lan() -> list[Answer]:
     """Who answers a HAIL to all on the LAN, of whatever team; it takes ``TRIES`` times ``EACH_S`` seconds.
 
     So one who is of no team yet finds whom to ask.  Of a large team only some answer, others at the next call.
     """
-    return list(_asked(host, [], [], chosen(interfaces(), host), time.time).on_lan.values())
+    return list(_asked("*", [], [], chosen(interfaces(), "*"), time.time).on_lan.values())
 
 
 # -- the net ----------------------------------------------------------------------------------------------------------

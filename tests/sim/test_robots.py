@@ -73,29 +73,20 @@ class DogBodyTests(YardCase):
             self.assertFalse(body.sense()["base.moving"])
             self.assertTrue(math.isfinite(self.yard.world.dogs["dog1"].x))
 
-    def test_feels_between_the_ticks(self) -> None:
-        """What is always felt is a number at any moment, also after the yard has told its samples."""
+    def test_senses(self) -> None:
+        """It feels at any moment, and by its bumper a wall ahead or beside; its eye sees in full or half size."""
         body = self.lent()
         self.pass_time(0.5)
         sensed = body.sense()
         for key in ("imu.ax", "imu.az", "odom.x", "power.level"):
             self.assertTrue(math.isfinite(float(sensed[key])), key)
-
-    def test_feels_what_it_bumps_into(self) -> None:
-        """A wall ahead presses both halves of the bumper, one beside it one of them, nothing none."""
-        body = self.lent()
-        self.pass_time(0.1)
-        self.assertEqual((body.sense()["bump.left"], body.sense()["bump.right"]), (False, False))
+        self.assertEqual((sensed["bump.left"], sensed["bump.right"]), (False, False))
         for heading, wanted in ((180.0, (True, True)), (135.0, (True, False)), (-135.0, (False, True))):
             self.yard.world.move_dog("dog1", 0.2, 1.2, math.radians(heading))
             body.drive(0.16, 0.0, 0.0)
             self.pass_time(1.5)
             sensed = body.sense()
             self.assertEqual((sensed["bump.left"], sensed["bump.right"]), wanted, str(heading))
-
-    def test_sees(self) -> None:
-        """Its eye gives a picture of the camera's own size, or of half of it."""
-        body = self.lent()
         self.assertEqual(size_of(body.picture() or b""), (208, 160))
         self.assertEqual(size_of(body.picture(True) or b""), (104, 80))
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 from twisted.trial.unittest import SynchronousTestCase
 
 from sim.namespaces.kind import Kind
@@ -29,11 +27,6 @@ class OutcomeTests(SynchronousTestCase):
         self.assertEqual(len(pairs), 15)
         closed = [(a.value, b.value) for a, b in pairs if not is_punchable(a, b)]
         self.assertEqual(closed, [("port", "sym"), ("sym", "sym")])
-
-    def test_the_slower_side_counts(self) -> None:
-        """A pair needs as long as the slower of the two, and for ever where one never got an answer."""
-        self.assertEqual(Outcome(PLAIN, "none", "none", [0.1, 0.4]).seconds, 0.4)
-        self.assertEqual(Outcome(PLAIN, "none", "none", [0.1, None]).seconds, math.inf)
 
     def test_a_good_round_keeps_every_promise(self) -> None:
         """With all as it should be nothing is broken; with what can be punched relayed, or slow, something is."""
