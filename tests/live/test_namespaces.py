@@ -172,7 +172,7 @@ class MatrixTests(NamespaceCase):
     def test_whoever_can_reach_each_other_does(self) -> None:
         """One round of the matrix: nodes without a router meet at once, and table, JSON and picture are written."""
         folder = Path(self.mktemp()).absolute()
-        command = [sys.executable, "-m", "sim.namespaces", "--count", "1", "--lossy", "0", "--out", str(folder)]
+        command = [sys.executable, "-m", "benchmarks.nat", "--count", "1", "--lossy", "0", "--out", str(folder)]
         ran = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
         self.assertIn(ran.returncode, (0, 1), ran.stderr)
         found = json.loads((folder / "live-nat.json").read_text())["trials"]

@@ -1,6 +1,6 @@
 """Real nodes on one host of the internet of network namespaces (``sim.namespaces``), ordered by JSON lines.
 
-``python -m swarmnode.trial_host``.  A trial is a team of its own, so many can run beside each other in one process.
+``python -m benchmarks.nat.child``.  A trial is a team of its own, so many can run beside each other in one process.
 What is measured of a node is the node's own doing: the first moment at which it asks a peer anything, and the first
 answer that it gets.
 """

@@ -7,7 +7,7 @@ import statistics
 from collections.abc import Sequence
 from html import escape
 
-from sim.namespaces.outcome import ALONE, FORGOTTEN, LOSS, MATRIX, PLAIN, RENUMBERED, Outcome, cell, promises
+from benchmarks.nat.outcome import ALONE, FORGOTTEN, LOSS, MATRIX, PLAIN, RENUMBERED, Outcome, cell, promises
 
 WHOLE = (PLAIN, LOSS, FORGOTTEN, RENUMBERED)
 """The parts in which every pair is tried."""

@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from random import Random
 from typing import Any
 
+from benchmarks.nat.hosts import Hosts
+from benchmarks.nat.outcome import ALONE, FORGOTTEN, HOME, IDLE, LEAKY, LOSS, MATRIX, MOVED, PLAIN, RENUMBERED, Outcome
+from benchmarks.remote import Lost
 from middleware.entangled.identity import Identity
-from sim.namespaces.hosts import Hosts
 from sim.namespaces.internet import PUB, PUBS, Internet, Site
 from sim.namespaces.kind import Kind
-from sim.namespaces.outcome import ALONE, FORGOTTEN, HOME, IDLE, LEAKY, LOSS, MATRIX, MOVED, PLAIN, RENUMBERED, Outcome
-from sim.namespaces.remote import Lost
 
 JOIN_S, LOSSY_JOIN_S = 6.0, 20.0
 MEET_S, LOSSY_MEET_S = 6.0, 10.0

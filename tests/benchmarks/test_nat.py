@@ -1,13 +1,13 @@
-"""What ``sim.namespaces`` makes of its trials: promises, table, document and picture; nothing is run."""
+"""What ``benchmarks.nat`` makes of its trials: promises, table, document and picture; nothing is run."""
 
 from __future__ import annotations
 
 from twisted.trial.unittest import SynchronousTestCase
 
+from benchmarks.nat.matrix import plain_pairs, sites, special_pairs
+from benchmarks.nat.outcome import LOSS, MATRIX, PLAIN, Outcome, cell, is_punchable, promises
+from benchmarks.nat.report import BEGIN, END, drawn, table, written
 from sim.namespaces.kind import Kind
-from sim.namespaces.matrix import plain_pairs, sites, special_pairs
-from sim.namespaces.outcome import LOSS, MATRIX, PLAIN, Outcome, cell, is_punchable, promises
-from sim.namespaces.report import BEGIN, END, drawn, table, written
 
 
 def good(part: str = PLAIN) -> list[Outcome]:
