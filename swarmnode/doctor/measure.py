@@ -68,11 +68,10 @@ def measured(
     is_running: bool = False,
     health: Health | None = None,
     wall: Callable[[], float] = time.time,
-    team: Team | None = None,
 ) -> Facts:
     """The facts of the node with these settings, whose host names were looked up."""
     node = settings.node
-    team = team_of(settings) if team is None else team
+    team = team_of(settings)
     found = tuple(interfaces())
     named = dict.fromkeys([*node.known_nodes, *team.known])
     known = [each for each in named if _is_figures(each) and not _is_self(each, node.host, node.port, found)]

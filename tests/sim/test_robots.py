@@ -12,13 +12,10 @@ from twisted.internet.task import Clock
 from twisted.internet.testing import MemoryReactorClock
 from twisted.trial.unittest import SynchronousTestCase
 
-from drivers.aibo.driver import AiboDriver
-from drivers.driver import Permit
 from drivers.errors import UsageError
 from drivers.registry import describe
 from formats.jpeg import size_of
 from sim.robots.dog import LIMITS
-from sim.robots.emulator.aibo_dog import AiboEmulator
 from sim.robots.emulator.bittle import Bittle
 from sim.robots.emulator.body import MemoryBody
 from sim.robots.emulator.dog import DogBody
@@ -93,24 +90,6 @@ class DogBodyTests(YardCase):
 
 class RobotsTests(YardCase):
     """The table of robots is checked, and each dog is reached in one way only."""
-
-    def test_driver_of_its_kind_moves_it(self) -> None:
-        """The driver of an AIBO walks a dog of the yard through Tekkotsu's ports."""
-        emulator = AiboEmulator(self.clock, self.yard.lend("dog1", LIMITS), Random(2))
-        emulator.start()
-        driver = AiboDriver({"host": "dog1"}, "dog1", emulator.connector(), self.clock)
-        driver.connect()
-        self.pass_time(3.0)
-        driver.enable()
-        self.pass_time(0.2)
-        before = self.yard.world.dogs["dog1"].x
-        driver.act({"base.vx": 0.16}, Permit(1, self.clock.seconds() + 1.0))
-        self.pass_time(2.0)
-        self.assertGreater(self.yard.world.dogs["dog1"].x - before, 0.08)
-        self.assertFalse(self.yard.world.dogs["dog1"].is_moving)
-        self.assertEqual(driver.diagnostics()["bad_frames"], 0)
-        driver.disconnect()
-        emulator.stop()
 
     def test_lent_dog_has_no_other_driver(self) -> None:
         """A driver of simulated dogs is told that this one is none of them any more."""

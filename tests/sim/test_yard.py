@@ -199,24 +199,16 @@ class YardTests(SynchronousTestCase):
         self.assertEqual((self.client.is_open, stranger.is_open, lively.is_open), (False, False, True))
         self.assertEqual(self.yard.holders, [])
 
-    def test_keeps_one_driver_per_dog(self) -> None:
-        """A second driver is told that dog1 is taken and hung up on; the first goes on."""
-        second = Client(self.yard)
-        second.say(Hello(VERSION, "dog1", 0.0))
-        self.assertEqual(second.heard, [Refused("dog1 is taken by another driver", False)])
-        self.assertFalse(second.is_open)
-        self.ticks(1)
-        self.assertEqual(len(self.client.of(Sensors)), 1)
-        self.assertEqual(self.yard.holders, ["dog1"])
-
-    def test_refuses_what_waiting_will_not_mend(self) -> None:
-        """An unknown robot, another version and a second robot on one connection are refused for good."""
-        for hello in (Hello(VERSION, "cat", 0.0), Hello(VERSION + 1, "dog2", 0.0)):
+    def test_refuses_drivers(self) -> None:
+        """A robot that is taken is refused for now; an unknown one, another version or a second robot for good."""
+        cases = [("dog1", VERSION, False), ("cat", VERSION, True), ("dog2", VERSION + 1, True)]
+        for robot, version, is_lasting in cases:
             client = Client(self.yard)
-            client.say(hello)
+            client.say(Hello(version, robot, 0.0))
             (refusal,) = client.heard
             assert isinstance(refusal, Refused)
-            self.assertTrue(refusal.lasting)
+            self.assertEqual((refusal.lasting, client.is_open), (is_lasting, False))
+        self.assertEqual(self.yard.holders, ["dog1"])
         self.client.say(Hello(VERSION, "dog2", 0.0))
         self.assertEqual(self.client.heard[-1], Refused("this connection holds dog1 already", True))
         self.assertEqual(self.yard.holders, [])
@@ -260,14 +252,10 @@ class YardTests(SynchronousTestCase):
         self.assertIsNotNone(self.yard.world.target)
 
     def test_turns_away_the_crowd(self) -> None:
-        """The sixty-fifth connection is refused; those that are open stay."""
+        """The sixty-fifth connection is refused; a stopped yard hangs up on everybody and has no timer left."""
         crowd = [Client(self.yard) for _ in range(65)]
         self.assertEqual(sum(not client.is_open for client in crowd), 2)
         self.assertTrue(self.client.is_open)
-
-    def test_leaves_nothing_behind(self) -> None:
-        """A stopped yard has hung up on everybody and has no timer left."""
-        self.ticks(2)
         self.yard.stop()
         self.assertFalse(self.client.is_open)
         self.assertEqual(self.clock.getDelayedCalls(), [])
