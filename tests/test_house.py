@@ -170,7 +170,6 @@ PURE = (
     "formats",
     "swarmnode.doctor.diagnosis",
     "swarmnode.doctor.facts",
-    "swarmnode.doctor.finding",
     "swarmnode.doctor.team",
     "swarmnode.doctor.way",
     "swarmnode.systemd.unit",

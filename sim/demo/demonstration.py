@@ -193,9 +193,9 @@ async def judged(
         raise SystemExit(1)
 
 
-def _arguments(arguments: Sequence[str]) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="swarm demo", description="Three robots, a red target and the page.")
-    parser.add_argument("--headless", action="store_true", help="run both experiments, judge them, exit with 0 or 1")
+def options(prog: str, description: str) -> argparse.ArgumentParser:
+    """A command line with the options that demonstrations on one machine and across several have in common."""
+    parser = argparse.ArgumentParser(prog=prog, description=description)
     parser.add_argument(
         "--robot",
         choices=sorted(CASTS),
@@ -209,6 +209,14 @@ def _arguments(arguments: Sequence[str]) -> argparse.Namespace:
         help="what experiment 2 takes from the dog on its way: node, or link to the robot (default %(default)s)",
     )
     parser.add_argument("--seed", type=int, default=1, help="seed of the yard (default 1)")
+    parser.add_argument("--run-dir", type=Path, default=Path("run"), help="logs, stores and configurations go there")
+    parser.add_argument("--report", type=Path, help="write the verdict of both experiments there as JSON")
+    return parser
+
+
+def _arguments(arguments: Sequence[str]) -> argparse.Namespace:
+    parser = options("swarm demo", "Three robots, a red target and the page.")
+    parser.add_argument("--headless", action="store_true", help="run both experiments, judge them, exit with 0 or 1")
     parser.add_argument("--web-host", default=LOOPBACK, help="address of the page; 0.0.0.0 opens it to the network")
     parser.add_argument(
         "--web-port",
@@ -217,8 +225,6 @@ def _arguments(arguments: Sequence[str]) -> argparse.Namespace:
         help=f"port of the page (default {WEB_PORT}, or a free one; 0: all ports are free ones, for several at once)",
     )
     parser.add_argument("--tls", action="store_true", help="serve the page over TLS on this machine alone, too")
-    parser.add_argument("--run-dir", type=Path, default=Path("run"), help="logs, stores and configurations go there")
-    parser.add_argument("--report", type=Path, default=None, help="with --headless: write the verdict there as JSON")
     wishes = parser.parse_args(arguments)
     if wishes.lose == "link" and wishes.robot == "sim":
         parser.error("--lose link: a simulated dog has no link of its own; choose another --robot")

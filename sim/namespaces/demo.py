@@ -19,9 +19,11 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from sim.demo.cast import CASTS, LOOPBACK, MOST_PORTS, Robot, chosen
+from sim.demo.cast import LOOPBACK, MOST_PORTS, Robot, chosen
 from sim.demo.configuration import BOOTSTRAP, DOGS, JUDGE, RESERVE, YARD, Place, Plan
+from sim.demo.demonstration import Demonstration, judged, options
 from sim.demo.stage import Trouble, fresh, say
+from sim.demo.visitor import PageError
 from sim.namespaces.internet import Internet, Site
 from sim.namespaces.kind import Kind
 from sim.namespaces.room import refusal
@@ -73,9 +75,6 @@ def inside(given: argparse.Namespace) -> None:
     from twisted.internet.defer import Deferred
     from twisted.internet.task import react
 
-    from sim.demo.demonstration import Demonstration, judged
-    from sim.demo.visitor import PageError
-
     ReactorBase.seconds = staticmethod(time.monotonic)
     folder = given.run_dir.absolute()
 
@@ -102,16 +101,7 @@ def inside(given: argparse.Namespace) -> None:
 
 def main(arguments: Sequence[str] = tuple(sys.argv[1:])) -> int:
     """The command line; returns 0 where both experiments held, 2 where namespaces are refused."""
-    parser = argparse.ArgumentParser(
-        prog="python -m sim.namespaces.demo", description="Both experiments, behind routers."
-    )
-    parser.add_argument("--robot", choices=sorted(CASTS), default="aibo", help="what the three are (%(default)s)")
-    parser.add_argument(
-        "--lose", choices=("node", "link"), default="node", help="what experiment 2 takes (%(default)s)"
-    )
-    parser.add_argument("--seed", type=int, default=1, help="seed of the yard (%(default)s)")
-    parser.add_argument("--run-dir", type=Path, default=Path("run"), help="logs, stores and configurations go there")
-    parser.add_argument("--report", type=Path, default=None, help="write the verdict there as JSON")
+    parser = options("python -m sim.namespaces.demo", "Both experiments, behind routers.")
     parser.add_argument("--loss", type=float, default=0.0, help="percent lost on every line (%(default)s)")
     parser.add_argument("--record", type=Path, default=None, help="write every frame of the wide area there")
     for ignored in ("--web-host", "--web-port"):

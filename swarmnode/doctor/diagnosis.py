@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 
 from swarmnode.doctor import team, way
-from swarmnode.doctor.facts import Facts
-from swarmnode.doctor.finding import ORDER, Finding, error, warning
+from swarmnode.doctor.facts import ORDER, Facts, Finding, error, warning
 
 LEAST_FREE = 16 * 2**20
 """Bytes of free disk below which a store may soon be unable to write."""

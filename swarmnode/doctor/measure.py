@@ -79,27 +79,27 @@ def measured(
     port_problem = ""
     if node.port and not is_free(socket.SOCK_DGRAM, "" if is_any(node.host) else node.host, node.port):
         port_problem = f"Another program listens at {node.host}:{node.port}."
-    facts = Facts(
+    where = chosen(list(found), node.host) if node.lan and not is_local(node.host) else []
+    heard = _asked(node.host, known, team.secrets, where, wall)
+    gateway = _gateway()
+    return Facts(
         node.name,
         node.host,
         node.port,
         wall(),
         interfaces=found,
+        known=tuple(_probe(address, heard, found) for address in known),
+        lan=Lan(tuple(heard.on_lan.values()), heard.is_sent, heard.is_own_heard) if where else None,
         port_problem=port_problem if settings.is_given("node", "port") else "",
         is_running=is_running,
         fingerprint=team.fingerprint,
         way_out=_way_out([each.host for each in known if not is_local(each.host)]),
+        is_gateway_resolved=_is_resolved(gateway) if gateway else None,
         certificate=team.certificate,
         storage=_storage(node.store),
         open_files=tuple(_open(_secret_files(settings))),
         health=health,
     )
-    where = chosen(list(found), node.host) if node.lan and not is_local(node.host) else []
-    heard = _asked(node.host, known, team.secrets, where, wall)
-    gateway = _gateway()
-    probes = tuple(_probe(address, heard, found) for address in known)
-    lan = Lan(tuple(heard.on_lan.values()), heard.is_sent, heard.is_own_heard) if where else None
-    return replace(facts, known=probes, lan=lan, is_gateway_resolved=_is_resolved(gateway) if gateway else None)
 
 
 def team_of(settings: Settings) -> Team:

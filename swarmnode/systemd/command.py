@@ -76,7 +76,8 @@ def main(
         if wishes.verb in ("restart", "remove"):
             return _Place(wishes.name, is_user, root, run, out).do(wishes.verb)
         program, interpreter = twistd(executable, is_user, can_enter), str(_interpreter(executable))
-        unit = unit_for(_settings(wishes.settings), program, is_user, wishes.memory, interpreter)
+        settings = Settings.load(str(Path(wishes.settings).absolute()))
+        unit = unit_for(settings, program, is_user, wishes.memory, interpreter)
         if wishes.verb == "show":
             out.write(unit.text)
             return DONE
@@ -102,10 +103,6 @@ def twistd(executable: str, is_user: bool, can_enter: Callable[[Path], bool]) ->
 def _interpreter(executable: str) -> Path:
     """The Python that runs: the interpreter of an environment is often a link to another one."""
     return Path(executable).resolve()
-
-
-def _settings(path: str) -> Settings:
-    return Settings.load(str(Path(path).absolute()))
 
 
 class _Place:

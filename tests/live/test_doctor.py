@@ -44,18 +44,12 @@ while True:
 class DoctorCase(NamespaceCase):
     """An internet with nodes, and a doctor."""
 
+    net: Internet
+
     def setUp(self) -> None:
         super().setUp()
         self.folder = Path(self.mktemp()).absolute()
         self.folder.mkdir()
-
-    def internet(self, *sites: Site) -> Internet:
-        """One that is gone after the test."""
-        net = Internet(sites)
-        net.__enter__()
-        self.addCleanup(net.close)
-        self.net = net
-        return net
 
     def settings(self, name: str, host: str, known: Sequence[str] = (), **others: object) -> Path:
         """The settings of a node."""
@@ -111,7 +105,7 @@ class WayTests(DoctorCase):
 
     def test_routers_and_firewalls(self) -> None:
         """Each kind of router is named by who is behind it, a firewall against UDP too, and a cut as no bootstrap."""
-        net = self.internet(
+        net = self.net = self.internet(
             Site("c", Kind.PORT), Site("s", Kind.SYM), Site("n", Kind.NOUDP), Site("o", Kind.NONE), Site("x", Kind.PORT)
         )
         known = [f"{address}:8484" for address in PUBS]
@@ -130,7 +124,7 @@ class LanTests(DoctorCase):
 
     def setUp(self) -> None:
         super().setUp()
-        net = self.internet(Site("a", Kind.PORT, hosts=2))
+        net = self.net = self.internet(Site("a", Kind.PORT, hosts=2))
         self.other = f"{net.address('a2')}:8484"
         self.node("a2", self.settings("other", net.address("a2")))
         self.own = self.settings("own", net.address("a1"), [self.other])

@@ -66,11 +66,8 @@ class DrivenTests(SynchronousTestCase):
         dog.connect()
         driver = self.driver()
         here, there = self.newest(driver), self.newest(dog)
-        self.assertEqual(sorted(here.values), sorted(there.values))
-        self.assertEqual(
-            {key: type(value) for key, value in here.values.items()},
-            {key: type(value) for key, value in there.values.items()},
-        )
+        kinds = [{key: type(value) for key, value in seen.values.items()} for seen in (here, there)]
+        self.assertEqual(*kinds)
         self.assertEqual(sorted(here.samples), sorted(there.samples))
         before = driver.diagnostics()["frames"]
         self.clock.advance(100 * TICK)
