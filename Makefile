@@ -114,7 +114,7 @@ live: $(DEV)
 
 # Wants root, or namespaces for users, and says so.
 live-nat: $(RUNTIME)
-	$(PY) -m sim.namespaces --count $(if $(filter file,$(origin N)),5,$(N)) $(if $(filter-out 0,$(DOCS)),--docs)
+	$(PY) -m benchmarks.nat --count $(if $(filter file,$(origin N)),5,$(N)) $(if $(filter-out 0,$(DOCS)),--docs)
 
 contract: $(CONTRACT)/.stamp
 	$(CONTRACT)/bin/python -m twisted.trial tests.live.test_contract

@@ -15,7 +15,6 @@ from twisted.internet.defer import Deferred
 from agents.catalogue import DEMO, task_named
 from middleware.config.settings import Settings
 from middleware.entangled.network.network import Address
-from middleware.entangled.network.switchboard import Weather
 from middleware.entangled.replication.watch import Watch
 from middleware.tasks.task import Task, outcome_of
 from sim.robots.crowd.command import main as run_crowd
@@ -52,10 +51,9 @@ class CrowdTeam(World):
         ground: Ground,
         controller: Controller = wander,
         stopwatch: Callable[[], float] = lambda: 0.0,
-        weather: Weather = LAN,
         camera_fps: float = CAMERA_FPS,
     ) -> None:
-        super().__init__(seed, weather)
+        super().__init__(seed, LAN)
         yard_dice = random.Random(f"{seed}/yard")
         self.yard = CrowdYard(self.clock, yard_dice, ground, agents, controller, stopwatch)
         self.yard.start()
@@ -115,15 +113,8 @@ class CrowdTeam(World):
             node["known_nodes"] = [str(self.address(dice.randrange(number)))]
             mapping["agent"] = {"module": "search"}
             mapping["driver"] = {"kind": "sim", "options": {"robot": name, "camera_fps": self._fps}}
-        connector = self.yard.connector()
-        seams = Seams(
-            self.clock,
-            partial(self.network, number),
-            self.store(number),
-            dice,
-            self.clock.seconds,
-            connector,
-        )
+        network = partial(self.network, number)
+        seams = Seams(self.clock, network, self.store(number), dice, self.clock.seconds, self.yard.connector())
         self.services[name] = NodeService(Settings.from_mapping(mapping, f"seed {self.seed}"), seams)
         self.services[name].startService()
 

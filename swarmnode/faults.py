@@ -153,7 +153,7 @@ def main(
 
 
 def _rehearse(scenario: Scenario, seed: int | None, say: Callable[[str], None]) -> int:
-    from swarmnode.rehearsed import RehearsedStage  # the yard's libraries are for this alone
+    from swarmnode.rehearsal import RehearsedStage  # the yard's libraries are for this alone
 
     seed = scenario.seed if seed is None else seed
     stage = RehearsedStage(seed)

@@ -28,19 +28,6 @@ VERBS: Mapping[str, tuple[Verb, str]] = {
 }
 
 
-class Ending:
-    """The wish of a person to end: after the first Ctrl-C a run ends in good order, after the second at once."""
-
-    def __init__(self) -> None:
-        self.is_wished = False
-
-    def wish(self, number: int, frame: FrameType | None) -> None:
-        """A signal has come."""
-        if self.is_wished:
-            raise KeyboardInterrupt
-        self.is_wished = True
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the verb that the command line names; returns its exit code."""
     words = list(sys.argv[1:] if arguments is None else arguments)
@@ -53,14 +40,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return 0
         sys.stderr.write(f"sim: no verb {verb!r}; there is {', '.join(VERBS)}; sim --help says more\n")
         return WRONG
-    ending = Ending()
+    signals: list[int] = []
+
+    def end(number: int, frame: FrameType | None) -> None:
+        """After the first signal a run ends in good order, after the second at once."""
+        if signals:
+            raise KeyboardInterrupt
+        signals.append(number)
+
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, ending.wish)
+        signal.signal(number, end)
     world = Environment(
         *(sys.stdout, sys.stderr, time.monotonic, time.process_time),
         read=lambda path: Path(path).read_text(encoding="ascii"),
         columns=shutil.get_terminal_size().columns if sys.stderr.isatty() else 0,
-        is_stopped=lambda: ending.is_wished,
+        is_stopped=lambda: bool(signals),
         grown=_spare_the_collector,
     )
     # Until somebody listens Twisted keeps what is logged, and so each life of each node that logged it.

@@ -134,7 +134,7 @@ LAYERS: dict[str, Layer] = {
         ("formats", "middleware", *(f"drivers.{name}" for name in ("driver", "errors", "gate", "link"))),
     ),
     "sim.namespaces": Layer(
-        "real nodes behind routers in network namespaces ([nat.md](nat.md))", ("middleware", "sim")
+        "an internet of network namespaces, and the demonstration across it ([nat.md](nat.md))", ("sim.demo",)
     ),
     "swarmnode": Layer("settings in, a running node out; the `swarm` command", TOP),
 }

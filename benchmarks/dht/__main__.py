@@ -20,7 +20,7 @@ from benchmarks.dht.report import table
 from benchmarks.dht.space import space
 from benchmarks.dht.team import Team
 from benchmarks.dht.verbs import long_values, watches
-from sim.namespaces.remote import Lost
+from benchmarks.remote import Lost
 
 PARTS = ("steady", "killed", "silent")
 KEYS = 200

@@ -16,7 +16,7 @@ from typing import Any
 
 from benchmarks.dht.meter import Cost, Meter, memory_mib, percentile
 from benchmarks.dht.team import Node, Team
-from sim.namespaces.remote import Lost
+from benchmarks.remote import Lost
 
 JOINERS = 4
 JOIN_LIMIT_S = 15.0

@@ -7,7 +7,7 @@ import asyncio
 from benchmarks.dht.course import Course, Result, times
 from benchmarks.dht.meter import Meter
 from benchmarks.dht.team import Node
-from sim.namespaces.remote import Lost
+from benchmarks.remote import Lost
 
 OUTS = 30
 CROWD = 30

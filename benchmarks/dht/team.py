@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.dht.contestant import HOST, Entry
+from benchmarks.remote import Remote
 from sim.demo.port import BOTH, free
-from sim.namespaces.remote import Remote
 
 ROOT = Path(__file__).resolve().parents[2]
 SPAWNED_AT_ONCE = 4

@@ -28,7 +28,7 @@ from sim.demo.configuration import DOGS, JUDGE, YARD, Plan
 from sim.demo.experiment import Experiment, report, table
 from sim.demo.port import PortBusy
 from sim.demo.processes import RESTART_S, Team
-from sim.demo.stage import WEB_PORT, Trouble, arranged, fresh, has_tls
+from sim.demo.stage import WEB_PORT, Trouble, arranged, fresh, has_tls, say
 from sim.demo.story import present, told
 from sim.demo.visitor import PageError, Visitor
 
@@ -193,9 +193,9 @@ async def judged(
         raise SystemExit(1)
 
 
-def _arguments(arguments: Sequence[str]) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="swarm demo", description="Three robots, a red target and the page.")
-    parser.add_argument("--headless", action="store_true", help="run both experiments, judge them, exit with 0 or 1")
+def options(prog: str, description: str) -> argparse.ArgumentParser:
+    """A command line with the options that demonstrations on one machine and across several have in common."""
+    parser = argparse.ArgumentParser(prog=prog, description=description)
     parser.add_argument(
         "--robot",
         choices=sorted(CASTS),
@@ -209,6 +209,14 @@ def _arguments(arguments: Sequence[str]) -> argparse.Namespace:
         help="what experiment 2 takes from the dog on its way: node, or link to the robot (default %(default)s)",
     )
     parser.add_argument("--seed", type=int, default=1, help="seed of the yard (default 1)")
+    parser.add_argument("--run-dir", type=Path, default=Path("run"), help="logs, stores and configurations go there")
+    parser.add_argument("--report", type=Path, help="write the verdict of both experiments there as JSON")
+    return parser
+
+
+def _arguments(arguments: Sequence[str]) -> argparse.Namespace:
+    parser = options("swarm demo", "Three robots, a red target and the page.")
+    parser.add_argument("--headless", action="store_true", help="run both experiments, judge them, exit with 0 or 1")
     parser.add_argument("--web-host", default=LOOPBACK, help="address of the page; 0.0.0.0 opens it to the network")
     parser.add_argument(
         "--web-port",
@@ -217,8 +225,6 @@ def _arguments(arguments: Sequence[str]) -> argparse.Namespace:
         help=f"port of the page (default {WEB_PORT}, or a free one; 0: all ports are free ones, for several at once)",
     )
     parser.add_argument("--tls", action="store_true", help="serve the page over TLS on this machine alone, too")
-    parser.add_argument("--run-dir", type=Path, default=Path("run"), help="logs, stores and configurations go there")
-    parser.add_argument("--report", type=Path, default=None, help="with --headless: write the verdict there as JSON")
     wishes = parser.parse_args(arguments)
     if wishes.lose == "link" and wishes.robot == "sim":
         parser.error("--lose link: a simulated dog has no link of its own; choose another --robot")
@@ -234,11 +240,6 @@ def _port(word: str) -> int:
     return int(word)
 
 
-def _say(line: str) -> None:
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
-
-
 async def _run(reactor: Any, wishes: argparse.Namespace) -> None:
     try:
         with fresh(wishes.run_dir.absolute()):
@@ -248,8 +249,8 @@ async def _run(reactor: Any, wishes: argparse.Namespace) -> None:
             if wishes.tls and not has_tls():
                 raise Trouble("--tls wants libraries that are missing; install them by: pip install 'swarm-node[tls]'")
             is_usual = not wishes.headless and wishes.web_port != 0
-            plan = arranged(folder, wishes.web_host, wishes.web_port, is_usual, _say, with_tls, wishes.robot)
-            demonstration = Demonstration(reactor, plan, wishes.seed, _say, wishes.lose == "link")
+            plan = arranged(folder, wishes.web_host, wishes.web_port, is_usual, say, with_tls, wishes.robot)
+            demonstration = Demonstration(reactor, plan, wishes.seed, say, wishes.lose == "link")
             reactor.addSystemEventTrigger("before", "shutdown", demonstration.stop)
 
             async def begun() -> None:
@@ -258,26 +259,26 @@ async def _run(reactor: Any, wishes: argparse.Namespace) -> None:
                     demonstration.watch()
                     await Deferred()
 
-            await judged(demonstration, begun, wishes.report, _say)
+            await judged(demonstration, begun, wishes.report, say)
     except (Trouble, PageError, PortBusy, OSError) as problem:
         sys.stderr.write(f"swarm demo: {problem}\n")
         raise SystemExit(2 if isinstance(problem, PortBusy) else 1) from None
 
 
 def _invite(demonstration: Demonstration, plan: Plan) -> None:
-    _say(f"The page: {demonstration.address}   (logs: {plan.run_dir}; end with Ctrl-C)")
+    say(f"The page: {demonstration.address}   (logs: {plan.run_dir}; end with Ctrl-C)")
     if demonstration.secure:
-        _say(f"Over TLS: {demonstration.secure}   (a browser warns until it trusts the team: docs/https.md)")
-    _say("If the node that serves it is lost, the page goes on at another: end the process of vaio, and see.")
+        say(f"Over TLS: {demonstration.secure}   (a browser warns until it trusts the team: docs/https.md)")
+    say("If the node that serves it is lost, the page goes on at another: end the process of vaio, and see.")
     if plan.web_host == LOOPBACK:
-        _say("For a phone or tablet in the same network, then over TLS as well: make demo WEB_HOST=0.0.0.0")
+        say("For a phone or tablet in the same network, then over TLS as well: make demo WEB_HOST=0.0.0.0")
     else:
         here, tls = os.uname().nodename, plan.tls_ports[0]
         also = f", https://{here}.local:{tls} (which the camera of a phone wants)" if tls else ""
-        _say(f"In the same network: http://{here}.local:{plan.web_port}{also}, or this machine's address;")
-        _say(f"the code to sign in with: {plan.code}.  For a phone there is a code to scan: Invite, on the page")
+        say(f"In the same network: http://{here}.local:{plan.web_port}{also}, or this machine's address;")
+        say(f"the code to sign in with: {plan.code}.  For a phone there is a code to scan: Invite, on the page")
         if not tls:
-            _say("The camera of a phone wants https, which is missing here: pip install 'swarm-node[tls]'")
+            say("The camera of a phone wants https, which is missing here: pip install 'swarm-node[tls]'")
 
 
 def main(arguments: Sequence[str] = tuple(sys.argv[1:])) -> None:

@@ -1,7 +1,7 @@
 """Team: the operating-system processes of a demonstration, watched by Twisted's ``ProcessMonitor``.
 
 What a process writes goes line by line to ``RUN_DIR/NAME.log`` and to whoever listens.  A process that ends is
-started again after ``restart_delay`` seconds, so that a killed node stays away long enough to be missed.
+started again after ``RESTART_S``, so that a killed node stays away long enough to be missed.
 """
 
 from __future__ import annotations
@@ -9,10 +9,10 @@ from __future__ import annotations
 import os
 import sys
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import inf
 from pathlib import Path
-from typing import Any, Protocol, TextIO
+from typing import Any, TextIO
 
 from twisted.internet.defer import Deferred
 from twisted.internet.error import ProcessExitedAlready
@@ -25,25 +25,17 @@ RESTART_S = 30.0
 """Seconds after which a dead process starts again: longer than another robot needs to finish on a busy machine."""
 
 
-class Said(Protocol):
-    """Who is told each line that a process writes."""
-
-    def __call__(self, name: str, line: str) -> None:
-        """Process ``name`` wrote ``line``."""
-
-
 class Team:
     """Processes by name, started and ended together.
 
     :param reactor: starts the processes and says what time it is
     :param run_dir: an existing folder; logs go there
-    :param said: told every line; None: only the logs have them
-    :param restart_delay: seconds between the end of a process and its next start
+    :param said: told the name of a process and each line that it writes
     """
 
     log = Logger()
 
-    def __init__(self, reactor: Any, run_dir: Path, said: Said | None = None, restart_delay: float = RESTART_S) -> None:
+    def __init__(self, reactor: Any, run_dir: Path, said: Callable[[str, str], None] = lambda name, line: None) -> None:
         self._clock = IReactorTime(reactor)
         self._run_dir = run_dir
         self._said = said
@@ -53,7 +45,7 @@ class Team:
         monitor = ProcessMonitor(reactor)
         # Every end counts as "died too fast" for the monitor, and both its delays are ours: so it always waits.
         monitor.threshold = inf  # type: ignore[assignment]
-        monitor.minRestartDelay = monitor.maxRestartDelay = restart_delay  # type: ignore[assignment]
+        monitor.minRestartDelay = monitor.maxRestartDelay = RESTART_S  # type: ignore[assignment]
         monitor.killTime = 4
         monitor.log = Logger(namespace="team", observer=self._observe)  # type: ignore[arg-type]
         self._monitor = monitor
@@ -133,8 +125,7 @@ class Team:
         log = self._logs[name]
         if not log.closed:
             log.write(line + "\n")
-        if self._said is not None:
-            self._said(name, line)
+        self._said(name, line)
 
 
 def on_leash(arguments: Sequence[str]) -> list[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import secrets
 import shutil
+import sys
 from collections.abc import Callable
 from importlib.machinery import PathFinder
 from pathlib import Path
@@ -53,6 +54,12 @@ def fresh(run_dir: Path) -> TextIO:
         else:
             entry.unlink()
     return lock
+
+
+def say(line: str) -> None:
+    """Print a line at once."""
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()
 
 
 def has_tls() -> bool:

@@ -1,22 +1,22 @@
 """Visitor: a client of a web node's page, as a browser is one, for programs.
 
-Follows the live stream of states, and asks and orders through the page's JSON.
+Follows the live stream of states, and orders through the page's JSON.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from io import BytesIO
 from typing import Any
 
-from twisted.internet.defer import Deferred, succeed
-from twisted.internet.interfaces import IConsumer, IDelayedCall, IReactorTime
+from twisted.internet.defer import Deferred
+from twisted.internet.interfaces import IDelayedCall, IReactorTime
 from twisted.internet.protocol import Protocol, connectionDone
 from twisted.python.failure import Failure
-from twisted.web.client import Agent, readBody
+from twisted.web.client import Agent, FileBodyProducer, readBody
 from twisted.web.http_headers import Headers
 from twisted.web.iweb import IBodyProducer, IResponse
-from zope.interface import implementer
 
 RETRY_S = 0.5
 LIMIT_S = 5.0
@@ -97,32 +97,27 @@ class Visitor:
 
     async def post(self, path: str) -> dict[str, Any]:
         """Give an order to the page; raises ``PageError`` where it is refused."""
-        return await self._ask(b"POST", path)
+        await self._sign_in()
+        return await self._posted(path, None)
 
-    async def get(self, path: str) -> dict[str, Any]:
-        """Ask the page."""
-        return await self._ask(b"GET", path)
-
-    async def _ask(self, verb: bytes, path: str, content: dict[str, str] | None = None) -> dict[str, Any]:
-        if content is None:
-            await self._sign_in()
-        producer = None if content is None else _Body(json.dumps(content).encode())
-        asked = self._agent.request(verb, (self._address + path).encode(), self._headers(), producer)
+    async def _posted(self, path: str, body: IBodyProducer | None) -> dict[str, Any]:
+        asked = self._agent.request(b"POST", (self._address + path).encode(), self._headers(), body)
         response = await asked.addTimeout(LIMIT_S, self._clock)
-        body = await readBody(response).addTimeout(LIMIT_S, self._clock)
+        content = await readBody(response).addTimeout(LIMIT_S, self._clock)
         try:
-            answer = json.loads(body)
+            answer = json.loads(content)
         except ValueError:
             answer = None
         if response.code == 401:
             self._token = ""
         if response.code >= 400 or not isinstance(answer, dict):
-            raise PageError(f"{path}: {response.code} {body[:200].decode(errors='replace')}")
+            raise PageError(f"{path}: {response.code} {content[:200].decode(errors='replace')}")
         return answer
 
     async def _sign_in(self) -> None:
         if self._code and not self._token:
-            answer = await self._ask(b"POST", "/api/v1/session", {"code": self._code})
+            body = FileBodyProducer(BytesIO(json.dumps({"code": self._code}).encode()))
+            answer = await self._posted("/api/v1/session", body)
             self._token = str(answer.get("token", ""))
 
     def _headers(self) -> Headers:
@@ -161,28 +156,6 @@ class Visitor:
         if isinstance(state, dict):
             before, self.state = self.state, state
             self._on_state(before, state)
-
-
-@implementer(IBodyProducer)
-class _Body:
-    """A body that is there as a whole."""
-
-    def __init__(self, content: bytes) -> None:
-        self.length = len(content)
-        self._content = content
-
-    def startProducing(self, consumer: IConsumer) -> Deferred[None]:
-        consumer.write(self._content)
-        return succeed(None)
-
-    def pauseProducing(self) -> None:
-        pass
-
-    def resumeProducing(self) -> None:
-        pass
-
-    def stopProducing(self) -> None:
-        pass
 
 
 class _Stream(Protocol):

@@ -16,7 +16,6 @@ import socket
 import struct
 import subprocess
 import sys
-import time
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -26,7 +25,7 @@ from typing import Any, BinaryIO
 
 from sim.namespaces.internet import Internet
 from sim.namespaces.kind import WAN
-from sim.namespaces.switch import EVERYTHING, FILE_HEADER, SNAP
+from sim.namespaces.switch import EVERYTHING, FILE_HEADER, SNAP, recorded
 
 OUTGOING = 4
 IPV4, UDP = 0x0800, 17
@@ -50,12 +49,12 @@ class Traffic:
 
 
 class Capture:
-    """What passes ``interface`` of ``host`` between ``with`` and its end; ``traffic`` is there afterwards."""
+    """What passes the interface of ``host`` between ``with`` and its end; ``traffic`` is there afterwards."""
 
-    def __init__(self, net: Internet, host: str, file: Path, interface: str = WAN) -> None:
+    def __init__(self, net: Internet, host: str, file: Path) -> None:
         self.traffic: dict[str, Traffic] = {}
         self.file = file
-        arguments = [sys.executable, "-m", "sim.namespaces.capture", interface, str(file.absolute())]
+        arguments = [sys.executable, "-m", "sim.namespaces.capture", WAN, str(file.absolute())]
         self._process = net.start(host, arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
     def __enter__(self) -> Capture:
@@ -92,21 +91,15 @@ def readable(passed: bytes, words: Iterable[bytes]) -> list[bytes]:
     return [w for w in words if w.lower() in text or w.decode().lower().encode("utf-16-le") in text]
 
 
-def frames(file: Path) -> Iterator[bytes]:
-    """The frames of a capture."""
+def datagrams(file: Path) -> Iterator[tuple[str, str, bytes]]:
+    """The UDP datagrams of a capture: from where, to where, and what they hold."""
     data, place = file.read_bytes(), len(FILE_HEADER)
     while place + 16 <= len(data):
         length = struct.unpack_from("=I", data, place + 8)[0]
-        yield data[place + 16 : place + 16 + length]
-        place += 16 + length
-
-
-def datagrams(file: Path) -> Iterator[tuple[str, str, bytes]]:
-    """The UDP datagrams of a capture: from where, to where, and what they hold."""
-    for frame in frames(file):
-        held = payload(frame)
+        held = payload(data[place + 16 : place + 16 + length])
         if held is not None:
             yield held
+        place += 16 + length
 
 
 def payload(frame: bytes) -> tuple[str, str, bytes] | None:
@@ -137,8 +130,7 @@ def capture(interface: str, out: BinaryIO, orders: int, ready: Any) -> dict[str,
         if raw not in readable:
             continue
         frame, (_, _, direction, *_) = raw.recvfrom(SNAP)
-        now = time.time()
-        out.write(struct.pack("=IIII", int(now), int(now % 1 * 1_000_000), len(frame), len(frame)) + frame)
+        out.write(recorded(frame))
         datagram = payload(frame)
         if datagram is None:
             continue

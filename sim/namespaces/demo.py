@@ -19,8 +19,11 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from sim.demo.cast import CASTS, LOOPBACK, MOST_PORTS, Robot, chosen
+from sim.demo.cast import LOOPBACK, MOST_PORTS, Robot, chosen
 from sim.demo.configuration import BOOTSTRAP, DOGS, JUDGE, RESERVE, YARD, Place, Plan
+from sim.demo.demonstration import Demonstration, judged, options
+from sim.demo.stage import Trouble, fresh, say
+from sim.demo.visitor import PageError
 from sim.namespaces.internet import Internet, Site
 from sim.namespaces.kind import Kind
 from sim.namespaces.room import refusal
@@ -57,9 +60,7 @@ def planned(run_dir: Path, robot: str, places: dict[str, Place], code: str) -> P
         name: _cabled(each, places[name].yard) for name, each in chosen(robot, DOGS, run_dir, ports, YARD_PORT).items()
     }
     nodes = dict.fromkeys((BOOTSTRAP, RESERVE, *DOGS), NODE_PORT)
-    return Plan(
-        run_dir, "0.0.0.0", WEB_PORT, YARD_PORT, nodes, code, WEB_PORT, robots=robots, places=places
-    )  # fmt: skip
+    return Plan(run_dir, "0.0.0.0", WEB_PORT, YARD_PORT, nodes, code, WEB_PORT, robots=robots, places=places)
 
 
 def _cabled(robot: Robot, yard: str) -> Robot:
@@ -74,10 +75,6 @@ def inside(given: argparse.Namespace) -> None:
     from twisted.internet.defer import Deferred
     from twisted.internet.task import react
 
-    from sim.demo.demonstration import Demonstration, judged
-    from sim.demo.stage import Trouble, fresh
-    from sim.demo.visitor import PageError
-
     ReactorBase.seconds = staticmethod(time.monotonic)
     folder = given.run_dir.absolute()
 
@@ -87,13 +84,13 @@ def inside(given: argparse.Namespace) -> None:
                 said = json.loads(sys.stdin.readline())
                 places = {name: Place(**{**each, "enter": tuple(each["enter"])}) for name, each in said.items()}
                 plan = planned(folder, given.robot, places, "over-there")
-                demonstration = Demonstration(reactor, plan, given.seed, _say, given.lose == "link")
+                demonstration = Demonstration(reactor, plan, given.seed, say, given.lose == "link")
                 reactor.addSystemEventTrigger("before", "shutdown", demonstration.stop)
 
                 async def begun() -> None:
-                    _say(f"{time.monotonic() - began:7.2f} s  the page lists all dogs: {demonstration.address}")
+                    say(f"{time.monotonic() - began:7.2f} s  the page lists all dogs: {demonstration.address}")
 
-                await judged(demonstration, begun, given.report, _say)
+                await judged(demonstration, begun, given.report, say)
         except (Trouble, PageError, OSError) as problem:
             sys.stderr.write(f"demo across namespaces: {problem}\n")
             raise SystemExit(1) from None
@@ -104,16 +101,7 @@ def inside(given: argparse.Namespace) -> None:
 
 def main(arguments: Sequence[str] = tuple(sys.argv[1:])) -> int:
     """The command line; returns 0 where both experiments held, 2 where namespaces are refused."""
-    parser = argparse.ArgumentParser(
-        prog="python -m sim.namespaces.demo", description="Both experiments, behind routers."
-    )
-    parser.add_argument("--robot", choices=sorted(CASTS), default="aibo", help="what the three are (%(default)s)")
-    parser.add_argument(
-        "--lose", choices=("node", "link"), default="node", help="what experiment 2 takes (%(default)s)"
-    )
-    parser.add_argument("--seed", type=int, default=1, help="seed of the yard (%(default)s)")
-    parser.add_argument("--run-dir", type=Path, default=Path("run"), help="logs, stores and configurations go there")
-    parser.add_argument("--report", type=Path, default=None, help="write the verdict there as JSON")
+    parser = options("python -m sim.namespaces.demo", "Both experiments, behind routers.")
     parser.add_argument("--loss", type=float, default=0.0, help="percent lost on every line (%(default)s)")
     parser.add_argument("--record", type=Path, default=None, help="write every frame of the wide area there")
     for ignored in ("--web-host", "--web-port"):
@@ -136,18 +124,13 @@ def main(arguments: Sequence[str] = tuple(sys.argv[1:])) -> int:
         for site in net.sites:
             net.weather(site, loss=given.loss)
         net.record(given.record)
-        _say(f"dog1 behind a router ({KINDS[0].meaning}), dog2 behind another ({KINDS[1].meaning}), dog3 at home")
+        say(f"dog1 behind a router ({KINDS[0].meaning}), dog2 behind another ({KINDS[1].meaning}), dog3 at home")
         command = [sys.executable, "-m", "sim.namespaces.demo", "--inside", *arguments]
         process = net.start(HOSTS[JUDGE], command, stdin=subprocess.PIPE, cwd=Path.cwd(), text=True)
         assert process.stdin is not None
         process.stdin.write(json.dumps({name: asdict(place) for name, place in places.items()}) + "\n")
         process.stdin.flush()
         return int(process.wait())
-
-
-def _say(line: str) -> None:
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
 
 
 if __name__ == "__main__":

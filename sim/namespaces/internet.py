@@ -42,18 +42,14 @@ class Site:
 
 
 class Internet:
-    """The sites, between ``with`` and its end; ``seed`` is that of the losses.  Raises ``Refused``.
+    """The sites, between ``with`` and its end; ``seed`` is that of the losses.  Raises ``Refused``."""
 
-    With ``has_ipv6`` the hosts keep their link-local addresses; without, not a datagram is sent that nobody wanted.
-    """
-
-    def __init__(self, sites: Sequence[Site], seed: int = 1, has_ipv6: bool = False) -> None:
+    def __init__(self, sites: Sequence[Site], seed: int = 1) -> None:
         if len(sites) > MAX_SITES or len({site.name for site in sites}) < len(sites):
             raise ValueError(f"at most {MAX_SITES} sites, each with a name of its own")
         self.sites = {site.name: site for site in sites}
         self._numbers = {site.name: number for number, site in enumerate(sites, start=1)}
         self._seed = seed
-        self._has_ipv6 = has_ipv6
         self._rooms: dict[str, Room] = {}
         self._ports: dict[str, str] = {}
         self._addresses: dict[str, str] = {}
@@ -155,9 +151,9 @@ class Internet:
         """Let nothing pass into a site, out of it, or either; with ``to`` only on the way from it to that one."""
         self.weather(site, way, to, loss=100.0)
 
-    def heal(self, site: str, way: Way = "both", to: str = "") -> None:
-        """Make a line good again."""
-        self.weather(site, way, to)
+    def heal(self, site: str) -> None:
+        """Make the line of a site good again."""
+        self.weather(site)
 
     def counted(self) -> dict[str, Any]:
         """Frames passed and lost and bytes carried so far, by the name of the line and by ``up`` and ``down``."""
@@ -259,8 +255,8 @@ class Internet:
         return room
 
     def _quiet(self, room: Room) -> None:
-        silence = "" if self._has_ipv6 else "for f in /proc/sys/net/ipv6/conf/*/disable_ipv6; do echo 1 >$f; done\n"
-        room.run(f"{silence}ip link set lo up\n")
+        # Without IPv6 not a datagram is sent that nobody wanted.
+        room.run("for f in /proc/sys/net/ipv6/conf/*/disable_ipv6; do echo 1 >$f; done\nip link set lo up\n")
 
     def _uplink(self, name: str, addresses: Sequence[str]) -> None:
         """Join a router or host to the wide area."""

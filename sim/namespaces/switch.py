@@ -101,16 +101,12 @@ class Switch:
         target = None if receiver[0] & 1 else self._heard_at.get(receiver)
         targets = [target] if target is not None else [port for port in self._ports.values() if port is not source]
         if self._record is not None:
-            self._write(frame)
+            self._record.write(recorded(frame))
         now = time.monotonic()
         for port in targets:
-            if port is source:
-                continue
-            lines = [source.up, port.down]
-            way = self._ways.get((source.name, port.name))
-            if way is not None:
-                lines.insert(1, way)
-            self._carry(lines, port, frame, now)
+            if port is not source:
+                way = self._ways.get((source.name, port.name))
+                self._carry([source.up, *([way] if way is not None else []), port.down], port, frame, now)
 
     def _carry(self, lines: list[Line], port: Port, frame: bytes, now: float) -> None:
         if frame[12:14] == ARP:
@@ -159,10 +155,11 @@ class Switch:
             self._record = open(path, "wb")  # noqa: SIM115 - it stays open until the order to close it
             self._record.write(FILE_HEADER)
 
-    def _write(self, frame: bytes) -> None:
-        assert self._record is not None
-        now = time.time()
-        self._record.write(struct.pack("=IIII", int(now), int(now % 1 * 1_000_000), len(frame), len(frame)) + frame)
+
+def recorded(frame: bytes) -> bytes:
+    """A frame that passes now, as it stands in a file that begins with ``FILE_HEADER``."""
+    now = time.time()
+    return struct.pack("=IIII", int(now), int(now % 1 * 1_000_000), len(frame), len(frame)) + frame
 
 
 def main(seed: str, *ports: str) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from dataclasses import dataclass
 from random import Random
 
 import cv2
@@ -13,20 +15,30 @@ from sim.robots.lens import (
     EYE,
     NEAR_PLANE,
     SUB_BITS,
+    Colour,
     Image,
+    Points,
     Room,
     View,
-    draw_cylinder,
     draw_shadow,
+    draw_target,
     encoded,
     filled,
     pixels,
 )
-from sim.robots.mesh import Colour, Mesh, Points, dog_mesh
 from sim.robots.world import Target, World
 
 TILE = 0.3
 _JOINT: Colour = (96, 118, 106)
+_YELLOW: Colour = (25, 205, 245)
+_WHITE: Colour = (226, 226, 222)
+_GREY: Colour = (150, 146, 140)
+_DARK: Colour = (58, 54, 52)
+_LIGHT = np.array([0.42, 0.27, 0.87])
+_FACES = ((2, 0, 4, 6), (1, 3, 7, 5), (0, 1, 5, 4), (3, 2, 6, 7), (4, 5, 7, 6))
+"""The back, front, right, left and top of a box by its corners, counter-clockwise seen from outside."""
+
+Span = tuple[float, float]
 
 
 class Camera:
@@ -35,7 +47,7 @@ class Camera:
     def __init__(self, rng: Random, world: World) -> None:
         self._world = world
         self._room = Room(rng, world.scene.width, world.scene.height, world.scene.wall_height)
-        self._meshes = {name: dog_mesh(dog.stripes) for name, dog in world.dogs.items()}
+        self._meshes = {name: _dog_mesh(dog.stripes) for name, dog in world.dogs.items()}
         self._joints = _joints(world.scene.width, world.scene.height)
 
     def jpeg(self, dog: Dog, is_halved: bool = False) -> bytes:
@@ -58,7 +70,7 @@ class Camera:
             things.append((math.hypot(target.x - view.x, target.y - view.y), len(things) + 1, target))
         for _, _, thing in sorted(things, key=lambda entry: (-entry[0], entry[1])):
             if isinstance(thing, Target):
-                draw_cylinder(image, view, thing.x, thing.y, thing.radius, thing.height)
+                draw_target(image, view, thing.x, thing.y, thing.radius, thing.height)
             else:
                 _draw_dog(image, view, thing, self._meshes[thing.name])
         return self._room.noisy(image)
@@ -78,7 +90,7 @@ class Camera:
         cv2.polylines(image, list(lines), False, _JOINT, 1, cv2.LINE_AA, SUB_BITS)
 
 
-def _draw_dog(image: Image, view: View, dog: Dog, mesh: Mesh) -> None:
+def _draw_dog(image: Image, view: View, dog: Dog, mesh: _Mesh) -> None:
     x, y = dog.x - view.x, dog.y - view.y
     ahead, left = view.cos * x + view.sin * y, view.cos * y - view.sin * x
     if ahead < -0.2 or abs(left) > 0.6 * max(ahead, 0.0) + 0.35:
@@ -96,9 +108,9 @@ def _draw_dog(image: Image, view: View, dog: Dog, mesh: Mesh) -> None:
     parts = [part for face in order for part in (face, *mesh.marks[face])]
     if seen[:, 0].min() < NEAR_PLANE:
         for part in parts:
-            filled(image, seen[mesh.quads[part]].tolist(), mesh.colours[part])
+            filled(image, seen[4 * part : 4 * part + 4].tolist(), mesh.colours[part])
         return
-    for part, quad in zip(parts, pixels(seen)[mesh.quads[parts]], strict=True):
+    for part, quad in zip(parts, pixels(seen).reshape(-1, 4, 2)[parts], strict=True):
         cv2.fillConvexPoly(image, quad, mesh.colours[part], cv2.LINE_AA, SUB_BITS)
 
 
@@ -107,3 +119,69 @@ def _joints(width: float, height: float) -> Points:
     across = [((x, 0.0, 0.0), (x, height, 0.0)) for x in np.arange(TILE, width - 0.01, TILE)]
     along = [((0.0, y, 0.0), (width, y, 0.0)) for y in np.arange(TILE, height - 0.01, TILE)]
     return np.array(across + along).reshape(-1, 3)
+
+
+@dataclass(frozen=True)
+class _Mesh:
+    """Faces of four ``corners`` each, in the dog's own frame; a face is seen from the side that its normal points to.
+
+    The first ``count`` faces stand by themselves; ``marks`` lists, for each of them, the faces that are painted on it.
+    """
+
+    corners: Points
+    normals: Points
+    centres: Points
+    colours: list[Colour]
+    marks: list[range]
+    count: int
+
+
+def _dog_mesh(stripes: int) -> _Mesh:
+    """An ERS-7 in outline: body, head with ``stripes`` yellow stripes, ears, legs, tail, the shade below."""
+    faces: list[Points] = []
+    plain: list[Colour] = []
+    bands: list[list[Points]] = []
+    for x, y, z, colour, marked in _boxes(stripes):
+        corners = [(x[i & 1], y[i >> 1 & 1], z[i >> 2]) for i in range(8)]
+        for row in _FACES:
+            faces.append(np.array([corners[i] for i in row]))
+            plain.append(colour)
+            bands.append(_bands(faces[-1], marked))
+    marks = []
+    for some in bands:
+        marks.append(range(len(faces), len(faces) + len(some)))
+        faces += some
+        plain += [_YELLOW] * len(some)
+    quads = np.array(faces)
+    normals = np.cross(quads[:, 1] - quads[:, 0], quads[:, 3] - quads[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    shades = 0.80 + 0.20 * np.clip(normals @ _LIGHT, -0.6, 1.0)
+    colours = [(int(b * shade), int(g * shade), int(r * shade)) for (b, g, r), shade in zip(plain, shades, strict=True)]
+    return _Mesh(quads.reshape(-1, 3), normals, quads.mean(axis=1), colours, marks, len(marks))
+
+
+def _boxes(stripes: int) -> Iterator[tuple[Span, Span, Span, Colour, int]]:
+    """The boxes of a dog: spans of x, y and z in metres, the colour, and how many stripes each side has.
+
+    The trunk is as high as the target, so that a dog in front of it hides it whole.
+    """
+    yield (-0.105, 0.095), (-0.055, 0.055), (0.0, 0.11), _DARK, 0
+    for x in (-0.105, 0.045):
+        for y in (-0.082, 0.034):
+            yield (x, x + 0.06), (y, y + 0.048), (0.0, 0.125), _GREY, 0
+    yield (-0.115, 0.105), (-0.080, 0.080), (0.105, 0.232), _WHITE, 0
+    yield (-0.130, -0.115), (-0.012, 0.012), (0.150, 0.240), _DARK, 0
+    yield (0.035, 0.145), (-0.058, 0.058), (0.185, 0.300), _WHITE, stripes
+    yield (0.145, 0.172), (-0.030, 0.030), (0.190, 0.226), _DARK, 0
+    for y in (-0.072, 0.058):
+        yield (0.045, 0.085), (y, y + 0.014), (0.215, 0.295), _DARK, 0
+
+
+def _bands(face: Points, stripes: int) -> list[Points]:
+    """``stripes`` upright bands across a face, in its own plane."""
+    a, b, c, d = face
+    edges = np.arange(1, 2 * stripes + 1) / (2 * stripes + 1)
+    return [
+        np.array([a + left * (b - a), a + right * (b - a), d + right * (c - d), d + left * (c - d)])
+        for left, right in zip(edges[::2], edges[1::2], strict=True)
+    ]

@@ -6,14 +6,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from random import Random
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.robots.mesh import Colour, Points
 from sim.robots.sensor import NOSE
 
 WIDTH, HEIGHT = 208, 160
@@ -25,6 +23,9 @@ QUALITY = 80
 NEAR_PLANE = 0.02
 SKIRTING_M = 0.03
 
+Colour = tuple[int, int, int]
+"""Blue, green, red, as OpenCV has them."""
+Points = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 _WALLS: tuple[Colour, ...] = ((182, 176, 166), (170, 164, 154), (188, 182, 172), (164, 158, 149))
@@ -32,9 +33,9 @@ _SKIRTING: Colour = (112, 106, 98)
 _BEYOND: Colour = (214, 208, 202)
 _SHADOW: Colour = (84, 104, 92)
 
-SEAMS = (1.0, 0.9, 0.72, 0.45, 0.1, -0.3, -0.62, -0.86, -1.0)
+_SEAMS = (1.0, 0.9, 0.72, 0.45, 0.1, -0.3, -0.62, -0.86, -1.0)
 """Where the strips of the round target meet, as shares of its half width, from left to right."""
-REDS: tuple[Colour, ...] = (
+_REDS: tuple[Colour, ...] = (
     (28, 18, 158),
     (32, 22, 176),
     (38, 28, 194),
@@ -111,20 +112,8 @@ def draw_shadow(image: Image, view: View, x: float, y: float, radius: float) -> 
     filled(image, ring, _SHADOW)
 
 
-def draw_cylinder(
-    image: Image,
-    view: View,
-    x: float,
-    y: float,
-    radius: float,
-    height: float,
-    seams: Sequence[float] = SEAMS,
-    colours: Sequence[Colour] = REDS,
-) -> None:
-    """Draw an upright cylinder, at least as high as the lens, as strips between its two tangents.
-
-    The strips meet at ``seams``, shares of its half width, and have ``colours``, one less than seams.
-    """
+def draw_target(image: Image, view: View, x: float, y: float, radius: float, height: float) -> None:
+    """Draw the upright red cylinder, at least as high as the lens, as strips between its two tangents."""
     ahead, left, _ = view.seen_one(x, y, 0.0)
     distance, bearing = math.hypot(ahead, left), math.atan2(left, ahead)
     half = math.asin(min(0.999, radius / max(distance, 1e-6)))
@@ -132,14 +121,14 @@ def draw_cylinder(
         return
     draw_shadow(image, view, x, y, radius * 1.25)
     edges = []
-    for share in seams:
+    for share in _SEAMS:
         off = half * share
         edge = max(-1.4, min(1.4, bearing + off))
         # The foot and the top are round: the middle of the cylinder is nearer than its tangents.
         sagitta = math.sqrt(max(0.0, radius**2 - (distance * math.sin(off)) ** 2))
         along = distance * math.cos(off) - sagitta
         edges.append((max(along * math.cos(edge), NEAR_PLANE), along * math.sin(edge)))
-    for (ahead_1, left_1), (ahead_2, left_2), colour in zip(edges, edges[1:], colours, strict=False):
+    for (ahead_1, left_1), (ahead_2, left_2), colour in zip(edges, edges[1:], _REDS, strict=False):
         low, high = -EYE, height - EYE
         strip = [[ahead_1, left_1, low], [ahead_2, left_2, low], [ahead_2, left_2, high], [ahead_1, left_1, high]]
         filled(image, strip, colour)

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.robots.mesh import Colour
+from sim.robots.lens import Colour, Image
 
 WIDTH, HEIGHT = 640, 520
 _FINE = 3
@@ -28,39 +28,13 @@ _EAR: Colour = (60, 56, 54)
 _YELLOW: Colour = (20, 200, 250)
 _RED: Colour = (40, 34, 208)
 _INK: Colour = (48, 44, 42)
-_TRAILS: tuple[Colour, ...] = ((176, 110, 40), (60, 120, 40), (150, 50, 140), (40, 90, 170), (90, 90, 90))
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
-Image = NDArray[np.uint8]
-Trail = Sequence[tuple[float, float]]
 
-
-def overhead(
-    snapshot: Mapping[str, Any],
-    width: int = WIDTH,
-    height: int = HEIGHT,
-    trails: Mapping[str, Trail] | None = None,
-    caption: str = "",
-) -> bytes:
-    """A PNG of ``width`` by ``height`` pixels of the yard's ``snapshot``, with the ways the dogs came and a caption."""
-    done, data = cv2.imencode(".png", overhead_image(snapshot, width, height, trails, caption))
-    if not done:
-        raise RuntimeError("the picture cannot be encoded")
-    return data.tobytes()
-
-
-def overhead_image(
-    snapshot: Mapping[str, Any],
-    width: int = WIDTH,
-    height: int = HEIGHT,
-    trails: Mapping[str, Trail] | None = None,
-    caption: str = "",
-) -> Image:
-    """The same as blue, green and red bytes."""
-    sheet = _Sheet(snapshot["walls"], width, height, caption)
+def overhead(snapshot: Mapping[str, Any], caption: str = "") -> bytes:
+    """A PNG of the yard's ``snapshot``, with a ``caption``."""
+    sheet = _Sheet(snapshot["walls"], caption)
     sheet.draw_yard()
-    for number, dog in enumerate(snapshot["dogs"]):
-        sheet.draw_trail((trails or {}).get(dog["name"], ()), _TRAILS[number % len(_TRAILS)])
     if snapshot["target"] is not None:
         sheet.draw_target(snapshot["target"])
     for dog in snapshot["dogs"]:
@@ -70,28 +44,30 @@ def overhead_image(
         _draw_name(image, sheet, dog)
     if caption:
         _draw_caption(image, caption)
-    return image
+    done, data = cv2.imencode(".png", image)
+    if not done:
+        raise RuntimeError("the picture cannot be encoded")
+    return data.tobytes()
 
 
 class _Sheet:
     """A large drawing in metres: x to the right, y up."""
 
-    def __init__(self, walls: Sequence[float], width: int, height: int, caption: str) -> None:
+    def __init__(self, walls: Sequence[float], caption: str) -> None:
         self.room = (float(walls[0]), float(walls[1]))
-        below = _CAPTION if caption else 0
-        self.scale = min((width - 2 * _MARGIN) / self.room[0], (height - below - 2 * _MARGIN) / self.room[1])
-        self.left = (width - self.scale * self.room[0]) / 2
-        self.bottom = (height - below + self.scale * self.room[1]) / 2
-        self._size = (width, height)
-        self.image: Image = np.full((height * _FINE, width * _FINE, 3), _PAPER, np.uint8)
+        high = HEIGHT - (_CAPTION if caption else 0)
+        self.scale = min((WIDTH - 2 * _MARGIN) / self.room[0], (high - 2 * _MARGIN) / self.room[1])
+        self._left = (WIDTH - self.scale * self.room[0]) / 2
+        self._bottom = (high + self.scale * self.room[1]) / 2
+        self._image: Image = np.full((HEIGHT * _FINE, WIDTH * _FINE, 3), _PAPER, np.uint8)
 
     def place(self, x: float, y: float) -> tuple[float, float]:
         """Where a point of the yard falls, in pixels of the finished picture."""
-        return self.left + self.scale * x, self.bottom - self.scale * y
+        return self._left + self.scale * x, self._bottom - self.scale * y
 
     def shrunk(self) -> Image:
         """The finished picture."""
-        return np.asarray(cv2.resize(self.image, self._size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+        return np.asarray(cv2.resize(self._image, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
     def draw_yard(self) -> None:
         width, height = self.room
@@ -106,11 +82,6 @@ class _Sheet:
         for y in np.arange(0.3, height - 0.01, 0.3):
             self._line([(0, y), (width, y)], _JOINT, 0.006)
         self._line([(0, 0), (width, 0), (width, height), (0, height), (0, 0)], _EDGE, 0.012)
-
-    def draw_trail(self, trail: Trail, colour: Colour) -> None:
-        if len(trail) > 1:
-            self._line(list(trail), colour, 0.014)
-            self._disc(*trail[0], 0.018, colour)
 
     def draw_target(self, target: Mapping[str, float]) -> None:
         x, y, radius = target["x"], target["y"], target["radius"]
@@ -141,29 +112,24 @@ class _Sheet:
         stripes = int(dog["stripes"])
         for number in range(stripes):
             middle = 0.095 + 0.036 * (number - (stripes - 1) / 2)
-            band = [
-                (middle - 0.010, -0.050),
-                (middle + 0.010, -0.050),
-                (middle + 0.010, 0.050),
-                (middle - 0.010, 0.050),
-            ]
-            self._polygon(at(band), _YELLOW)
+            left, right = middle - 0.010, middle + 0.010
+            self._polygon(at([(left, -0.050), (right, -0.050), (right, 0.050), (left, 0.050)]), _YELLOW)
 
     def _outlined(self, points: Sequence[tuple[float, float]], colour: Colour) -> None:
         self._polygon(points, colour)
         self._line([*points, points[0]], _EDGE, 0.006)
 
     def _polygon(self, points: Sequence[tuple[float, float]], colour: Colour) -> None:
-        cv2.fillPoly(self.image, [self._fine(points)], colour, cv2.LINE_AA, 4)
+        cv2.fillPoly(self._image, [self._fine(points)], colour, cv2.LINE_AA, 4)
 
     def _line(self, points: Sequence[tuple[float, float]], colour: Colour, thickness: float) -> None:
         wide = max(1, round(thickness * self.scale * _FINE))
-        cv2.polylines(self.image, [self._fine(points)], False, colour, wide, cv2.LINE_AA, 4)
+        cv2.polylines(self._image, [self._fine(points)], False, colour, wide, cv2.LINE_AA, 4)
 
     def _disc(self, x: float, y: float, radius: float, colour: Colour) -> None:
         column, row = self._fine([(x, y)])[0]
         size = round(radius * self.scale * _FINE * 16)
-        cv2.circle(self.image, (int(column), int(row)), size, colour, -1, cv2.LINE_AA, 4)
+        cv2.circle(self._image, (int(column), int(row)), size, colour, -1, cv2.LINE_AA, 4)
 
     def _fine(self, points: Sequence[tuple[float, float]]) -> NDArray[np.int32]:
         return (np.array([self.place(x, y) for x, y in points]) * (_FINE * 16)).round().astype(np.int32)

@@ -22,6 +22,8 @@ TICK = SUBSTEPS * SUBSTEP
 """Seconds by which a yard goes on at a time: one sensor frame of the ERS-7."""
 WALL_THICKNESS = 0.04
 TRIES = 2000
+CLEARANCE, APART, FROM_WALLS = 0.75, 0.25, 0.25
+"""Metres that a target at random keeps from the dogs, between its distances to two of them, and from the walls."""
 LATEST = 3600.0
 """Seconds within which a target can be placed later."""
 
@@ -117,22 +119,22 @@ class World:
         self._target_shape = shape
         self._space.add(shape)
 
-    def place_target_at_random(self, clearance: float = 0.75, from_walls: float = 0.25, apart: float = 0.25) -> None:
-        """Put the target at a free place, ``clearance`` from every dog, so that one dog is clearly the nearest.
+    def place_target_at_random(self) -> None:
+        """Put the target at a free place, ``CLEARANCE`` from every dog, so that one dog is clearly the nearest.
 
-        The distances to the dogs differ pairwise by ``apart`` metres.  Where no place has both, the one that comes
-        nearest to both is taken; raises ``NotPossible`` in a yard with no free place at all.
+        The distances to the dogs differ pairwise by ``APART``.  Where no place has both, the one that comes nearest to
+        both is taken; raises ``NotPossible`` in a yard with no free place at all.
         """
         best, best_fit = None, -math.inf
         for _ in range(TRIES):
-            x = self._rng.uniform(from_walls, self.scene.width - from_walls)
-            y = self._rng.uniform(from_walls, self.scene.height - from_walls)
+            x = self._rng.uniform(FROM_WALLS, self.scene.width - FROM_WALLS)
+            y = self._rng.uniform(FROM_WALLS, self.scene.height - FROM_WALLS)
             distances = sorted(math.hypot(dog.x - x, dog.y - y) for dog in self.dogs.values())
             if distances and distances[0] < FOOTPRINT + 2 * self.scene.target_radius:
                 continue
-            gap = min((b - a for a, b in zip(distances, distances[1:], strict=False)), default=apart)
-            room = distances[0] if distances else clearance
-            fit = min(gap / apart, 1.0) + min(room / clearance, 1.0)
+            gap = min((b - a for a, b in zip(distances, distances[1:], strict=False)), default=APART)
+            room = distances[0] if distances else CLEARANCE
+            fit = min(gap / APART, 1.0) + min(room / CLEARANCE, 1.0)
             if fit > best_fit:
                 best, best_fit = (x, y), fit
         if best is None:

@@ -13,10 +13,9 @@ from twisted.internet.interfaces import IReactorTime
 from drivers.sim.codec import VERSION, Done, Message, Order, Overlook, Truth
 from sim.robots.camera import Camera
 from sim.robots.emulator.dog import DogBody
-from sim.robots.paced import PacedYard
+from sim.robots.reception import Beat, PacedYard, Session
 from sim.robots.scene import Scene
 from sim.robots.sensor import Sensors as Senses
-from sim.robots.session import Beat, Session
 from sim.robots.world import SUBSTEPS, TICK, NotPossible, World
 
 MAX_SESSIONS = 64
@@ -35,7 +34,7 @@ class Yard(PacedYard):
         self._senses = {
             name: Senses(Random(rng.getrandbits(64)), self.world, dog) for name, dog in self.world.dogs.items()
         }
-        super().__init__(clock, self.world.dogs, self.world, MAX_SESSIONS, self._on_operator)
+        super().__init__(clock, self.world.dogs, self.world, MAX_SESSIONS)
         self._orders: dict[str, tuple[Callable[..., None], tuple[type, ...]]] = {
             "place_target": (self.world.place_target, (float, float)),
             "place_target_at_random": (self.world.place_target_at_random, ()),
@@ -48,8 +47,10 @@ class Yard(PacedYard):
     def truth(self) -> dict[str, object]:
         """The whole yard as seen from above, and of each dog what its gate has let through and refused."""
         snapshot = self.world.snapshot()
-        gates = self._reception.gates.values()
-        counts = [{"token": g.token or 0, "accepted": g.accepted, "refused": sum(g.refused.values())} for g in gates]
+        counts = [
+            {"token": gate.token or 0, "accepted": gate.accepted, "refused": sum(gate.refused.values())}
+            for gate in self._gates.values()
+        ]
         dogs: Any = snapshot["dogs"]
         return {**snapshot, "dogs": [{**dog, **count} for dog, count in zip(dogs, counts, strict=True)]}
 
@@ -58,7 +59,7 @@ class Yard(PacedYard):
 
         Raises ``UsageError`` where there is no such dog.
         """
-        self._reception.lend(name)
+        self._withhold(name)
         dog = self.world.dogs[name]
         dog.limits = limits
         return DogBody(self.world, dog, self._senses[name], self._camera)
@@ -76,35 +77,32 @@ class Yard(PacedYard):
 
     def _tick(self, with_pictures: bool) -> None:
         for _ in range(SUBSTEPS):
-            self._reception.expire(self.world.t)
+            self._expire(self.world.t)
             self.world.step()
             for senses in self._senses.values():
                 senses.sample()
         self._report(with_pictures)
-        self._reception.drop_silent()
+        self._drop_silent()
 
     def _report(self, with_pictures: bool) -> None:
         t = self.world.t
         for name, senses in self._senses.items():
             values, samples = senses.values(), senses.taken_samples()
             picture = partial(self._camera.jpeg, self.world.dogs[name]) if with_pictures else None
-            self._reception.tell(name, t, values, samples, picture)
-        sessions = self._reception.sessions
-        watchers = [one for one in sessions if one.is_operator and one.truths.is_due(t) and not one.link.is_busy]
+            self._tell(name, t, values, samples, picture)
+        watchers = [one for one in self._sessions if one.is_operator and one.truths.is_due(t) and not one.link.is_busy]
         if watchers:
             truth = Truth(self.truth())
             for session in watchers:
                 session.send(truth)
 
-    def _on_operator(self, session: Session, message: Message) -> None:
+    def _on_other(self, session: Session, message: Message) -> None:
         match message:
             case Overlook():
                 session.is_operator = message.version == VERSION
                 session.truths = Beat(min(max(message.rate, 0.1), MAX_RATE))
             case Order() if session.is_operator:
                 session.send(Done(message.number, self._carried_out(message)))
-            case _:
-                pass
 
     def _carried_out(self, order: Order) -> str:
         """Do what the operator orders; the problem in words, or an empty text."""

@@ -17,8 +17,7 @@ from middleware.entangled.control.word import printable
 from middleware.entangled.network.interface import interfaces
 from middleware.errors import SwarmError
 from swarmnode.doctor.diagnosis import diagnosed
-from swarmnode.doctor.facts import Facts, Health
-from swarmnode.doctor.finding import Finding
+from swarmnode.doctor.facts import Facts, Finding, Health
 from swarmnode.doctor.measure import measured
 from swarmnode.links import figures
 from swarmnode.world import resolved

@@ -1,13 +1,17 @@
-"""Facts: what was measured around one node, and nothing of what it means; None is what could not be measured."""
+"""Facts: what was measured around one node, and what was found in it; a fact that could not be measured is None."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from ipaddress import ip_address
+from typing import Literal
 
 from middleware.entangled.network.interface import Interface
 from middleware.entangled.network.network import Address
 from middleware.entangled.wire.hail import VERSION
+
+Weight = Literal["error", "warning", "note"]
+ORDER: tuple[Weight, ...] = ("error", "warning", "note")
 
 
 @dataclass(frozen=True)
@@ -131,3 +135,32 @@ def is_local(host: str) -> bool:
         return ip_address(host.partition("%")[0]).is_loopback
     except ValueError:
         return False
+
+
+@dataclass(frozen=True)
+class Finding:
+    """``cause`` is a name for programs, such as ``udp-blocked``; the rest are sentences for people.
+
+    An ``error`` keeps the node from its team, a ``warning`` will or may, a ``note`` is good to know.
+    """
+
+    weight: Weight
+    cause: str
+    what: str
+    why: str
+    remedy: str
+
+
+def error(cause: str, what: str, why: str, remedy: str) -> Finding:
+    """What keeps the node from its team."""
+    return Finding("error", cause, what, why, remedy)
+
+
+def warning(cause: str, what: str, why: str, remedy: str) -> Finding:
+    """What may keep it, or will."""
+    return Finding("warning", cause, what, why, remedy)
+
+
+def note(cause: str, what: str, why: str, remedy: str) -> Finding:
+    """What is good to know."""
+    return Finding("note", cause, what, why, remedy)

@@ -20,10 +20,8 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from importlib.util import find_spec
 from ipaddress import ip_address
 from pathlib import Path
-from typing import Any
 
 from middleware.config.settings import IN_MEMORY, Settings
 from middleware.entangled.errors import Forged, Malformed
@@ -70,53 +68,50 @@ def measured(
     is_running: bool = False,
     health: Health | None = None,
     wall: Callable[[], float] = time.time,
-    team: Team | None = None,
 ) -> Facts:
     """The facts of the node with these settings, whose host names were looked up."""
     node = settings.node
-    team = team_of(settings) if team is None else team
+    team = team_of(settings)
     found = tuple(interfaces())
     named = dict.fromkeys([*node.known_nodes, *team.known])
     known = [each for each in named if _is_figures(each) and not _is_self(each, node.host, node.port, found)]
     known = known[:MAX_KNOWN]
     port_problem = ""
-    if node.port and not is_free(socket.SOCK_DGRAM, _bindable(node.host), node.port):
+    if node.port and not is_free(socket.SOCK_DGRAM, "" if is_any(node.host) else node.host, node.port):
         port_problem = f"Another program listens at {node.host}:{node.port}."
-    facts = Facts(
+    where = chosen(list(found), node.host) if node.lan and not is_local(node.host) else []
+    heard = _asked(node.host, known, team.secrets, where, wall)
+    gateway = _gateway()
+    return Facts(
         node.name,
         node.host,
         node.port,
         wall(),
         interfaces=found,
+        known=tuple(_probe(address, heard, found) for address in known),
+        lan=Lan(tuple(heard.on_lan.values()), heard.is_sent, heard.is_own_heard) if where else None,
         port_problem=port_problem if settings.is_given("node", "port") else "",
         is_running=is_running,
         fingerprint=team.fingerprint,
         way_out=_way_out([each.host for each in known if not is_local(each.host)]),
+        is_gateway_resolved=_is_resolved(gateway) if gateway else None,
         certificate=team.certificate,
         storage=_storage(node.store),
         open_files=tuple(_open(_secret_files(settings))),
         health=health,
     )
-    where = chosen(list(found), node.host) if node.lan and not is_local(node.host) else []
-    heard = _asked(node.host, known, team.secrets, where, wall)
-    gateway = _gateway()
-    probes = tuple(_probe(address, heard, found) for address in known)
-    lan = Lan(tuple(heard.on_lan.values()), heard.is_sent, heard.is_own_heard) if where else None
-    return replace(facts, known=probes, lan=lan, is_gateway_resolved=_is_resolved(gateway) if gateway else None)
 
 
 def team_of(settings: Settings) -> Team:
     """The team that the settings name."""
-    path = getattr(settings.node, "membership", "")
+    path = settings.node.membership
     if not path:
         return Team([settings.node.team_secret])
-    if find_spec("middleware.admission") is None:
-        return Team([], certificate=Certificate(problem="this program knows no closed teams; upgrade it"))
     # What reads it is needed by members of closed teams only.
-    from importlib import import_module
+    from middleware.admission.membership import MembershipFile
 
     try:
-        kept: Any = import_module("middleware.admission.membership").MembershipFile(Path(path)).membership
+        kept = MembershipFile(Path(path)).membership
         member = kept.member
     except Exception as error:  # whatever is wrong with the file is what the doctor is asked for
         return Team([], certificate=Certificate(problem=str(error)))
@@ -125,12 +120,12 @@ def team_of(settings: Settings) -> Team:
     return Team(secrets, mark, Certificate(member.not_before, member.not_after), kept.known)
 
 
-def on_lan(host: str = "*") -> list[Answer]:
+def on_lan() -> list[Answer]:
     """Who answers a HAIL to all on the LAN, of whatever team; it takes ``TRIES`` times ``EACH_S`` seconds.
 
     So one who is of no team yet finds whom to ask.  Of a large team only some answer, others at the next call.
     """
-    return list(_asked(host, [], [], chosen(interfaces(), host), time.time).on_lan.values())
+    return list(_asked("*", [], [], chosen(interfaces(), "*"), time.time).on_lan.values())
 
 
 # -- the net ----------------------------------------------------------------------------------------------------------
@@ -338,10 +333,6 @@ def _is_self(address: Address, host: str, port: int, found: Sequence[Interface])
     return bool(port) and address.port == port and address.host in mine
 
 
-def _bindable(host: str) -> str:
-    return "" if is_any(host) else host
-
-
 def _way_out(hosts: Sequence[str]) -> str:
     """The address from which this machine would send to the first of them."""
     for host in hosts[:1]:
@@ -358,26 +349,26 @@ def _is_near(host: str, found: Sequence[Interface]) -> bool:
     if address.version == 6:
         mine = [ip_address(each) for i in found for each in i.addresses if ":" in each and not i.is_loopback]
         return any(int(address) >> 64 == int(own) >> 64 for own in mine)
-    routes = [(network, mask) for _, network, gateway, mask in _routes() if not gateway and mask]
+    routes = [(network, mask) for network, gateway, mask in _routes() if not gateway and mask]
     return any(int(address) & mask == network for network, mask in routes)
 
 
 def _gateway() -> str:
     """The router that everything else goes through; empty where there is none."""
-    for _, network, gateway, mask in _routes():
+    for network, gateway, mask in _routes():
         if gateway and not network and not mask:
             return str(ip_address(gateway))
     return ""
 
 
-def _routes() -> list[tuple[str, int, int, int]]:
-    """(interface, network, gateway, mask) of each route of IPv4."""
+def _routes() -> list[tuple[int, int, int]]:
+    """(network, gateway, mask) of each route of IPv4."""
     try:
         lines = Path("/proc/net/route").read_text(encoding="ascii").splitlines()[1:]
     except (OSError, ValueError):
         return []
     rows = [line.split() for line in lines]
-    return [(row[0], _number(row[1]), _number(row[2]), _number(row[7])) for row in rows if len(row) > 7]
+    return [(_number(row[1]), _number(row[2]), _number(row[7])) for row in rows if len(row) > 7]
 
 
 def _number(digits: str) -> int:
@@ -426,7 +417,7 @@ def _storage(path: str) -> Storage | None:
 
 
 def _secret_files(settings: Settings) -> list[str]:
-    paths = [getattr(settings.node, "membership", ""), settings.node.store]
+    paths = [settings.node.membership, settings.node.store]
     if settings.is_given("node", "team_key"):
         paths.append(settings.origin)
     return [path for path in paths if path and path != IN_MEMORY]

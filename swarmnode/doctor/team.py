@@ -8,8 +8,7 @@ from statistics import median
 
 from middleware.entangled.wire.door import DOUBLED, EARLY, EXPIRED, FOREIGN, REVOKED, SUPERSEDED, meaning
 from middleware.entangled.wire.hail import VERSION
-from swarmnode.doctor.facts import Facts
-from swarmnode.doctor.finding import Finding, error, warning
+from swarmnode.doctor.facts import Facts, Finding, error, warning
 
 SKEW = 300.0
 """Seconds by which clocks of one team may differ before a certificate seems not valid yet, or expired."""

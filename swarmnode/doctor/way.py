@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from middleware.entangled.network.interface import is_any
-from swarmnode.doctor.facts import Facts, Probe, is_local
-from swarmnode.doctor.finding import Finding, error, note, warning
+from swarmnode.doctor.facts import Facts, Finding, Probe, error, is_local, note, warning
 
 
 def interface(facts: Facts) -> Iterator[Finding]:

@@ -76,7 +76,8 @@ def main(
         if wishes.verb in ("restart", "remove"):
             return _Place(wishes.name, is_user, root, run, out).do(wishes.verb)
         program, interpreter = twistd(executable, is_user, can_enter), str(_interpreter(executable))
-        unit = unit_for(_settings(wishes.settings), program, is_user, wishes.memory, interpreter)
+        settings = Settings.load(str(Path(wishes.settings).absolute()))
+        unit = unit_for(settings, program, is_user, wishes.memory, interpreter)
         if wishes.verb == "show":
             out.write(unit.text)
             return DONE
@@ -102,10 +103,6 @@ def twistd(executable: str, is_user: bool, can_enter: Callable[[Path], bool]) ->
 def _interpreter(executable: str) -> Path:
     """The Python that runs: the interpreter of an environment is often a link to another one."""
     return Path(executable).resolve()
-
-
-def _settings(path: str) -> Settings:
-    return Settings.load(str(Path(path).absolute()))
 
 
 class _Place:
@@ -155,7 +152,7 @@ class _Place:
         """Put the settings into the service's folder, and once the files that they name in their own folder."""
         settings, folder = Settings.load(path), Path(path).parent
         self._state.mkdir(mode=0o700, parents=True, exist_ok=True)
-        named = [settings.node.store, getattr(settings.node, "membership", "")]
+        named = [settings.node.store, settings.node.membership]
         for file in [Path(each) for each in named if each and each != IN_MEMORY]:
             try:
                 inside = file.relative_to(folder)

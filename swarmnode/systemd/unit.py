@@ -121,7 +121,7 @@ _MOUNTED = (
 def unit_for(settings: Settings, twistd: str, is_user: bool, memory: str = MEMORY, interpreter: str = "") -> Unit:
     """The unit of the node with these settings, which are in the file ``settings.origin``."""
     node, web = settings.node, settings.web
-    ports = [node.port, getattr(node, "tunnel_port", 0) or 0]
+    ports = [node.port, node.tunnel_port]
     if "web" in node.roles:
         ports += [web.port, web.tls_port if web.tls else 0]
     options = [settings.driver.options, *(options for _, options in settings.driver.parts)]

@@ -11,6 +11,7 @@ from functools import cache
 
 from twisted.trial.unittest import SkipTest, SynchronousTestCase
 
+from sim.namespaces.internet import Internet, Site
 from sim.namespaces.room import refusal
 
 
@@ -24,6 +25,13 @@ class NamespaceCase(SynchronousTestCase):
             self.fail(f"SWARM_CI=1, and the tests in namespaces cannot run: {why}")
         if why:
             raise SkipTest(why)
+
+    def internet(self, *sites: Site) -> Internet:
+        """One that is gone after the test."""
+        net = Internet(sites)
+        net.__enter__()
+        self.addCleanup(net.close)
+        return net
 
 
 @cache

@@ -7,11 +7,11 @@ import sys
 from pathlib import Path
 from random import Random
 
+from benchmarks.nat.hosts import Hosts
+from benchmarks.nat.matrix import Pair, Trial
 from sim.namespaces.capture import Capture, datagrams
-from sim.namespaces.hosts import Hosts
 from sim.namespaces.internet import PUB, PUBS, Internet, Site
 from sim.namespaces.kind import Kind
-from sim.namespaces.matrix import Pair, Trial
 from tests.live.namespaces import NamespaceCase
 
 STRANGER = """

@@ -44,18 +44,12 @@ while True:
 class DoctorCase(NamespaceCase):
     """An internet with nodes, and a doctor."""
 
+    net: Internet
+
     def setUp(self) -> None:
         super().setUp()
         self.folder = Path(self.mktemp()).absolute()
         self.folder.mkdir()
-
-    def internet(self, *sites: Site) -> Internet:
-        """One that is gone after the test."""
-        net = Internet(sites)
-        net.__enter__()
-        self.addCleanup(net.close)
-        self.net = net
-        return net
 
     def settings(self, name: str, host: str, known: Sequence[str] = (), **others: object) -> Path:
         """The settings of a node."""
@@ -111,7 +105,7 @@ class WayTests(DoctorCase):
 
     def test_routers_and_firewalls(self) -> None:
         """Each kind of router is named by who is behind it, a firewall against UDP too, and a cut as no bootstrap."""
-        net = self.internet(
+        net = self.net = self.internet(
             Site("c", Kind.PORT), Site("s", Kind.SYM), Site("n", Kind.NOUDP), Site("o", Kind.NONE), Site("x", Kind.PORT)
         )
         known = [f"{address}:8484" for address in PUBS]
@@ -130,7 +124,7 @@ class LanTests(DoctorCase):
 
     def setUp(self) -> None:
         super().setUp()
-        net = self.internet(Site("a", Kind.PORT, hosts=2))
+        net = self.net = self.internet(Site("a", Kind.PORT, hosts=2))
         self.other = f"{net.address('a2')}:8484"
         self.node("a2", self.settings("other", net.address("a2")))
         self.own = self.settings("own", net.address("a1"), [self.other])
@@ -176,25 +170,17 @@ class LanTests(DoctorCase):
             self.net.room("a-gw").run(f"ip link set {port} type bridge_slave isolated on\n")
         self.assertEqual(self.causes("a1", self.own), ["client-isolation"])
 
-    def test_nobody_listens(self) -> None:
-        """A neighbour without a node at that port is named."""
-        settings = self.settings("own", self.net.address("a1"), [f"{self.net.address('a2')}:9999"], lan=False)
-        self.assertEqual(self.causes("a1", settings), ["nobody-listens"])
-
-    def test_wrong_interface(self) -> None:
-        """An address that this machine does not have, and one that no other machine reaches, are named."""
+    def test_settings_and_clock(self) -> None:
+        """No node at a port, an own address that cannot be, another team, and a clock that is behind are named."""
+        own, other = self.net.address("a1"), self.net.address("a2")
+        nobody = self.settings("own", own, [f"{other}:9999"], lan=False)
+        self.assertEqual(self.causes("a1", nobody), ["nobody-listens"])
         for host in ("198.19.77.7", "127.0.0.1"):
-            settings = self.settings("own", host, [self.other])
-            self.assertIn("wrong-interface", self.causes("a1", settings))
-
-    def test_wrong_team(self) -> None:
-        """A neighbour of another team is named."""
-        settings = self.settings("own", self.net.address("a1"), [self.other], team_key="of others")
-        self.assertEqual(self.causes("a1", settings), ["wrong-team"])
-
-    def test_clock(self) -> None:
-        """A clock that is an hour behind is named."""
-        self.assertEqual(self.causes("a1", self.own, late=3600.0), ["clock-off"])
+            self.assertIn("wrong-interface", self.causes("a1", self.settings("own", host, [self.other])))
+        foreign = self.settings("own", own, [self.other], team_key="of others")
+        self.assertEqual(self.causes("a1", foreign), ["wrong-team"])
+        settings = self.settings("own", own, [self.other])
+        self.assertEqual(self.causes("a1", settings, late=3600.0), ["clock-off"])
 
     def test_version(self) -> None:
         """A node of another version of the protocol is named."""

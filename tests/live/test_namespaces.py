@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -13,6 +12,8 @@ from sim.namespaces.capture import Capture
 from sim.namespaces.internet import PUBS, ROOT, Internet, Site
 from sim.namespaces.kind import Kind
 from tests.live.namespaces import NamespaceCase
+from tests.live.test_processes import is_alive
+from tests.live.until import until
 
 LIMIT_S = 60.0
 TARGETS = (f"{PUBS[0]}:4000", f"{PUBS[0]}:4001", f"{PUBS[1]}:4000")
@@ -46,13 +47,6 @@ print(seen)
 
 class InternetTests(NamespaceCase):
     """What ``Internet`` promises."""
-
-    def internet(self, *sites: Site, seed: int = 1) -> Internet:
-        """One that is gone after the test."""
-        net = Internet(sites, seed)
-        net.__enter__()
-        self.addCleanup(net.close)
-        return net
 
     def seen(self, net: Internet, host: str) -> list[tuple[str, int] | None]:
         """As which addresses the public host sees one socket of ``host`` at its three echoes."""
@@ -134,6 +128,7 @@ class InternetTests(NamespaceCase):
             "    if sys.argv[1] == 'raise': raise SystemExit(3)\n"
             "    signal.pause()\n"
         )
+        left: list[int] = []
         for end in ("raise", "kill"):
             child = subprocess.Popen([sys.executable, "-c", program, end], cwd=ROOT, stdout=subprocess.PIPE, text=True)
             assert child.stdout is not None
@@ -143,27 +138,8 @@ class InternetTests(NamespaceCase):
                 child.send_signal(signal.SIGKILL)
             child.wait(LIMIT_S)
             child.stdout.close()
-            for pid in pids:
-                # Woken by the end of its input, or by the kernel's signal: either is a moment, not a wait of ours.
-                descriptor = _opened(pid)
-                if descriptor >= 0:
-                    self.assertTrue(_ended(descriptor), f"process {pid} is left after {end}")
-
-
-def _opened(pid: int) -> int:
-    try:
-        return os.pidfd_open(pid)
-    except ProcessLookupError:
-        return -1
-
-
-def _ended(descriptor: int) -> bool:
-    import select
-
-    try:
-        return bool(select.select([descriptor], [], [], 10.0)[0])
-    finally:
-        os.close(descriptor)
+            left += pids
+        until(lambda: not any(map(is_alive, left)), 10.0, lambda: f"one is left of {left}")
 
 
 class MatrixTests(NamespaceCase):
@@ -172,7 +148,7 @@ class MatrixTests(NamespaceCase):
     def test_whoever_can_reach_each_other_does(self) -> None:
         """One round of the matrix: nodes without a router meet at once, and table, JSON and picture are written."""
         folder = Path(self.mktemp()).absolute()
-        command = [sys.executable, "-m", "sim.namespaces", "--count", "1", "--lossy", "0", "--out", str(folder)]
+        command = [sys.executable, "-m", "benchmarks.nat", "--count", "1", "--lossy", "0", "--out", str(folder)]
         ran = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
         self.assertIn(ran.returncode, (0, 1), ran.stderr)
         found = json.loads((folder / "live-nat.json").read_text())["trials"]

@@ -8,42 +8,33 @@ from typing import Any
 
 from tests.live.page import DESK, PageCase
 
-BARE = (
-    *("<script>ran()</script>", "<script src=//evil.example/x.js></script>", "<img src=x onerror=ran()>"),
-    *(
-        "<svg onload=ran()>",
-        "<svg><script>ran()</script></svg>",
-        "<body onload=ran()>",
-        "<iframe src=javascript:ran()>",
-    ),
-    *(
-        "<iframe srcdoc='<script>parent.ran()</script>'>",
-        "<a href=javascript:ran()>x</a>",
-        "<details open ontoggle=ran()>",
-    ),
-    *(
-        "<input autofocus onfocus=ran()>",
-        "<video><source onerror=ran()></video>",
-        "<math href=javascript:ran()>x</math>",
-    ),
-    *(
-        "<object data=javascript:ran()>",
-        "<embed src=javascript:ran()>",
-        "<form action=javascript:ran()><button>x</form>",
-    ),
-    *(
-        "<base href=//evil.example/>",
-        "<link rel=stylesheet href=//evil.example/x.css>",
-        "<meta http-equiv=refresh content=0>",
-    ),
-    *("<style>@import '//evil.example/x.css'</style>", "<div style=background:url(//evil.example/x.png)>x</div>"),
-    *(
-        "<template><script>ran()</script></template>",
-        "<marquee onstart=ran()>x</marquee>",
-        "<img src=//evil.example/x.png>",
-    ),
-    "<svg><animate onbegin=ran() attributeName=x dur=1s></svg>",
-)
+BARE = """\
+<script>ran()</script>
+<script src=//evil.example/x.js></script>
+<img src=x onerror=ran()>
+<svg onload=ran()>
+<svg><script>ran()</script></svg>
+<body onload=ran()>
+<iframe src=javascript:ran()>
+<iframe srcdoc='<script>parent.ran()</script>'>
+<a href=javascript:ran()>x</a>
+<details open ontoggle=ran()>
+<input autofocus onfocus=ran()>
+<video><source onerror=ran()></video>
+<math href=javascript:ran()>x</math>
+<object data=javascript:ran()>
+<embed src=javascript:ran()>
+<form action=javascript:ran()><button>x</form>
+<base href=//evil.example/>
+<link rel=stylesheet href=//evil.example/x.css>
+<meta http-equiv=refresh content=0>
+<style>@import '//evil.example/x.css'</style>
+<div style=background:url(//evil.example/x.png)>x</div>
+<template><script>ran()</script></template>
+<marquee onstart=ran()>x</marquee>
+<img src=//evil.example/x.png>
+<svg><animate onbegin=ran() attributeName=x dur=1s></svg>
+"""
 WAYS = (
     "{}",
     "\"'>{}",
@@ -55,7 +46,7 @@ WAYS = (
     "data: x\n\nevent: state\ndata: {{}}\n\n{}",
 )
 BATCH = 8
-PAYLOADS = [way.format(bare) for way in WAYS for bare in BARE]
+PAYLOADS = [way.format(bare) for way in WAYS for bare in BARE.splitlines()]
 WATCH = """
 globalThis.violations = [];
 globalThis.ran = () => { globalThis.hasRun = true; };

@@ -8,15 +8,16 @@ import socket
 import ssl
 import sys
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from twisted.internet import reactor, task
-from twisted.internet.defer import Deferred, inlineCallbacks
+from twisted.internet.defer import Deferred
 from twisted.protocols import portforward
 from twisted.trial.unittest import TestCase
 
+from middleware.entangled.contact import Contact
 from middleware.entangled.errors import TunnelPortInUse
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.tcp import TcpCarrier
@@ -80,20 +81,12 @@ class TunnelTests(TestCase):
         self.addCleanup(end.stop)
         return end
 
-    def until(self, is_so: Callable[[], bool], seconds: float = 15.0) -> Deferred[float]:
-        """Wait until something is so; fires with the seconds that it took."""
+    async def until(self, is_so: Callable[[], bool], seconds: float = 15.0) -> float:
+        """Wait until something is so; returns the seconds that it took."""
         began = time.monotonic()
-        done: Deferred[float] = Deferred()
-
-        def look() -> None:
-            took = time.monotonic() - began
-            if is_so() or took > seconds:
-                loop.stop()
-                done.callback(took)
-
-        loop = task.LoopingCall(look)
-        loop.start(0.05, now=False)
-        return done
+        while not is_so() and time.monotonic() - began <= seconds:
+            await task.deferLater(REACTOR, 0.05)
+        return time.monotonic() - began
 
     def dialled(self, url: Url) -> ssl.SSLSocket:
         """A blocking client that has spoken TLS and the greeting, and reads nothing after it."""
@@ -106,8 +99,14 @@ class TunnelTests(TestCase):
         self.addCleanup(client.close)
         return client
 
-    @inlineCallbacks
-    def greet(self, url: Url) -> Generator[Deferred[Any], Any, ssl.SSLSocket]:
+    async def member(self, url: Url) -> tuple[Endpoint, Contact, TunnelNetwork]:
+        """An endpoint that has met the one where ``url`` leads, that one's contact, and its own tunnel."""
+        tunnel, _ = self.made(url)
+        client = self.endpoint(2, tunnel)
+        contact = await client.greet(url.address, 4.0)
+        return client, contact, tunnel
+
+    async def greet(self, url: Url) -> ssl.SSLSocket:
         """One that has greeted by hand."""
         client = self.dialled(url)
         for step in (client.do_handshake, lambda: client.send(REQUEST), lambda: client.recv(4096)):
@@ -116,32 +115,26 @@ class TunnelTests(TestCase):
                     step()
                     break
                 except (ssl.SSLWantReadError, ssl.SSLWantWriteError):
-                    yield task.deferLater(REACTOR, 0.01)
+                    await task.deferLater(REACTOR, 0.01)
         return client
 
-    @inlineCallbacks
-    def test_endpoints_talk(self) -> Generator[Deferred[Any], Any, None]:
+    async def test_endpoints_talk(self) -> None:
         """Two endpoints greet, ask and answer through TLS, 1 MiB included; the first answer comes within a second."""
-        server, _, url = self.served()
-        tunnel, _ = self.made(url)
-        client = self.endpoint(2, tunnel)
+        _, _, url = self.served()
         began = time.monotonic()
-        contact = yield client.greet(url.address, 4.0)
-        answer = yield client.ask(contact, "echo", 42)
+        client, contact, tunnel = await self.member(url)
+        answer = await client.ask(contact, "echo", 42)
         self.assertEqual((contact.public, answer), (Identity(b"\x01" * 32).public, 42))
         self.assertLess(time.monotonic() - began, 1.0)
         large = random.Random(1).randbytes(2**20 - 100)
-        answer = yield client.ask(contact, "echo", large, timeout=30.0)
+        answer = await client.ask(contact, "echo", large, timeout=30.0)
         self.assertTrue(answer == large, "1 MiB comes back as it went")
         self.assertEqual(tunnel.counters["opened"], 1, "where nothing is lost one connection is enough")
 
-    @inlineCallbacks
-    def test_bear_a_crowd(self) -> Generator[Deferred[Any], Any, None]:
+    async def test_bear_a_crowd(self) -> None:
         """Of five hundred dribblers few are borne, all are let go in time, and a member is served in between."""
-        server, tunnel, url = self.served()
-        client_tunnel, _ = self.made(url)
-        client = self.endpoint(2, client_tunnel)
-        contact = yield client.greet(url.address, 4.0)
+        _, tunnel, url = self.served()
+        client, contact, _ = await self.member(url)
         crowd: set[socket.socket] = set()
         selector = selectors.DefaultSelector()
         for number in range(500):
@@ -153,7 +146,7 @@ class TunnelTests(TestCase):
             selector.register(each, selectors.EVENT_READ)
             self.addCleanup(each.close)
             if number % 25 == 0:
-                yield task.deferLater(REACTOR, 0.0)
+                await task.deferLater(REACTOR, 0.0)
         slowest, most = 0.0, 0
         began = time.monotonic()
         while crowd and time.monotonic() - began < 20.0:
@@ -175,63 +168,56 @@ class TunnelTests(TestCase):
                     selector.unregister(gone)
                     crowd.discard(gone)
             asked = time.monotonic()
-            yield client.ask(contact, "echo", 1)
+            await client.ask(contact, "echo", 1)
             slowest = max(slowest, time.monotonic() - asked)
             most = max(most, len(tunnel._links))
-            yield task.deferLater(REACTOR, 0.1)
+            await task.deferLater(REACTOR, 0.1)
         selector.close()
         self.assertEqual(len(crowd), 0)
         self.assertLess(time.monotonic() - began, 15.0)
         self.assertLess(slowest, 0.5)
         self.assertLessEqual(most, MAX_BEGUN + 2)
 
-    @inlineCallbacks
-    def test_bear_one_address(self) -> Generator[Deferred[Any], Any, None]:
+    async def test_bear_one_address(self) -> None:
         """Of one address no more are borne than a large team needs, and the rest is hung up on at once."""
         _, tunnel, url = self.served()
         crowd = [socket.create_connection((url.host, url.port), 5.0) for _ in range(100)]
         for each in crowd:
             self.addCleanup(each.close)
-        yield self.until(lambda: tunnel.counters["crowded"] >= 100 - MAX_OF_HOST)
+        await self.until(lambda: tunnel.counters["crowded"] >= 100 - MAX_OF_HOST)
         self.assertEqual(tunnel.counters["crowded"], 100 - MAX_OF_HOST)
 
-    @inlineCallbacks
-    def test_garbage(self) -> Generator[Deferred[Any], Any, None]:
+    async def test_garbage(self) -> None:
         """Garbage instead of TLS, of the greeting, and of frames ends its own link alone; nothing is raised."""
-        server, tunnel, url = self.served()
-        client_tunnel, _ = self.made(url)
-        client = self.endpoint(2, client_tunnel)
-        contact = yield client.greet(url.address, 4.0)
+        _, tunnel, url = self.served()
+        client, contact, _ = await self.member(url)
         dice = random.Random(3)
         for _ in range(20):
             plain = socket.create_connection((url.host, url.port), 5.0)
             self.addCleanup(plain.close)
             plain.send(dice.randbytes(dice.randrange(1, 3000)))
         for _ in range(10):
-            greeted = yield self.greet(url)
+            greeted = await self.greet(url)
             greeted.send(dice.randbytes(dice.randrange(20, 3000)))
-        yield self.until(lambda: len(tunnel._links) == 1)
+        await self.until(lambda: len(tunnel._links) == 1)
         self.assertEqual(len(tunnel._links), 1)
-        answer = yield client.ask(contact, "echo", 1)
+        answer = await client.ask(contact, "echo", 1)
         self.assertEqual(answer, 1)
 
-    @inlineCallbacks
-    def test_slow_reader(self) -> Generator[Deferred[Any], Any, None]:
+    async def test_slow_reader(self) -> None:
         """For who reads nothing little is kept, the rest is dropped, and others are served as fast as before."""
-        server, tunnel, url = self.served()
-        client_tunnel, _ = self.made(url)
-        client = self.endpoint(2, client_tunnel)
-        contact = yield client.greet(url.address, 4.0)
+        _, tunnel, url = self.served()
+        client, contact, _ = await self.member(url)
         others = set(tunnel.peers)
-        yield self.greet(url)
-        yield self.until(lambda: len(tunnel.peers) == 2)
+        await self.greet(url)
+        await self.until(lambda: len(tunnel.peers) == 2)
         (slow,) = set(tunnel.peers) - others
         slowest = 0.0
         for _ in range(50):
             for _ in range(100):
                 tunnel.send(bytes(1400), slow)
             asked = time.monotonic()
-            yield client.ask(contact, "echo", 1)
+            await client.ask(contact, "echo", 1)
             slowest = max(slowest, time.monotonic() - asked)
         (link,) = (each for each in tunnel._links if each.address == slow)
         transport: Any = link.transport
@@ -240,27 +226,26 @@ class TunnelTests(TestCase):
         self.assertGreater(link.dropped, 4000)
         self.assertLess(slowest, 0.3)
 
-    @inlineCallbacks
-    def test_strain(self) -> Generator[Deferred[Any], Any, None]:
+    async def test_strain(self) -> None:
         """Linux tells how a stream does: nothing held or repeated where all is confirmed, much where nobody reads."""
         if sys.platform != "linux":
             self.skipTest("only Linux tells")
         server, tunnel, url = self.served()
         client_tunnel, carrier = self.made(url)
         client = self.endpoint(2, client_tunnel)
-        contact = yield client.greet(url.address, 4.0)
-        yield client.ask(contact, "echo", 1)
-        yield task.deferLater(REACTOR, 0.3)
+        contact = await client.greet(url.address, 4.0)
+        await client.ask(contact, "echo", 1)
+        await task.deferLater(REACTOR, 0.3)
         (link,) = client_tunnel._links
         strain = carrier.strain(link.transport)
         assert strain is not None
         self.assertEqual((strain.held, strain.repeated), (0, 0))
         self.assertGreater(strain.acked, 1000)
-        yield self.greet(url)
+        await self.greet(url)
         (deaf,) = (each for each in tunnel._links if each.address != tunnel.peers[0])
         for _ in range(400):
             tunnel.send(bytes(1400), deaf.address)
-            yield task.deferLater(REACTOR, 0.001)
+            await task.deferLater(REACTOR, 0.001)
         strain = carrier.strain(deaf.transport)
         assert strain is not None
         self.assertGreater(strain.held, 8192)
@@ -268,8 +253,7 @@ class TunnelTests(TestCase):
         self.assertIsNone(carrier.strain(None))
         server.stop()
 
-    @inlineCallbacks
-    def test_dead_end(self) -> Generator[Deferred[Any], Any, None]:
+    async def test_dead_end(self) -> None:
         """A connection that stays up and carries nothing is given up, and another one dialled, within 12 s."""
         server, tunnel, url = self.served()
 
@@ -279,23 +263,21 @@ class TunnelTests(TestCase):
         front = REACTOR.listenTCP(0, factory, interface=HOST)
         self.addCleanup(front.stopListening)
         through = Url("wss", HOST, front.getHost().port)
-        client_tunnel, _ = self.made(through)
-        client = self.endpoint(2, client_tunnel)
-        contact = yield client.greet(through.address, 4.0)
-        yield client.ask(contact, "echo", 1)
+        client, contact, client_tunnel = await self.member(through)
+        await client.ask(contact, "echo", 1)
         Forwarder.is_stuck = True
         calls = task.LoopingCall(client_tunnel.send, b"there?", through.address)
         calls.start(0.2)
-        took = yield self.until(lambda: not client_tunnel.peers)
+        took = await self.until(lambda: not client_tunnel.peers)
         Forwarder.is_stuck = False
         calls.stop()
         self.assertLess(took, 12.0)
-        yield task.deferLater(REACTOR, 1.0)
-        again = yield client.greet(through.address, 4.0)
+        await task.deferLater(REACTOR, 1.0)
+        again = await client.greet(through.address, 4.0)
         self.assertEqual(again.public, contact.public)
         client.stop()
         server.stop()
-        yield task.deferLater(REACTOR, 0.2)
+        await task.deferLater(REACTOR, 0.2)
 
     def test_port_in_use(self) -> None:
         """A port that another program holds is refused in one line that names the setting and says what to do."""

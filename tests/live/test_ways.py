@@ -18,7 +18,7 @@ class WaysTests(PageCase):
         return page
 
     def test_tell_the_ways(self) -> None:
-        """Each way has its number, a word, how and since when; the worst of the others comes first, unmeasured last."""
+        """Each way has its number, a word, how and since when; of the others the worst is first; axe finds nothing."""
         page = self.looked(PHONE)
         rows = [item.inner_text().split("\n") for item in page.locator("#ways li").all()]
         self.assertEqual(
@@ -38,6 +38,7 @@ class WaysTests(PageCase):
             others, [["dog2 \N{EN DASH} dog1", "70 \N{EN DASH} fair"], ["dog2 \N{EN DASH} dog3", "measuring"]]
         )
         self.assertEqual(page.locator("#ways-line").inner_text(), "5 links: 1 poor, 2 fair. 1 did not answer.")
+        self.sound_by_day_and_night(page)
 
     def test_tell_who_was_turned_away(self) -> None:
         """What several tell of one refusal is one line, with who, by whom, why and the remedy."""
@@ -101,11 +102,3 @@ class WaysTests(PageCase):
         self.assertTrue(asks())
         self.view(page, "devices")
         self.assertFalse(asks())
-
-    def test_sound(self) -> None:
-        """On phone and desk, light and dark, axe finds nothing, and nothing is wider than the screen."""
-        for screen in (PHONE, DESK):
-            page = self.looked(screen)
-            page.locator("#ways-others summary").click()
-            self.sound_by_day_and_night(page)
-            page.context.close()

@@ -1,4 +1,4 @@
-"""Tests of ``sim.robots.camera`` and ``sim.robots.mesh``."""
+"""Tests of ``sim.robots.camera``."""
 
 from __future__ import annotations
 
@@ -45,11 +45,16 @@ class CameraTests(SynchronousTestCase):
         return red(self.camera.image(self.dog))
 
     def test_sees_no_red_without_a_target(self) -> None:
-        """Walls, floor, dogs and noise have nothing of target red, from anywhere and in any direction."""
-        for seed in range(12):
-            self.world.scatter(seed)
+        """Walls, floor, dogs and noise have nothing of target red, also nose to nose, in corners and against walls."""
+        for seed in range(20):
+            self.world.scatter(seed, clearance=0.25, from_walls=0.12)
             for dog in self.world.dogs.values():
-                self.assertEqual(int(red(self.camera.image(dog)).sum()), 0)
+                image = self.camera.image(dog)
+                self.assertEqual((image.shape, image.dtype), ((HEIGHT, WIDTH, 3), np.uint8))
+                self.assertGreater(float(image.std()), 1.0)
+                self.assertEqual(int(red(image).sum()), 0)
+            self.world.move_dog("dog1", 0.12, 0.12, Random(seed).uniform(-3.0, 3.0))
+            self.camera.image(self.dog)
 
     def test_shows_the_target_where_and_as_large_as_it_is(self) -> None:
         """Bearing and width of the red agree with the geometry to a pixel and a half, near and far."""
@@ -76,7 +81,7 @@ class CameraTests(SynchronousTestCase):
         self.assertGreater(int((self.mask() > 0).sum()), 0.7 * WIDTH * HEIGHT)
 
     def test_hides_the_target_behind_a_dog(self) -> None:
-        """A dog between eye and target hides it, whichever way the dog looks; beside the line it does not."""
+        """A dog between eye and target hides it, whichever way the dog looks; beside or behind it does not."""
         self.world.place_target(2.4, 1.2)
         plain = int((self.mask() > 0).sum())
         self.assertGreater(plain, 100)
@@ -85,9 +90,6 @@ class CameraTests(SynchronousTestCase):
             self.assertEqual(int((self.mask() > 0).sum()), 0, heading)
         self.world.move_dog("dog2", 1.2, 1.6, 0.0)
         self.assertGreater(int((self.mask() > 0).sum()), 0.9 * plain)
-
-    def test_shows_the_target_before_a_dog(self) -> None:
-        """A dog behind the target takes nothing away from it."""
         self.world.place_target(1.4, 1.2)
         plain = int((self.mask() > 0).sum())
         self.world.move_dog("dog2", 2.0, 1.2, 0.0)
@@ -104,23 +106,3 @@ class CameraTests(SynchronousTestCase):
             row = yellow[yellow.sum(axis=1).argmax()]
             self.assertEqual(int((np.diff(row.astype(int)) == 1).sum()) + int(row[0]), stripes, name)
             self.world.move_dog(name, 0.3, 0.3 if name == "dog2" else 2.1, 0.0)
-
-    def test_draws_anything_from_anywhere(self) -> None:
-        """Dogs nose to nose, in corners and against walls give pictures of the right size, not all one colour."""
-        for seed in range(20):
-            rng = Random(seed)
-            self.world.clear_target()
-            self.world.scatter(seed, clearance=0.25, from_walls=0.12)
-            for dog in self.world.dogs.values():
-                image = self.camera.image(dog)
-                self.assertEqual((image.shape, image.dtype), ((HEIGHT, WIDTH, 3), np.uint8))
-                self.assertGreater(float(image.std()), 1.0)
-            self.world.move_dog("dog1", 0.12, 0.12, rng.uniform(-3.0, 3.0))
-            self.camera.image(self.dog)
-
-    def test_repeats_for_a_seed(self) -> None:
-        """Cameras of one seed make the same JPEGs in turn; noise makes successive ones differ."""
-        other = Camera(Random(2), self.world)
-        first = [self.camera.jpeg(self.dog) for _ in range(8)]
-        self.assertEqual([other.jpeg(self.dog) for _ in range(8)], first)
-        self.assertGreater(len(set(first)), 1)

@@ -12,13 +12,10 @@ from twisted.internet.task import Clock
 from twisted.internet.testing import MemoryReactorClock
 from twisted.trial.unittest import SynchronousTestCase
 
-from drivers.aibo.driver import AiboDriver
-from drivers.driver import Permit
 from drivers.errors import UsageError
 from drivers.registry import describe
 from formats.jpeg import size_of
 from sim.robots.dog import LIMITS
-from sim.robots.emulator.aibo_dog import AiboEmulator
 from sim.robots.emulator.bittle import Bittle
 from sim.robots.emulator.body import MemoryBody
 from sim.robots.emulator.dog import DogBody
@@ -73,53 +70,26 @@ class DogBodyTests(YardCase):
             self.assertFalse(body.sense()["base.moving"])
             self.assertTrue(math.isfinite(self.yard.world.dogs["dog1"].x))
 
-    def test_feels_between_the_ticks(self) -> None:
-        """What is always felt is a number at any moment, also after the yard has told its samples."""
+    def test_senses(self) -> None:
+        """It feels at any moment, and by its bumper a wall ahead or beside; its eye sees in full or half size."""
         body = self.lent()
         self.pass_time(0.5)
         sensed = body.sense()
         for key in ("imu.ax", "imu.az", "odom.x", "power.level"):
             self.assertTrue(math.isfinite(float(sensed[key])), key)
-
-    def test_feels_what_it_bumps_into(self) -> None:
-        """A wall ahead presses both halves of the bumper, one beside it one of them, nothing none."""
-        body = self.lent()
-        self.pass_time(0.1)
-        self.assertEqual((body.sense()["bump.left"], body.sense()["bump.right"]), (False, False))
+        self.assertEqual((sensed["bump.left"], sensed["bump.right"]), (False, False))
         for heading, wanted in ((180.0, (True, True)), (135.0, (True, False)), (-135.0, (False, True))):
             self.yard.world.move_dog("dog1", 0.2, 1.2, math.radians(heading))
             body.drive(0.16, 0.0, 0.0)
             self.pass_time(1.5)
             sensed = body.sense()
             self.assertEqual((sensed["bump.left"], sensed["bump.right"]), wanted, str(heading))
-
-    def test_sees(self) -> None:
-        """Its eye gives a picture of the camera's own size, or of half of it."""
-        body = self.lent()
         self.assertEqual(size_of(body.picture() or b""), (208, 160))
         self.assertEqual(size_of(body.picture(True) or b""), (104, 80))
 
 
 class RobotsTests(YardCase):
     """The table of robots is checked, and each dog is reached in one way only."""
-
-    def test_driver_of_its_kind_moves_it(self) -> None:
-        """The driver of an AIBO walks a dog of the yard through Tekkotsu's ports."""
-        emulator = AiboEmulator(self.clock, self.yard.lend("dog1", LIMITS), Random(2))
-        emulator.start()
-        driver = AiboDriver({"host": "dog1"}, "dog1", emulator.connector(), self.clock)
-        driver.connect()
-        self.pass_time(3.0)
-        driver.enable()
-        self.pass_time(0.2)
-        before = self.yard.world.dogs["dog1"].x
-        driver.act({"base.vx": 0.16}, Permit(1, self.clock.seconds() + 1.0))
-        self.pass_time(2.0)
-        self.assertGreater(self.yard.world.dogs["dog1"].x - before, 0.08)
-        self.assertFalse(self.yard.world.dogs["dog1"].is_moving)
-        self.assertEqual(driver.diagnostics()["bad_frames"], 0)
-        driver.disconnect()
-        emulator.stop()
 
     def test_lent_dog_has_no_other_driver(self) -> None:
         """A driver of simulated dogs is told that this one is none of them any more."""

@@ -82,7 +82,7 @@ class RecordTests(SynchronousTestCase):
         self.assertEqual(list(json.loads(Path(out, "scale.json").read_text())["sizes"]), ["3"])
 
     def test_bad_input(self) -> None:
-        """Sizes that are none, and a file that is not ours, are refused by name."""
+        """Sizes that are none, a file that is not ours, and a folder that cannot be written are refused by name."""
         for text in ("", "many", "2", "3,1000000"):
             with self.assertRaisesRegex(BadSetting, "--nodes"):
                 scale(["--nodes", text, "--out", self.mktemp()], world())
@@ -96,8 +96,6 @@ class RecordTests(SynchronousTestCase):
             with self.assertRaisesRegex(BadSetting, "cannot be taken up"):
                 Record(path, SurveySettings()).read()
 
-    def test_a_folder_that_cannot_be_written(self) -> None:
-        """A folder that cannot be made, or where nothing can be written, is refused before anything is measured."""
         file, full = Path(self.mktemp()), Path(self.mktemp())
         file.touch()
         (full / "scale.new").mkdir(parents=True)
@@ -134,9 +132,7 @@ class PageTests(SynchronousTestCase):
         self.assertRegex(shown, r"Hops of a lookup \| hops \|.*\| 6.979 \|")
         self.assertRegex(shown, r"Processor of a node.* \| - \| 1 \| - \| \*\*1\*\* \| <= 0.5 \|  \|")
         self.assertIsNone(led(hops[:3]))
-
-    def test_targets_of_some_sizes(self) -> None:
-        """Where smaller teams are held to something else, the table says to what."""
+        # Where smaller teams are held to something else, the table says to what.
         shown = page(CURVES, {"auctions.agree.p95": [(n, 0.7) for n in (3, 100, 1000, 10_000)]})
         self.assertIn("| 0.7 | **0.7** | 0.7 | 0.7 | <= 1; <= 0.6 at 100, <= 0.8 at 1,000 |", shown)
 

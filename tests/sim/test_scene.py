@@ -40,13 +40,10 @@ class SceneTests(SynchronousTestCase):
         self.assertEqual((scene.width, scene.height), (3.0, 2.4))
 
     def test_reads_a_file(self) -> None:
-        """A name that ends in .json is a path; degrees become radians."""
+        """A name that ends in .json is a path, and degrees become radians; unknown names and paths are refused."""
         path = Path(self.mktemp() + ".json")
         path.write_text(json.dumps(self.fields))
         self.assertEqual(loaded(str(path)).kennels[0].heading, math.pi / 2)
-
-    def test_names_what_is_unknown(self) -> None:
-        """An unknown scene is answered with the known ones, a missing file with its path."""
         self.assertIn("known are three-dogs", str(self.assertRaises(SceneError, loaded, "four-cats")))
         self.assertIn("nowhere.json", str(self.assertRaises(SceneError, loaded, "nowhere.json")))
 
@@ -56,21 +53,12 @@ class SceneTests(SynchronousTestCase):
             self.assertIn("two.json", str(self.assertRaises(SceneError, parsed, text, "two.json")))
 
     def test_names_the_wrong_key(self) -> None:
-        """A missing or wrong field is refused with its key and lawful range."""
-        for key, value in (
-            ("width", 0),
-            ("height", "2"),
-            ("wall_height", None),
-            ("name", 7),
-            ("dogs", []),
-            ("target", 3),
-        ):
+        """A missing or wrong field, and dogs in a wall, in each other, or of one name are refused with the key."""
+        wrong = {"width": 0, "height": "2", "wall_height": None, "name": 7, "dogs": [], "target": 3}
+        for key, value in wrong.items():
             self.setUp()
             self.fields[key] = value
             self.assertIn(key, self.refusal())
-
-    def test_keeps_dogs_apart_and_inside(self) -> None:
-        """Dogs in a wall, in each other, or of one name are refused."""
         for key, value, words in (("x", 1.95, "x must be"), ("name", "a", "two dogs"), ("stripes", 9, "stripes")):
             self.setUp()
             self.fields["dogs"][1][key] = value  # type: ignore[index]

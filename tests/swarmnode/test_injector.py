@@ -11,8 +11,7 @@ from middleware.faults.injector import TRANSITIONS, State
 from middleware.faults.kinds import ASKED, CAUSE, KINDS, Fault
 from middleware.faults.takeover import TARGET_S, Takeover, acting
 from swarmnode.asker import Refusal
-from swarmnode.rehearsal import VirtualTeam
-from swarmnode.rehearsed import RehearsedStage
+from swarmnode.rehearsal import RehearsedStage, VirtualTeam
 
 
 class InjectorTests(SynchronousTestCase):

@@ -13,10 +13,9 @@ import struct
 import numpy as np
 
 from sim.robots.crowd.ground import Floats, Ground
-from sim.robots.crowd.neighbour import Neighbours
-from sim.robots.crowd.ray import Disc, Rays
+from sim.robots.crowd.ray import Disc, Neighbours, Rays
 from sim.robots.dog import ACCELERATION, ANGULAR_ACCELERATION, BRAKING, LIMITS
-from sim.robots.scene import FOOTPRINT, SceneError
+from sim.robots.scene import FOOTPRINT
 from sim.robots.world import TICK, NotPossible, Target
 
 RAYS = 8
@@ -41,9 +40,7 @@ class Crowd:
     felt in the newest step, ``wish`` what each is to do (forward, left, turn), ``ranges`` what each ray met.
     """
 
-    def __init__(self, seed: int, ground: Ground, rays: int = RAYS) -> None:
-        if type(rays) is not int or not 1 <= rays <= 360:
-            raise SceneError(f"rays must be a whole number from 1 to 360, not {rays!r}")
+    def __init__(self, seed: int, ground: Ground) -> None:
         self.ground = ground
         self.target: Target | None = None
         self.ticks = 0
@@ -53,7 +50,7 @@ class Crowd:
         self.vx, self.vy, self.wz = np.zeros(count), np.zeros(count), np.zeros(count)
         self.ax, self.ay = np.zeros(count), np.zeros(count)
         self.wish = np.zeros((count, 3))
-        self._rays = Rays(ground.width, ground.height, rays, REACH)
+        self._rays = Rays(ground.width, ground.height, RAYS, REACH)
         self._neighbours = Neighbours(CLOSE, SKIN)
         self.ranges = self.cast()
 

@@ -17,13 +17,13 @@ from sim.robots.lens import (
     HEIGHT,
     NEAR_PLANE,
     WIDTH,
+    Colour,
     Image,
     Room,
     View,
-    draw_cylinder,
+    draw_target,
     encoded,
 )
-from sim.robots.mesh import Colour
 from sim.robots.scene import FOOTPRINT
 
 CLEAR = 4.0
@@ -64,7 +64,7 @@ class Eyes:
         behind = int((others > target_at).sum())
         _draw(image, drums[:behind])
         if target is not None:
-            draw_cylinder(image, view, target.x, target.y, target.radius, target.height)
+            draw_target(image, view, target.x, target.y, target.radius, target.height)
         _draw(image, drums[behind:])
         return self._room.noisy(image)
 

@@ -1,4 +1,4 @@
-"""Rays: how far it is from every robot to whatever stands around it, all rays of all robots at once."""
+"""Rays: how far it is from every robot to whatever stands around it, and which robots are near each other."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sim.robots.crowd.ground import Floats
-from sim.robots.crowd.neighbour import Neighbours, Places
 from sim.robots.scene import FOOTPRINT
 
+Places = NDArray[np.int64]
 SKIN = 0.3
 Disc = tuple[float, float, float]
 """Something round that stands still: x, y and radius in metres."""
@@ -23,14 +24,13 @@ class Rays:
     not with the number of rays.
     """
 
-    def __init__(self, width: float, height: float, count: int, reach: float, radius: float = FOOTPRINT) -> None:
+    def __init__(self, width: float, height: float, count: int, reach: float) -> None:
         self._width = width
         self._height = height
         self._count = count
         self._reach = reach
-        self._radius = radius
         self._between = math.tau / count
-        self._neighbours = Neighbours(reach + radius, SKIN)
+        self._neighbours = Neighbours(reach + FOOTPRINT, SKIN)
 
     def cast(self, x: Floats, y: Floats, heading: Floats, discs: Sequence[Disc] = ()) -> Floats:
         """Metres along each ray, a row for each robot, counter-clockwise; ``reach`` where nothing is met."""
@@ -39,7 +39,7 @@ class Rays:
         one, other = self._neighbours.pairs(x, y)
         dx, dy = x[other] - x[one], y[other] - y[one]
         square = dx * dx + dy * dy
-        is_near = np.flatnonzero(square < (self._reach + self._radius) ** 2)
+        is_near = np.flatnonzero(square < (self._reach + FOOTPRINT) ** 2)
         one, other = one[is_near], other[is_near]
         distance, towards = np.sqrt(square[is_near]), np.arctan2(dy[is_near], dx[is_near])
         # What one sees of the other, the other sees of the one in the opposite direction.
@@ -48,7 +48,7 @@ class Rays:
             np.concatenate((one, other)),
             np.concatenate((towards - heading[one], towards + math.pi - heading[other])),
             np.concatenate((distance, distance)),
-            self._radius,
+            FOOTPRINT,
         )
         for disc_x, disc_y, radius in discs:
             dx, dy = disc_x - x, disc_y - y
@@ -90,3 +90,51 @@ class Rays:
             across = np.where(cos > 0.0, self._width - x, x) / np.abs(cos)
             up = np.where(sin > 0.0, self._height - y, y) / np.abs(sin)
         ranges[close] = np.minimum(ranges[close], np.minimum(across, up))
+
+
+class Neighbours:
+    """The pairs of bodies whose middles are within ``reach`` metres of each other.
+
+    They are looked for ``skin`` metres farther, so that the list holds until somebody has gone half of that: a search
+    in cells of the whole yard becomes one in some dozens of steps.
+    """
+
+    def __init__(self, reach: float, skin: float) -> None:
+        self._reach = reach
+        self._skin = skin
+        self._found: tuple[Floats, Floats, Places, Places] | None = None
+
+    def pairs(self, x: Floats, y: Floats) -> tuple[Places, Places]:
+        """Each pair once, as two rows of numbers of bodies; some of them may be farther apart than ``reach``."""
+        if self._found is not None:
+            then_x, then_y, one, other = self._found
+            gone = (x - then_x) ** 2 + (y - then_y) ** 2
+            if gone.max() <= (self._skin / 2) ** 2:
+                return one, other
+        one, other = near(x, y, self._reach + self._skin)
+        self._found = x.copy(), y.copy(), one, other
+        return one, other
+
+
+def near(x: Floats, y: Floats, reach: float) -> tuple[Places, Places]:
+    """The pairs within ``reach``, each once."""
+    # Sorted by cells of that size, whoever may be near lies in two runs: the rest of its own cell with the next one
+    # above, and the three cells beside those in the next column.
+    column = np.floor(x / reach).astype(np.int64)
+    row = np.floor(y / reach).astype(np.int64)
+    rows = int(row.max()) + 3
+    key = column * rows + row
+    order = np.argsort(key, kind="stable")
+    key = key[order]
+    here = np.arange(len(key))
+    ones, others = [], []
+    for first, end in (
+        (here + 1, np.searchsorted(key, key + 1, "right")),
+        (np.searchsorted(key, key + rows - 1, "left"), np.searchsorted(key, key + rows + 1, "right")),
+    ):
+        count = end - first
+        ones.append(np.repeat(here, count))
+        others.append(np.arange(int(count.sum())) + np.repeat(first - np.cumsum(count) + count, count))
+    one, other = order[np.concatenate(ones)], order[np.concatenate(others)]
+    is_near = (x[other] - x[one]) ** 2 + (y[other] - y[one]) ** 2 <= reach * reach
+    return one[is_near], other[is_near]

@@ -9,7 +9,7 @@ import numpy as np
 from twisted.trial.unittest import SynchronousTestCase
 
 from sim.robots.crowd.controller import CONTROLLERS, Senses
-from sim.robots.crowd.crowd import RAYS, Crowd
+from sim.robots.crowd.crowd import Crowd
 from sim.robots.crowd.ground import CELL, MAX_BODIES, Ground, roomy
 from sim.robots.scene import FOOTPRINT, Kennel, Scene, SceneError
 from sim.robots.world import SUBSTEP, TICK, NotPossible, World
@@ -94,13 +94,6 @@ class CrowdTests(SynchronousTestCase):
         crowd.place_target_at_random()
         full = Crowd(1, Ground(121, 11 * CELL, 11 * CELL))
         self.assertRaises(NotPossible, full.place_target_at_random)
-
-    def test_rays_are_counted(self) -> None:
-        """Each robot has the rays that were asked for; what is no number of rays is refused."""
-        self.assertEqual(Crowd(1, roomy(5)).ranges.shape, (5, RAYS))
-        self.assertEqual(Crowd(1, roomy(5), 24).ranges.shape, (5, 24))
-        for rays in (0, 361, 1.5, True):
-            self.assertRaises(SceneError, Crowd, 1, roomy(5), rays)
 
 
 class GroundTests(SynchronousTestCase):
@@ -192,11 +185,3 @@ class ControllerTests(SynchronousTestCase):
         self.assertAlmostEqual(float(distance[0]), 1.0)
         self.assertAlmostEqual(float(bearing[4]), 0.2)
         self.assertTrue(np.isnan(Senses(Crowd(1, roomy(3))).sight()[0]).all())
-
-    def test_senses_of_some(self) -> None:
-        """A controller of those from a number on gets their rows and no others, and answers with as many."""
-        crowd = Crowd(1, roomy(10))
-        crowd.place_target_at_random()
-        for controller in CONTROLLERS.values():
-            self.assertEqual(controller(Senses(crowd, 4)).shape, (6, 3))
-        self.assertEqual(Senses(crowd, 4).number.tolist(), [4, 5, 6, 7, 8, 9])

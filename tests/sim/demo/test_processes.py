@@ -77,15 +77,11 @@ class TeamTests(SynchronousTestCase):
         self.addCleanup(team.stop)
         return team, reactor
 
-    def test_processes_start_on_a_leash(self) -> None:
-        """Each process runs under this Python, on a leash, and has its id."""
+    def test_processes_start_on_a_leash_and_are_heard(self) -> None:
+        """Each process runs on a leash and has its id; its lines arrive at the listener, in its log and in its tail."""
         team, reactor = self.team()
         self.assertEqual(reactor.started[0].arguments, on_leash(["-m", "x"]))
         self.assertEqual((team.pid("dog1"), team.pid("dog2"), team.missing()), (100, 101, []))
-
-    def test_lines_are_logged_under_the_name(self) -> None:
-        """What a process writes arrives line by line at the listener, in its log file and in its tail."""
-        team, reactor = self.team()
         reactor.started[0].write_line(b"one\ntw")
         reactor.started[0].write_line(b"o\n")
         self.assertEqual(self.said, [("dog1", "one"), ("dog1", "two")])
@@ -97,19 +93,14 @@ class TeamTests(SynchronousTestCase):
         team, reactor = self.team()
         reactor.advance(100.0)
         team.kill("dog1")
+        for name in ("dog1", "cat1"):
+            self.assertRaises(KeyError, team.kill, name)
         reactor.advance(0.0)
         self.assertEqual((reactor.started[0].signals, team.missing()), (["KILL"], ["dog1"]))
         reactor.advance(RESTART_S - 0.1)
         self.assertIsNone(team.pid("dog1"))
         reactor.advance(0.2)
         self.assertEqual((team.pid("dog1"), team.pid("dog2")), (102, 101))
-
-    def test_process_that_is_away_cannot_be_killed(self) -> None:
-        """To kill what does not run, or is unknown, is the caller's mistake."""
-        team, _ = self.team()
-        team.kill("dog1")
-        self.assertRaises(KeyError, team.kill, "dog1")
-        self.assertRaises(KeyError, team.kill, "cat1")
 
     def test_stop_ends_all_and_starts_none(self) -> None:
         """After ``stop`` no process runs, none comes back, and no timer is left; a second call is answered too."""

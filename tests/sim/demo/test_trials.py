@@ -81,30 +81,18 @@ class TrialTests(SynchronousTestCase):
         self.assertEqual((outcome.by, outcome.killed, outcome.digest), ("dog1", "", "digest 2"))
 
     def test_second_experiment_loses_the_dog_on_its_way(self) -> None:
-        """In experiment 2 the dog that approaches is killed once, and the time until another moves is noted."""
-        outcome = trial(PlayedTeam, 2, 2)
+        """In experiment 2 the dog on its way is killed once, the takeover is timed, and each phase drawn as a PNG."""
+        folder = Path(self.mktemp())
+        folder.mkdir()
+        outcome = trial(PlayedTeam, 2, 2, folder)
         self.assertEqual((outcome.killed, outcome.by, outcome.broken), ("dog1", "dog2", []))
         assert outcome.takeover is not None
         self.assertLess(outcome.takeover, 0.1)
-
-    def test_trial_that_never_ends_is_broken(self) -> None:
-        """A task that is never done ends after the limit, and says what was not so."""
-        outcome = trial(PlayedTeam, 1, 1)
-        self.assertFalse(outcome.held)
-        self.assertTrue(any("task completed" in what for what in outcome.broken))
-
-    def test_pictures_of_each_phase_are_drawn(self) -> None:
-        """With a folder each phase is drawn once, as a PNG."""
-        folder = Path(self.mktemp())
-        folder.mkdir()
-        trial(PlayedTeam, 2, 2, folder)
         names = sorted(path.name.removeprefix("experiment2-seed2-") for path in folder.iterdir())
         wanted = ("1-without-target", "2-with-target", "3-found", "4-approach", "5-lost", "6-reached")
         self.assertEqual(names, [f"{phase}.png" for phase in wanted])
         self.assertTrue(all(path.read_bytes()[:4] == b"\x89PNG" for path in folder.iterdir()))
 
-
-class TableTests(SynchronousTestCase):
     def test_percentile_is_a_value_that_was(self) -> None:
         """The percentile is the smallest value that the share does not exceed; it invents none."""
         values = [5.0, 1.0, 4.0, 2.0, 3.0]
@@ -120,8 +108,6 @@ class TableTests(SynchronousTestCase):
         self.assertEqual(lines[1][7:], ["2.00", "(3.00)", "2.00", "(2.00)", "10.00", "(10.00)", "-"])
         self.assertEqual(lines[2], ["experiment", "2", "1", "0", "0", "0", "0", "-", "-", "-", "1.25", "(1.25)"])
 
-
-class MainTests(SynchronousTestCase):
     def run_main(self, *words: str) -> tuple[int, str, Path]:
         """The command with a folder of its own; code, output and folder."""
         folder = Path(self.mktemp())
@@ -130,8 +116,8 @@ class MainTests(SynchronousTestCase):
             code = main([*words, "--jobs", "1", "--out", str(folder)], PlayedTeam)
         return code, output.getvalue(), folder
 
-    def test_all_held_is_success(self) -> None:
-        """When every trial held the code is 0; progress, table and report are there, and the report has each trial."""
+    def test_exit_code(self) -> None:
+        """Where every trial held the code is 0 and the report has each; else it is 1 and the line says what failed."""
         code, output, folder = self.run_main("--count", "1", "--seed", "2")
         self.assertEqual(code, 0, output)
         self.assertIn("   1/2 ok   experiment 1 seed 2: dog1 reached it", output)
@@ -139,9 +125,6 @@ class MainTests(SynchronousTestCase):
         rows = json.loads((folder / "trials.json").read_text(encoding="utf-8"))
         self.assertEqual([(row["experiment"], row["held"]) for row in rows], [(1, True), (2, True)])
         self.assertTrue(list(folder.glob("*.png")))
-
-    def test_one_that_did_not_hold_is_failure(self) -> None:
-        """When one trial did not hold the code is 1, and its line says what was not so."""
         code, output, _ = self.run_main("--count", "1", "--seed", "1", "--pictures", "0")
         self.assertEqual(code, 1)
         self.assertIn("1/2 FAIL experiment 1 seed 1: nobody reached it  (task completed (", output)

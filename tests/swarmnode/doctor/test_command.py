@@ -69,14 +69,11 @@ class CommandTests(SynchronousTestCase):
             code = main(words, out, self.ask, self.measure)
         return code, out.getvalue(), errors.getvalue()
 
-    def test_well(self) -> None:
-        """Where nothing is wrong it says so, with code 0."""
+    def test_exit_code(self) -> None:
+        """Where nothing is wrong it says so, with code 0; a finding has its reason and remedy, with code 1."""
         code, printed, _ = self.run_it(str(self.settings))
         self.assertEqual((code, printed), (0, "nothing is wrong that can be seen while the node is off\n"))
         self.assertEqual(self.measured, [("dog1", False, None)])
-
-    def test_ill(self) -> None:
-        """A finding is printed with its reason and remedy, with code 1."""
         self.facts = replace(WELL, open_files=(("dog1.toml", 0o644),))
         code, printed, _ = self.run_it(str(self.settings))
         self.assertEqual(code, 1)
@@ -109,14 +106,11 @@ class CommandTests(SynchronousTestCase):
         self.assertEqual((read["findings"][0]["cause"], read["findings"][0]["weight"]), ("key-readable", "error"))
         self.assertEqual([each["score"] for each in read["links"]], [100, 0])
 
-    def test_nobody_to_ask(self) -> None:
-        """Without settings and without a running node it says what to give, with code 2."""
+    def test_refusals(self) -> None:
+        """Neither settings nor a running node, and settings that a node would refuse, are one line and code 2."""
         code, _, complaint = self.run_it()
         self.assertEqual(code, 2)
         self.assertIn("swarm doctor SETTINGS", complaint)
-
-    def test_bad_settings(self) -> None:
-        """Settings that a node would refuse are refused in one line, with code 2."""
         self.settings.write_text("[node]\nport = 1\n", encoding="utf-8")
         code, _, complaint = self.run_it(str(self.settings))
         self.assertEqual((code, complaint.count("\n")), (2, 1))

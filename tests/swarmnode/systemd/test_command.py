@@ -9,6 +9,7 @@ import shutil
 import stat
 import subprocess
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from twisted.trial.unittest import SkipTest, SynchronousTestCase
@@ -38,6 +39,7 @@ class UnitTests(SynchronousTestCase):
             "NoNewPrivileges=yes",
             "CapabilityBoundingSet=",
             "PrivateDevices=yes",
+            "ProtectHome=yes",
             "StateDirectory=swarm-node-dog1",
             "MemoryMax=256M",
             "SystemCallFilter=@system-service",
@@ -46,29 +48,22 @@ class UnitTests(SynchronousTestCase):
         ):
             self.assertIn(line, lines)
 
-    def test_a_robot_on_a_cable_is_let_through(self) -> None:
-        """The device that the driver's settings name may be used, and no other."""
-        lines = unit(driver={"kind": "create2", "options": {"port": "/dev/ttyUSB0"}}).text.splitlines()
-        self.assertIn("DeviceAllow=/dev/ttyUSB0 rw", lines)
-        self.assertIn("DevicePolicy=closed", lines)
-        self.assertNotIn("PrivateDevices=yes", lines)
-
-    def test_a_low_port_takes_its_one_capability(self) -> None:
-        """A page at port 443 takes the right to listen there, and nothing else."""
-        lines = unit({"roles": ["web"]}, web={"tls": "auto", "tls_port": 443}).text.splitlines()
-        self.assertIn("AmbientCapabilities=CAP_NET_BIND_SERVICE", lines)
-
-    def test_a_python_in_a_home_can_be_read(self) -> None:
-        """Homes are hidden, but where the program or the Python behind its environment lies in one."""
-        self.assertIn("ProtectHome=yes", unit().text.splitlines())
-        settings = Settings.from_mapping({"node": {"name": "dog1"}}, "/a.toml")
-        for twistd, python in (
-            ("/home/ann/env/bin/twistd", "/usr/bin/python3"),
-            (PROGRAM, "/home/ann/.pyenv/bin/python3"),
-            (PROGRAM, "/root/.local/share/uv/python3"),
+    def test_what_the_settings_need_is_let_through(self) -> None:
+        """The device of a driver, the right to a low port, and a Python in a home may be used, and nothing else."""
+        robot = unit(driver={"kind": "create2", "options": {"port": "/dev/ttyUSB0"}})
+        low = unit({"roles": ["web"]}, web={"tls": "auto", "tls_port": 443})
+        homes = [
+            replace(unit(), twistd="/home/ann/env/bin/twistd"),
+            replace(unit(), interpreter="/root/.local/share/uv/python3"),
+        ]
+        for made, line, other in (
+            (robot, "DeviceAllow=/dev/ttyUSB0 rw", "PrivateDevices=yes"),
+            (robot, "DevicePolicy=closed", "PrivateDevices=yes"),
+            (low, "AmbientCapabilities=CAP_NET_BIND_SERVICE", "AmbientCapabilities="),
+            *((each, "ProtectHome=read-only", "ProtectHome=yes") for each in homes),
         ):
-            lines = unit_for(settings, twistd, is_user=False, interpreter=python).text.splitlines()
-            self.assertIn("ProtectHome=read-only", lines)
+            lines = made.text.splitlines()
+            self.assertEqual((line in lines, other in lines), (True, False), line)
 
     def test_names_cannot_add_lines(self) -> None:
         """Spaces, quotes and percent signs of a path stay in their place."""
@@ -153,20 +148,17 @@ class CommandTests(SynchronousTestCase):
         self.assertEqual((self.state / "dog1.sqlite").read_bytes(), b"newer")
         self.assertIn("kind", (self.state / "node.toml").read_text(encoding="utf-8"))
 
-    def test_a_store_elsewhere_is_refused(self) -> None:
-        """A store outside of the settings' folder could not be written by the service, so nothing is installed."""
-        self.settings.write_text('[node]\nname = "dog1"\nstore = "/srv/dog1.sqlite"\n', encoding="utf-8")
-        code, _, complaint = self.install()
-        self.assertEqual(code, 2)
-        self.assertIn("/srv/dog1.sqlite lies outside", complaint)
-        self.assertFalse(self.unit.exists())
-
-    def test_refused_settings_are_said_in_one_line(self) -> None:
-        """Settings that a node would refuse are refused here, with the line to mend."""
-        self.settings.write_text("[node]\n", encoding="utf-8")
-        code, _, complaint = self.run_it("show", str(self.settings))
-        self.assertEqual(code, 2)
-        self.assertIn("[node] name: is missing", complaint)
+    def test_refused_settings(self) -> None:
+        """A store outside of the settings' folder, and settings that a node would refuse, are refused by name."""
+        for text, words in (
+            ('[node]\nname = "dog1"\nstore = "/srv/dog1.sqlite"\n', "/srv/dog1.sqlite lies outside"),
+            ("[node]\n", "[node] name: is missing"),
+        ):
+            self.settings.write_text(text, encoding="utf-8")
+            code, _, complaint = self.install()
+            self.assertEqual(code, 2)
+            self.assertIn(words, complaint)
+            self.assertFalse(self.unit.exists())
 
     def test_a_program_that_the_service_could_not_run_is_refused(self) -> None:
         """A program in somebody's closed home is refused with the folder and the remedy."""
@@ -193,15 +185,12 @@ class CommandTests(SynchronousTestCase):
         self.assertFalse(self.unit.exists())
         self.assertTrue((self.state / "node.toml").exists())
 
-    def test_what_is_not_there_is_neither_restarted_nor_removed(self) -> None:
-        """A name of no service is refused, and systemd is told nothing."""
+    def test_refusals_of_restart_and_systemd(self) -> None:
+        """A name of no service is refused, systemd told nothing; what systemd refuses is code 1 and where to read."""
         for verb in ("restart", "remove"):
             code, _, complaint = self.run_it(verb, "cat")
             self.assertEqual((code, self.told), (2, []))
             self.assertIn("swarm-node-cat.service is not there", complaint)
-
-    def test_systemd_refuses(self) -> None:
-        """What systemd refuses ends with code 1 and where to read why."""
         self.codes["restart"] = 1
         code, _, complaint = self.install()
         self.assertEqual(code, 1)

@@ -1,6 +1,6 @@
 """Real nodes on one host of the internet of network namespaces (``sim.namespaces``), ordered by JSON lines.
 
-``python -m swarmnode.trial_host``.  A trial is a team of its own, so many can run beside each other in one process.
+``python -m benchmarks.nat.child``.  A trial is a team of its own, so many can run beside each other in one process.
 What is measured of a node is the node's own doing: the first moment at which it asks a peer anything, and the first
 answer that it gets.
 """
@@ -229,9 +229,8 @@ class Computer:
         member.call(public, done, order["limit_s"])
 
     def _do_path(self, order: Order) -> None:
-        """How peers are reached now."""
-        member = self._members[order["trial"]]
-        self._answer(order, paths=[member.path(bytes.fromhex(peer)) for peer in order["peers"]])
+        """How a peer is reached now."""
+        self._answer(order, path=self._members[order["trial"]].path(bytes.fromhex(order["peer"])))
 
     def _do_stop(self, order: Order) -> None:
         """End nodes without a word."""

@@ -10,13 +10,12 @@ from dataclasses import dataclass
 from random import Random
 from typing import Any
 
-from middleware.config.settings import NodeSettings
+from benchmarks.nat.hosts import Hosts
+from benchmarks.nat.outcome import ALONE, FORGOTTEN, HOME, IDLE, LEAKY, LOSS, MATRIX, MOVED, PLAIN, RENUMBERED, Outcome
+from benchmarks.remote import Lost
 from middleware.entangled.identity import Identity
-from sim.namespaces.hosts import Hosts
 from sim.namespaces.internet import PUB, PUBS, Internet, Site
 from sim.namespaces.kind import Kind
-from sim.namespaces.outcome import ALONE, FORGOTTEN, HOME, IDLE, LEAKY, LOSS, MATRIX, MOVED, PLAIN, RENUMBERED, Outcome
-from sim.namespaces.remote import Lost
 
 JOIN_S, LOSSY_JOIN_S = 6.0, 20.0
 MEET_S, LOSSY_MEET_S = 6.0, 10.0
@@ -27,8 +26,6 @@ LOST_PERCENT = 30.0
 SHORT_S = 20
 HOMES = (Kind.FULL, Kind.PORT, Kind.SYM)
 """Kinds of which a router has two hosts behind it."""
-KNOBS = {"tunnel_port", "tunnels", "lan"} & set(NodeSettings.__dataclass_fields__)
-"""Settings that are used where the nodes have them."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +112,7 @@ class Trial:
                 self.outcome.joined_s.append(answer["joined_s"])
             met = await asyncio.gather(*(self._ask("meet", host, meet_s) for host in self.order))
             self.outcome.took_s = [answer["took_s"] for answer in met]
-            self.outcome.path = self._path([answer["path"] for answer in met], await self._bootstrap_paths())
+            self.outcome.path = await self._found([answer["path"] for answer in met])
         except Lost as error:
             self.outcome.trouble = str(error)
 
@@ -126,7 +123,7 @@ class Trial:
         try:
             answer = await self._ask("call", host, BACK_S)
             outcome.took_s = [answer["took_s"]]
-            outcome.path = self._path([answer["path"]], await self._bootstrap_paths())
+            outcome.path = await self._found([answer["path"]])
         except Lost as error:
             outcome.trouble = str(error)
         return outcome
@@ -134,10 +131,7 @@ class Trial:
     async def look(self) -> None:
         """Take note how they reach each other by now."""
         try:
-            paths = []
-            for host in self.order:
-                paths += (await self._fleet[host].order("path", trial=self._name, peers=[self._other(host)]))["paths"]
-            self.outcome.later = self._path(paths, await self._bootstrap_paths())
+            self.outcome.later = await self._found([await self._path(host, self._other(host)) for host in self.order])
         except Lost as error:
             self.outcome.trouble = str(error)
 
@@ -152,15 +146,12 @@ class Trial:
     async def _ask(self, do: str, host: str, limit_s: float) -> dict[str, Any]:
         return await self._fleet[host].order(do, limit_s, trial=self._name, peer=self._other(host))
 
-    async def _bootstrap_paths(self) -> list[str]:
-        paths = []
-        for host in self.order:
-            asked = self._fleet[host].order("path", trial=self._name, peers=[self._publics[PUB]])
-            paths += (await asked)["paths"]
-        return paths
+    async def _path(self, host: str, peer: str) -> str:
+        return str((await self._fleet[host].order("path", trial=self._name, peer=peer))["path"])
 
-    def _path(self, between: Sequence[str], to_bootstrap: Sequence[str]) -> str:
+    async def _found(self, between: Sequence[str]) -> str:
         """The worse of the two directions; a relayed one whose first hop is a tunnel is one by tunnel."""
+        to_bootstrap = [await self._path(host, self._publics[PUB]) for host in self.order]
         if "" in between:
             return ""  # one of them never had an answer
         if any(path != "direct" for path in between):
@@ -172,15 +163,12 @@ class Trial:
         # Who will be elsewhere listens at whatever address it has.
         address = "*" if host in ROAMERS else self._fleet.net.address(host)
         node: dict[str, Any] = {"name": self._name, "host": address, "port": 0, "team_key": self._key}
-        node["known_nodes"] = known
-        more: dict[str, Any] = {"lan": False}
+        node |= {"known_nodes": known, "lan": False}
         if host == PUB:
-            node["roles"] = ["bootstrap"]
-            more["tunnel_port"] = tunnel_port
+            node |= {"roles": ["bootstrap"], "tunnel_port": tunnel_port}
         else:
-            more["tunnels"] = [f"wss://{PUBS[0]}:{tunnel_port}"]
-        node |= {name: value for name, value in more.items() if name in KNOBS}
-        sought = [public for other, public in self._publics.items() if other not in (host, PUB)] if known else []
+            node |= {"tunnels": [f"wss://{PUBS[0]}:{tunnel_port}"]}
+        sought = [self._other(host)] if known else []
         order = {"trial": self._name, "node": node, "seed": self._seeds[host].hex(), "sought": sought}
         return await self._fleet[host].order("start", limit_s, **order)
 
@@ -231,8 +219,8 @@ class Matrix:
         trials = [Trial(self._fleet, pair, next(self._numbers), self._rng) for pair in pairs]
         await asyncio.gather(*(trial.run(join_s, meet_s) for trial in trials))
         await asyncio.gather(*(trial.look() for trial in trials if not trial.outcome.trouble))
-        there = sum(not trial.outcome.trouble and None not in trial.outcome.took_s for trial in trials)
-        self._tell(f"{pairs[0].part}: {there} of {len(trials)} pairs have met")
+        there = [trial.outcome for trial in trials if not trial.outcome.trouble]
+        self._tell(f"{pairs[0].part}: {_answered(there)} of {len(trials)} pairs have met")
         return trials
 
     async def _lost_mappings(self, trials: Sequence[Trial]) -> None:
@@ -243,14 +231,14 @@ class Matrix:
         found = await asyncio.gather(*(trial.again(ALONE, 0) for trial in direct))
         self._net.heal(PUB)
         self.outcomes += found
-        self._tell(f"{ALONE}: {sum(None not in one.took_s for one in found)} of {len(direct)} direct pairs go on")
+        self._tell(f"{ALONE}: {_answered(found)} of {len(direct)} direct pairs go on")
         routers = [name for name, site in self._net.sites.items() if site.kind is not Kind.NONE and name != "short"]
         for part, first, change in ((FORGOTTEN, 0, self._net.forget), (RENUMBERED, 1, self._net.renumber)):
             for name in routers:
                 change(name)
             found = await asyncio.gather(*(trial.again(part, first) for trial in met))
             self.outcomes += found
-            self._tell(f"{part}: {sum(None not in one.took_s for one in found)} of {len(found)} pairs are back")
+            self._tell(f"{part}: {_answered(found)} of {len(found)} pairs are back")
 
     async def _moved(self) -> None:
         """Carry hosts to another network; see whether both sides reach each other again."""
@@ -258,9 +246,9 @@ class Matrix:
         for trial in trials:
             self._net.move(trial.pair.host_a, "phone")
         both = [trial.again(MOVED, first) for trial in trials for first in (0, 1)]
-        self.outcomes += await asyncio.gather(*both)
-        back = sum(None not in one.took_s for one in self.outcomes if one.part == MOVED)
-        self._tell(f"{MOVED}: {back} of {len(both)} sides are back")
+        found = await asyncio.gather(*both)
+        self.outcomes += found
+        self._tell(f"{MOVED}: {_answered(found)} of {len(found)} sides are back")
         await self._end(trials)
 
     async def _end(self, trials: Sequence[Trial]) -> None:
@@ -268,3 +256,8 @@ class Matrix:
 
     def _tell(self, line: str) -> None:
         self._say(f"{time.monotonic() - self._born:6.1f} s  {line}")
+
+
+def _answered(outcomes: Sequence[Outcome]) -> int:
+    """Of how many trials both sides got an answer."""
+    return sum(None not in one.took_s for one in outcomes)

@@ -1,4 +1,4 @@
-"""The computers of an internet of network namespaces, and the orders that they take."""
+"""Hosts: the computers of an internet of network namespaces, and the orders that they take."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from benchmarks.remote import Lost, Remote, Unable
 from sim.namespaces.internet import ROOT, Internet
-from sim.namespaces.remote import Lost, Remote, Unable
 from sim.namespaces.room import environment
 
 SPAWN_S = 60.0
@@ -56,7 +56,7 @@ class Hosts:
 
     async def _spawn(self, host: str) -> Computer:
         said, pipe = self._folder / f"{host}.errors", asyncio.subprocess.PIPE
-        command = self.net.command(host, [sys.executable, "-m", "swarmnode.trial_host"])
+        command = self.net.command(host, [sys.executable, "-m", "benchmarks.nat.child"])
         with said.open("wb") as errors:
             # In a session of its own: what is typed at the terminal is for the one who ends it.
             process = await asyncio.create_subprocess_exec(

@@ -17,33 +17,21 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
+from benchmarks.nat.outcome import PLAIN, Outcome, promises
+from benchmarks.nat.report import drawn, table, written
+from sim.demo.stage import say
+from sim.demo.trials import whole
 from sim.namespaces.internet import Internet
-from sim.namespaces.outcome import PLAIN, Outcome, promises
-from sim.namespaces.picture import drawn
-from sim.namespaces.report import table, written
 from sim.namespaces.room import refusal
 
 DOCUMENT = Path("docs/nat.md")
 PICTURE = "images/nat.svg"
 
 
-def whole(word: str) -> int:
-    """A number that is not negative, from the command line."""
-    if not (word.isdecimal() and len(word) <= 6):
-        raise argparse.ArgumentTypeError(f"must be a whole number from 0 on, is {word!r}")
-    return int(word)
-
-
-def say(line: str) -> None:
-    """Tell the person who waits."""
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
-
-
 async def run(count: int, lossy: int, seed: int) -> list[Outcome]:
     """The whole matrix; ends well on SIGTERM, too."""
-    from sim.namespaces.hosts import Hosts
-    from sim.namespaces.matrix import Matrix, sites
+    from benchmarks.nat.hosts import Hosts
+    from benchmarks.nat.matrix import Matrix, sites
 
     task = asyncio.current_task()
     assert task is not None
@@ -59,7 +47,7 @@ async def run(count: int, lossy: int, seed: int) -> list[Outcome]:
 
 def main(arguments: Sequence[str] = tuple(sys.argv[1:])) -> int:
     """The command line."""
-    parser = argparse.ArgumentParser(prog="python -m sim.namespaces", description="Who reaches whom behind routers.")
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.nat", description="Who reaches whom behind routers.")
     parser.add_argument("--count", type=whole, default=5, help="rounds of every pair (%(default)s)")
     parser.add_argument("--lossy", type=whole, default=4, help="rounds with 30 %% lost (%(default)s)")
     parser.add_argument("--seed", type=int, default=1, help="seed of losses and keys (%(default)s)")

@@ -1,16 +1,13 @@
-"""What ``sim.namespaces`` makes of its trials: promises, table, document and picture; nothing is run."""
+"""What ``benchmarks.nat`` makes of its trials: promises, table, document and picture; nothing is run."""
 
 from __future__ import annotations
 
-import math
-
 from twisted.trial.unittest import SynchronousTestCase
 
+from benchmarks.nat.matrix import plain_pairs, sites, special_pairs
+from benchmarks.nat.outcome import LOSS, MATRIX, PLAIN, Outcome, cell, is_punchable, promises
+from benchmarks.nat.report import BEGIN, END, drawn, table, written
 from sim.namespaces.kind import Kind
-from sim.namespaces.matrix import plain_pairs, sites, special_pairs
-from sim.namespaces.outcome import LOSS, MATRIX, PLAIN, Outcome, cell, is_punchable, percentile, promises
-from sim.namespaces.picture import drawn
-from sim.namespaces.report import BEGIN, END, table, written
 
 
 def good(part: str = PLAIN) -> list[Outcome]:
@@ -30,11 +27,6 @@ class OutcomeTests(SynchronousTestCase):
         self.assertEqual(len(pairs), 15)
         closed = [(a.value, b.value) for a, b in pairs if not is_punchable(a, b)]
         self.assertEqual(closed, [("port", "sym"), ("sym", "sym")])
-
-    def test_the_slower_side_counts(self) -> None:
-        """A pair needs as long as the slower of the two, and for ever where one never got an answer."""
-        self.assertEqual(Outcome(PLAIN, "none", "none", [0.1, 0.4]).seconds, 0.4)
-        self.assertEqual(Outcome(PLAIN, "none", "none", [0.1, None]).seconds, math.inf)
 
     def test_a_good_round_keeps_every_promise(self) -> None:
         """With all as it should be nothing is broken; with what can be punched relayed, or slow, something is."""
@@ -62,9 +54,8 @@ class OutcomeTests(SynchronousTestCase):
             outcome.took_s = [None, None]
         self.assertEqual([one.is_kept for one in promises(blocked)], [False, True, False])
 
-    def test_percentile_and_cell(self) -> None:
-        """A percentile is one of the values; a cell names ways, median, worst, and how many failed."""
-        self.assertEqual(percentile([3.0, 1.0, 2.0, 4.0], 0.5), 2.0)
+    def test_cell(self) -> None:
+        """A cell names ways, median, worst, and how many failed."""
         some = [Outcome(PLAIN, "port", "port", [took], "direct") for took in (0.1, 0.3, None)]
         self.assertEqual(cell(some), "direct 0.20 (0.30), 1 of 3 fail")
         self.assertEqual((cell(some[2:]), cell([])), ("fails", ""))
