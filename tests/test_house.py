@@ -164,7 +164,6 @@ PURE = (
     "sim.team.load.census",
     "sim.team.scale.curve",
     "sim.team.scale.drawing",
-    "sim.team.scale.floor",
     "sim.team.scale.page",
     "sim.team.scale.theory",
     "sim.team.scenario",

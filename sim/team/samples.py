@@ -33,7 +33,7 @@ class Samples:
         team, (then, sent, size) = run.team, self._before
         total = team.board.counters["sent"]
         bytes_sent = sum(team.traffic(place).sent_bytes for place in team.places)
-        passed, alive = now - then, len(team.nodes)
+        passed, alive = now - then, len(team.living)
         self._add("nodes alive", now, alive)
         self._add("nodes in the network", now, len(team.inside()))
         if passed and alive:

@@ -89,8 +89,8 @@ class Leases(LeaseTeam):
 
     @property
     def digest(self) -> str:
-        """The hash of every message, and of who won when."""
-        return self.radio.digest()
+        """The hash of every message that arrived, and when."""
+        return self.board.digest()
 
     def __str__(self) -> str:
         """What the schedule was."""

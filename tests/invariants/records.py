@@ -32,7 +32,7 @@ class Records:
         self._held: dict[tuple[int, int, Slot], tuple[int, bytes]] = {}
         self._met: dict[int, set[Contact]] = {}
         self._old: list[Record] = []
-        schedule.attend(lambda place, node: self._met.update({place: set()}), lambda place, node: None)
+        schedule.fleet.attend(lambda place, node: self._met.update({place: set()}), lambda place, node: None)
         if schedule.liar is not None:
             self._let_lie(schedule.node(schedule.liar))
 
@@ -80,7 +80,7 @@ class Records:
         self._get(place, self._rng.choice(KEYS), self._rng.choice(["majority", "majority", "fast"]))
 
     def _get(self, place: int, key: bytes, concern: Any) -> None:
-        life = self._schedule.life[place]
+        life = self._schedule.fleet.life[place]
         self._clients.read(place, life, self._schedule.node(place), key, concern).addCallback(self._keep)
 
     def _keep(self, records: list[Record]) -> None:

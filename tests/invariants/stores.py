@@ -33,7 +33,7 @@ class Stores:
         self._found: list[str] = []
         self._full: tuple[int, DiskStore] | None = None
         self._number = 0
-        schedule.attend(self._born, lambda place, node: None)
+        schedule.fleet.attend(self._born, lambda place, node: None)
         voters = min(schedule.n, 8)
         deaths = sum(len(fault.places) for fault in schedule.faults if fault.kind == "die")
         # A store that rots is one replica less; beyond what a majority can do without, nothing is promised.

@@ -96,7 +96,7 @@ class Wire:
                 )
 
         vars(self._board).update(_carry=tapped_carry, _deliver=tapped_deliver)
-        schedule.attend(self._born, self._died)
+        schedule.fleet.attend(self._born, self._died)
 
     def step(self) -> None:
         """A shot or two, and a question that may run once."""
@@ -205,7 +205,7 @@ class Wire:
 
     def _born(self, place: int, node: EntangledNode) -> None:
         self._born_at[self._schedule.fleet.address(place)] = self._schedule.fleet.clock.seconds()
-        life = self._schedule.life[place]
+        life = self._schedule.fleet.life[place]
 
         def run(peer: object, number: int) -> int:
             self._history.note(Ran, place, life, number)
@@ -218,12 +218,12 @@ class Wire:
 
     def _ask(self, asker: int, answerer: int) -> None:
         self._number += 1
-        number, life = self._number, self._schedule.life[answerer]
+        number, life = self._number, self._schedule.fleet.life[answerer]
         contact = self._schedule.node(answerer).contact
         asked = self._history.asked(asker, "run", number)
 
         def answered(answer: object) -> None:
-            self._history.answered(asked, (answer, answerer, life, self._schedule.life[answerer]))
+            self._history.answered(asked, (answer, answerer, life, self._schedule.fleet.life[answerer]))
 
         asking = self._schedule.node(asker).endpoint.ask(contact, "run", number, changes=True)
         asking.addCallbacks(answered, self._failed, errbackArgs=(asked,))

@@ -45,7 +45,7 @@ class Auctions:
     def __init__(self, team: Team, settings: AuctionSettings) -> None:
         self._team = team
         self._settings = settings
-        self._rng = team.rng("auctions")
+        self._rng = team.generator("auctions")
         self._residents = Residents(team)
         self._deputies = deputies_of(team)
         self._contest: Contest | None = None
@@ -96,7 +96,7 @@ class Auctions:
         self._begun += 1
         self._before = {deputy.place: _counts(deputy) for deputy in self._deputies.present()}
         task = Task(f"auction {self._begun}", "none", "nothing", waiting_period=self._settings.waiting)
-        dice = self._team.rng(f"auction/{self._begun}")
+        dice = self._team.generator(f"auction/{self._begun}")
         places = self._residents.places()
         dice.shuffle(places)  # who is first asks for the council
         contest = Contest(task, self._deputies, places, self._team.clock, dice, self._settings.spread)

@@ -13,7 +13,7 @@ class Deputies:
 
     def __init__(self, team: Team) -> None:
         self._clock = team.clock
-        self._rng = team.rng
+        self._rng = team.generator
         self._present: dict[int, Deputy] = {}
         self._lives = 0
         team.attend(self._born, self._died)

@@ -38,7 +38,7 @@ class Directory:
     def __init__(self, team: Team, settings: DirectorySettings) -> None:
         self._team = team
         self._settings = settings
-        self._rng = team.rng("directory")
+        self._rng = team.generator("directory")
         self._residents = Residents(team)
         self._begun = 0
         self._next_at = -math.inf

@@ -65,7 +65,7 @@ class Lookups:
     def __init__(self, team: Team, settings: LookupSettings) -> None:
         self._settings = settings
         self._clock = team.clock
-        self._rng = team.rng("lookups")
+        self._rng = team.generator("lookups")
         self._residents = Residents(team)
         self._pace = Pace(team.clock, settings.rate)
         self._open: dict[int, Trial] = {}

@@ -41,7 +41,7 @@ class Records:
 
     def __init__(self, team: Team, settings: RecordSettings) -> None:
         self._team = team
-        self._rng = team.rng("records")
+        self._rng = team.generator("records")
         self._residents = Residents(team)
         self._pace = Pace(team.clock, settings.rate)
         self._keys = [hashed_key(f"records {number}") for number in range(settings.keys)]
@@ -78,4 +78,4 @@ class Records:
     # -- inside -----------------------------------------------------------------------------------------------------
 
     def _read(self, place: int, key: bytes) -> None:
-        self._clients.read(place, self._team.place(place).lives, self._residents.node(place), key)
+        self._clients.read(place, self._team.life[place], self._residents.node(place), key)

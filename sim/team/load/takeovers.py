@@ -66,7 +66,7 @@ class Takeovers:
         self._team = team
         self._settings = settings
         self._clock = team.clock
-        self._rng = team.rng("takeovers")
+        self._rng = team.generator("takeovers")
         self._residents = Residents(team)
         self._deputies = deputies_of(team)
         self._pace = Pace(team.clock, settings.rate, settings.count)
@@ -170,7 +170,7 @@ class Takeovers:
         self._end(trial)
 
     def _return(self, place: int) -> None:
-        if place not in self._team.nodes:
+        if place not in self._team.living:
             self._team.start(place)
 
     def _end(self, trial: Trial) -> None:

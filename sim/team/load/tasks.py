@@ -48,7 +48,7 @@ class Tasks:
     def __init__(self, team: Team, settings: TaskSettings) -> None:
         self._team = team
         self._settings = settings
-        self._rng = team.rng("tasks")
+        self._rng = team.generator("tasks")
         self._residents = Residents(team)
         self._deputies = deputies_of(team)
         self._due_at: float | None = None

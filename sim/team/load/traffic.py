@@ -58,7 +58,7 @@ class Traffic:
             self._began = self._last_at = now
             self._cpu = time.process_time()
             self._before = {place: self._sent(place) for place in self._team.places}
-        self._node_seconds += (now - self._last_at) * len(self._team.nodes)
+        self._node_seconds += (now - self._last_at) * len(self._team.living)
         self._last_at = now
 
     def settled(self) -> None:
@@ -80,7 +80,7 @@ class Traffic:
                 (datagrams, size), (past, past_size) = self._sent(place), self._before.get(place, (0, 0))
                 sent, volume = sent + datagrams - past, volume + size - past_size
                 busiest = max(busiest, size - past_size)
-        n = len(self._team.nodes)
+        n = len(self._team.living)
         memory = (resident_bytes() - self._bare_bytes) / 1024 / max(1, n) if lived else None
         return [
             Figure("traffic.datagrams", _per(sent, lived), "a node and s", n=n),

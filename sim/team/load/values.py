@@ -87,7 +87,7 @@ class Values:
         self._team = team
         self._settings = settings
         self._clock = team.clock
-        self._rng = team.rng("values")
+        self._rng = team.generator("values")
         self._residents = Residents(team)
         self._pace = Pace(team.clock, settings.rate, settings.count)
         self._begun = 0
@@ -183,7 +183,7 @@ class Values:
             self._clock.callLater(self._settings.away, self._return, place)
 
     def _return(self, place: int) -> None:
-        if place not in self._team.nodes:
+        if place not in self._team.living:
             self._team.replace(place)
             self._team.start(place)
 

@@ -65,7 +65,7 @@ class Watches:
     def __init__(self, team: Team, settings: WatchSettings) -> None:
         self._settings = settings
         self._clock = team.clock
-        self._rng = team.rng("watches")
+        self._rng = team.generator("watches")
         self._residents = Residents(team)
         self._pace = Pace(team.clock, settings.rate)
         self._keys = [hashed_key(f"watched {number}") for number in range(settings.keys)]

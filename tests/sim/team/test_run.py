@@ -213,7 +213,7 @@ class RunTests(SynchronousTestCase):
         assert stays is not None
         expected = 12 * 60.0 / (stays.mean + sessions.breaks.mean)
         self.assertApproximates(len(ended) / expected, 1.0, 0.35)
-        self.assertGreaterEqual(len(run.team.nodes), 2)
+        self.assertGreaterEqual(len(run.team.living), 2)
         self.assertGreater(len([1 for _, event, _ in told if event == "born"]), 0.7 * len(ended))
 
     def test_sessions_may_bring_others(self) -> None:

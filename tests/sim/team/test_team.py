@@ -65,7 +65,7 @@ class TeamTests(SynchronousTestCase):
         self.successResultOf(put)
         former = team.entangled(2)
         team.kill(2)
-        self.assertNotIn(2, team.nodes)
+        self.assertNotIn(2, team.living)
         self.assertNotIn(2, team.inside())
         team.run(1.0)
         team.restart(2)
