@@ -161,7 +161,6 @@ PURE = (
     "sim.team.history",
     "sim.team.invariant",
     "sim.team.link",
-    "sim.team.load.census",
     "sim.team.scale.curve",
     "sim.team.scale.drawing",
     "sim.team.scale.page",

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import random
 from collections.abc import Sequence
-from typing import Protocol
 
 from middleware.entangled.network.network import Address
 from middleware.entangled.network.switchboard import CALM, Weather
@@ -17,6 +16,7 @@ from sim.team.checker import check
 from sim.team.event import Settled
 from sim.team.faults.timeline import TimedFault, Timeline
 from sim.team.shrink import WHOLE, Trim
+from sim.team.workload import Workload
 from sim.team.world import Fleet
 
 STRANDED = 0.15
@@ -24,19 +24,6 @@ STRANDED = 0.15
 STEP = 0.5
 SETTLE = 45.0
 """Seconds after which a healed team is as it should be: tries, three rounds of mending, and a struck member."""
-
-
-class Workload(Protocol):
-    """What clients do beside the faults; they write down in the history what they asked for and what they got."""
-
-    def step(self) -> None:
-        """Do something, every ``STEP`` seconds while the faults last."""
-
-    def settled(self) -> None:
-        """The faults are over and the repair interval has passed: ask what is to be asked; 10 s are left for it."""
-
-    def verdict(self) -> list[str]:
-        """Write down how things stand at the end; what only the workload itself can judge, a line each."""
 
 
 class Schedule:

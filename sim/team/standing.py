@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from sim.team.figure import Figure
 from sim.team.team import Team
-from sim.team.workload import Kind
+from sim.team.workload import Kind, Workload
 
 
 @dataclass(frozen=True)
@@ -14,17 +14,11 @@ class StandingSettings:
     """``[load.standing]``: nothing can be set."""
 
 
-class Standing:
+class Standing(Workload):
     """Looks at the team; it asks nobody anything."""
 
     def __init__(self, team: Team, settings: StandingSettings) -> None:
         self._team = team
-
-    def step(self) -> None:
-        """Nothing is done."""
-
-    def settled(self) -> None:
-        """Nothing is asked."""
 
     def verdict(self) -> list[str]:
         """Who is in the network and knows nobody."""

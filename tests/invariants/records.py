@@ -16,12 +16,13 @@ from sim.team.clients import REMOVE, Clients
 from sim.team.event import Counted, Met, Stored
 from sim.team.invariant.durability import Slot
 from sim.team.schedule import Schedule
+from sim.team.workload import Workload
 
 KEYS = [hashed_key(f"key {number}") for number in range(4)]
 NAMES = ("a", "b")
 
 
-class Records:
+class Records(Workload):
     """Clients of every node write their own slots under a few keys and read all of them."""
 
     def __init__(self, schedule: Schedule) -> None:

@@ -9,9 +9,10 @@ from functools import partial
 from typing import Protocol
 
 from sim.team.files import DiskFleet
-from sim.team.schedule import Schedule, Workload
+from sim.team.schedule import Schedule
 from sim.team.shrink import WHOLE, Trim
 from sim.team.sweep import sweep
+from sim.team.workload import Workload
 from sim.team.world import Fleet
 from tests.invariants.bug import BUGS, FINDERS, seeded
 from tests.invariants.deciders import Deciders

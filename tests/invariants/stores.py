@@ -12,6 +12,7 @@ from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import Record, hashed_key
 from sim.team.files import DiskFleet, DiskStore
 from sim.team.schedule import Schedule
+from sim.team.workload import Workload
 from tests.invariants.records import KEYS
 
 PROBE = hashed_key("probe of a full disk")
@@ -22,7 +23,7 @@ RECOVERY = 2.0
 """Seconds within which a node writes again when there is room (S-c)."""
 
 
-class Stores:
+class Stores(Workload):
     """Fills the disk of one node after the other for a while, and lets one store rot."""
 
     def __init__(self, schedule: Schedule) -> None:

@@ -21,6 +21,7 @@ from sim.team import event
 from sim.team.invariant.taking import PUT, RING, SURVEY, TAKE, WAIT
 from sim.team.schedule import Schedule
 from sim.team.takers.witness import Witness
+from sim.team.workload import Workload
 
 JOB = ("job", int, ANY)
 BELL = ("bell", int)
@@ -34,7 +35,7 @@ and one that knows the counter of that bid.  A sweep that took anything ends aft
 second sweep from elsewhere begins where the first did: that a tuple was left by both does not show that it is stuck."""
 
 
-class Tuples:
+class Tuples(Workload):
     """Clients of every node put, take, claim and read jobs; two of them wait for a bell that rings at the end."""
 
     def __init__(self, schedule: Schedule) -> None:

@@ -37,6 +37,7 @@ from middleware.entangled.wire.session import (
 )
 from sim.team.event import Ran, Shot, Size, Strange
 from sim.team.schedule import Schedule
+from sim.team.workload import Workload
 from sim.team.world import TEAM
 from tests.fuzz.ground import state_of
 
@@ -61,7 +62,7 @@ class Ear:
             self.heard.append(str(event.get("log_format")))
 
 
-class Wire:
+class Wire(Workload):
     """Shoots at nodes while they work, counts how often a method runs, and looks at every table at the end."""
 
     def __init__(self, schedule: Schedule) -> None:

@@ -14,8 +14,7 @@ from msgspec import Meta
 from middleware.entangled.record import hashed_key
 from sim.team.clients import READ, REMOVE, WRITE, Clients
 from sim.team.figure import Figure, share
-from sim.team.load.pace import Pace
-from sim.team.load.residents import Residents
+from sim.team.load.residents import Load, Pace
 from sim.team.team import Team
 
 NAME = "r"
@@ -36,13 +35,11 @@ class RecordSettings:
     """Writes, removals and reads in a second, in all."""
 
 
-class Records:
+class Records(Load):
     """The workload ``records``."""
 
     def __init__(self, team: Team, settings: RecordSettings) -> None:
-        self._team = team
-        self._rng = team.generator("records")
-        self._residents = Residents(team)
+        super().__init__(team, "records")
         self._pace = Pace(team.clock, settings.rate)
         self._keys = [hashed_key(f"records {number}") for number in range(settings.keys)]
         self._clients = Clients(team.history)
@@ -62,10 +59,6 @@ class Records:
         for place in self._residents.any(self._rng, MOST_READERS):
             for key in self._keys:
                 self._read(place, key)
-
-    def verdict(self) -> list[str]:
-        """Nothing: the checker has it."""
-        return []
 
     def figures(self) -> list[Figure]:
         """How much was answered; what was not may have been done."""

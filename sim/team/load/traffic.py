@@ -16,6 +16,7 @@ from msgspec import Meta
 
 from sim.team.figure import Figure, mean, percentile
 from sim.team.team import Team
+from sim.team.workload import Workload
 
 PAGE = resource.getpagesize()
 
@@ -38,7 +39,7 @@ def resident_bytes() -> int:
         return most if sys.platform == "darwin" else most * 1024
 
 
-class Traffic:
+class Traffic(Workload):
     """The workload ``traffic``; it asks nothing of anybody."""
 
     def __init__(self, team: Team, settings: TrafficSettings) -> None:
@@ -60,13 +61,6 @@ class Traffic:
             self._before = {place: self._sent(place) for place in self._team.places}
         self._node_seconds += (now - self._last_at) * len(self._team.living)
         self._last_at = now
-
-    def settled(self) -> None:
-        """Nothing is left to do."""
-
-    def verdict(self) -> list[str]:
-        """Nothing: what it costs is a figure."""
-        return []
 
     def figures(self) -> list[Figure]:
         """Of a node and a second of its life; its contacts; and what it costs here."""

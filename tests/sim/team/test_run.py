@@ -15,7 +15,7 @@ from sim.team.link import LinkSettings
 from sim.team.run import DONE, JOINING, RUNNING, Run
 from sim.team.scenario import Clocks, Join, Scenario, Sessions
 from sim.team.team import Team
-from sim.team.workload import Kind
+from sim.team.workload import Kind, Workload
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class _Nothing:
     pass
 
 
-class _Steps:
+class _Steps(Workload):
     """A workload that counts what is asked of it, and finds what it is told to find."""
 
     found: tuple[str, ...] = ()
