@@ -61,7 +61,7 @@ def main() -> int:
     if wanted.log and (wanted.bug or wanted.bugs):
         parser.error("--log: runs with a bug put in are not logged")
     if wanted.bug:
-        only = only or FINDERS.get(wanted.bug, ("records",))
+        only = only or FINDERS[wanted.bug]
     try:
         seeds = range(wanted.seed, wanted.seed + count)
         if wanted.bugs:

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from typing import Any
 
 from twisted.internet.defer import Deferred
-from twisted.python.failure import Failure
 
 from middleware.consensus.lease.lessee import STAGGER
 from middleware.entangled.contact import Contact
@@ -215,13 +214,8 @@ class Leases(LeaseTeam):
 
         def ended(_: object) -> None:
             lessee.release()
-            history.answered(asked)
 
-        def failed(failure: Failure) -> None:
-            failure.trap(EntangledError)
-            history.unanswered(asked, failure.value)
-
-        closing.addCallbacks(ended, failed)
+        history.follow(asked, closing.addCallback(ended))
         self.clock.advance(2 * self.ttl)
         for agent in self.agents:
             self.bidders[agent].lessee(task_id).want()

@@ -89,10 +89,8 @@ class Records(Workload):
 
     def _find(self, place: int, target: bytes) -> None:
         asked = self._history.asked(place, "look up", target, K)
-        self._schedule.node(place).find_node(target).addCallbacks(
-            lambda found: self._history.answered(asked, tuple(contact.node_id for contact in found)),
-            lambda failure: self._history.unanswered(asked, failure.value),
-        )
+        looking = self._schedule.node(place).find_node(target)
+        self._history.follow(asked, looking, lambda found: tuple(contact.node_id for contact in found))
 
     def _meddle(self, place: int) -> None:
         """A member stores what it must not: an old record of another, and one that it made up."""

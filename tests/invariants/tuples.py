@@ -120,9 +120,8 @@ class Tuples(Workload):
 
         def acknowledged(_: object) -> None:
             self._acknowledged[fields] = None
-            self._history.answered(asked)
 
-        putting.addCallbacks(acknowledged, self._failed, errbackArgs=(asked,))
+        self._history.follow(asked, putting.addCallback(acknowledged))
 
     def _take(self, place: int, space: TupleSpace) -> None:
         self._get(JOB, place, space, timeout=self._rng.choice([0.3, 2.0, 5.0]))
@@ -135,10 +134,7 @@ class Tuples(Workload):
 
     def _taking(self, taking: Deferred[list[Tuple]], place: int) -> None:
         """Write down what a client takes."""
-        asked = self._history.asked(place, TAKE, "job")
-        taking.addCallbacks(
-            lambda taken: self._history.answered(asked, tuple(taken)), self._failed, errbackArgs=(asked,)
-        )
+        self._history.follow(self._history.asked(place, TAKE, "job"), taking, tuple)
 
     def _claim(self, place: int, space: TupleSpace) -> None:
         claiming = space.claim(JOB, lease=1.5, timeout=3.0)
@@ -190,18 +186,16 @@ class Tuples(Workload):
     def _ring(self) -> None:
         place = self._rng.choice(sorted(self._spaces))
         asked = self._history.asked(place, RING, "bell")
-        self._spaces[place].put(("bell", 1)).addCallbacks(
-            lambda _: self._history.answered(asked), self._failed, errbackArgs=(asked,)
-        )
+        self._history.follow(asked, self._spaces[place].put(("bell", 1)))
 
     def _survey(self, place: int, space: TupleSpace) -> None:
         asked = self._history.asked(place, SURVEY, "job")
 
-        def seen(found: list[Tuple]) -> None:
+        def seen(found: list[Tuple]) -> tuple[Tuple, ...]:
             self._seats()
-            self._history.answered(asked, tuple(found))
+            return tuple(found)
 
-        space.read_all(JOB).addCallbacks(seen, self._failed, errbackArgs=(asked,))
+        self._history.follow(asked, space.read_all(JOB), seen)
 
     def _seats(self) -> None:
         self._witness.seated(map(self._schedule.node, self._schedule.alive()))
@@ -215,10 +209,6 @@ class Tuples(Workload):
         for posted in self._left():
             place = self._rng.choice(sorted(self._spaces))
             self._get(posted.fields, place, self._spaces[place])
-
-    def _failed(self, failure: Failure, asked: int) -> None:
-        failure.trap(EntangledError)
-        self._history.unanswered(asked, failure.value)
 
 
 def _weather(failure: Failure) -> None:

@@ -11,10 +11,8 @@ from collections import deque
 from typing import Any
 
 from twisted.logger import ILogObserver, LogLevel, globalLogPublisher
-from twisted.python.failure import Failure
 from zope.interface import implementer
 
-from middleware.entangled.errors import EntangledError
 from middleware.entangled.identity import Identity, exchange_key
 from middleware.entangled.kademlia.overlay import MAX_FOUND, K
 from middleware.entangled.network.network import Address
@@ -97,7 +95,8 @@ class Wire(Workload):
                 )
 
         vars(self._board).update(_carry=tapped_carry, _deliver=tapped_deliver)
-        schedule.fleet.attend(self._born, self._died)
+        # The recordings outlive a node: they are fired at its next life.
+        schedule.fleet.attend(self._born, lambda place, node: None)
 
     def step(self) -> None:
         """A shot or two, and a question that may run once."""
@@ -214,24 +213,17 @@ class Wire(Workload):
 
         node.endpoint.expose("run", run, changes=True)
 
-    def _died(self, place: int, node: EntangledNode) -> None:
-        """The recordings stay: they are fired at the next life."""
-
     def _ask(self, asker: int, answerer: int) -> None:
         self._number += 1
         number, life = self._number, self._schedule.fleet.life[answerer]
         contact = self._schedule.node(answerer).contact
         asked = self._history.asked(asker, "run", number)
 
-        def answered(answer: object) -> None:
-            self._history.answered(asked, (answer, answerer, life, self._schedule.fleet.life[answerer]))
+        def shown(answer: object) -> object:
+            return answer, answerer, life, self._schedule.fleet.life[answerer]
 
         asking = self._schedule.node(asker).endpoint.ask(contact, "run", number, changes=True)
-        asking.addCallbacks(answered, self._failed, errbackArgs=(asked,))
-
-    def _failed(self, failure: Failure, asked: int) -> None:
-        failure.trap(EntangledError)
-        self._history.unanswered(asked, failure.value)
+        self._history.follow(asked, asking, shown)
 
     # -- tables (R4) ------------------------------------------------------------------------------------------------
 

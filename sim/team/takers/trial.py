@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-from twisted.python.failure import Failure
-
-from middleware.entangled.errors import EntangledError
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.switchboard import Weather
 from middleware.entangled.node import EntangledNode
@@ -130,30 +127,20 @@ class Trial(World):
             self.number += 1
             place = self.dice.choice(self.alive())
             asked = self.history.asked(place, PUT, fields)
-            putting = self.spaces[place].put(fields)
-            putting.addCallbacks(self.answered, self.failed, (asked,), {}, (asked,))
+            self.history.follow(asked, self.spaces[place].put(fields))
         if self.dice.random() < 0.1:
             self.look(self.dice.choice(self.alive()))
-
-    def answered(self, result: object, asked: int) -> None:
-        """Write down that it was done."""
-        self.history.answered(asked)
-
-    def failed(self, failure: Failure, asked: int) -> None:
-        """Write down that it is not known what came of it."""
-        failure.trap(EntangledError)
-        self.history.unanswered(asked, failure.value)
 
     def look(self, place: int) -> None:
         """Read all tuples; while nothing disturbs the network, whatever was taken before must not be among them."""
         is_quiet = self.board.weather is self.calm or not (self.storm.loss or self.churn)
         asked = self.history.asked(place, SURVEY if is_quiet else "look", "job")
 
-        def seen(tuples: list[Tuple]) -> None:
+        def seen(tuples: list[Tuple]) -> tuple[Tuple, ...]:
             self.witness.seated(self.living.values())
-            self.history.answered(asked, tuple(tuples))
+            return tuple(tuples)
 
-        self.spaces[place].read_all(("job", int, float)).addCallbacks(seen, self.failed, errbackArgs=(asked,))
+        self.history.follow(asked, self.spaces[place].read_all(("job", int, float)), seen)
 
     def take(self, place: int) -> None:
         """Let the taker of this place take once more, in one way or another."""
