@@ -51,9 +51,7 @@ class History:
         """The client gave up: it is not known what came of it."""
         self.events.append(Unanswered(self._seconds(), number, str(why), is_unavailable))
 
-    def follow(
-        self, number: int, work: Deferred[T], shown: Callable[[T], object] = lambda result: None
-    ) -> Deferred[None]:
+    def follow(self, number: int, work: Deferred[T], shown: Callable[[T], object] = lambda result: None) -> None:
         """Write down what comes of ``work``: what ``shown`` makes of its result, or why it failed."""
 
         def failed(failure: Failure) -> None:

@@ -98,7 +98,7 @@ class Leases(LeaseTeam):
             "; ".join(map(str, self.faults))
         )
 
-    def run(self) -> list[str]:
+    def run(self) -> list[str]:  # type: ignore[override]
         """Faults, then health; the violations, a line each."""
         self.clock.advance(self.ttl + 0.1)
         self.radio.air = self.air
