@@ -7,7 +7,8 @@ import io
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from benchmarks.dissemination import BUSIEST, Crowd, Outcome, Weather, main, measured, percentile
+from benchmarks.dissemination import BUSIEST, Crowd, Outcome, Weather, main, measured
+from benchmarks.measure import percentile
 from middleware.consensus.bidding.scale import DIRECT, TREE
 
 AFTER = 4.0
