@@ -197,16 +197,11 @@ async def measured(given: Any, web: Child, where: int) -> list[str]:
         task.cancel()
     await asyncio.gather(*tasks, return_exceptions=True)
     rate = len(load.ages) / given.seconds / max(1, given.cameras)
+    late, age = 1000 * percentile(load.answers, 0.99), 1000 * percentile(load.ages, 0.95)
     return [
         _line("streams not fed", unfed, "of them", "unfed", f" (longest time without a beat {load.longest:.2f} s)"),
-        _line("API, 99 of 100", 1000 * percentile(load.answers, 0.99), "ms", "api", f" ({len(load.answers)} answers)"),
-        _line(
-            "picture's age, p95",
-            1000 * percentile(load.ages, 0.95),
-            "ms",
-            "glass",
-            f" ({rate:.1f} a second and viewer)",
-        ),
+        _line("API, 99 of 100", late, "ms", "api", f" ({len(load.answers)} answers)"),
+        _line("picture's age, p95", age, "ms", "glass", f" ({rate:.1f} a second and viewer)"),
         _line("slow viewer, oldest", max(load.slow, default=99.0), "s", "lag", f" ({len(load.slow)} pictures)"),
         _line("dribblers closed", max(load.closed, default=0.0), "s", "closed", f" ({open_still} are still open)"),
         _line("timers late", after["late_ms"], "ms", "late", f" (99 of 100: {after['late_p99_ms']:.1f} ms)"),

@@ -199,8 +199,6 @@ class Team(World):
         joined.addErrback(lambda failure: self._log.failure("while joining", failure))
         return node
 
-    restart = start
-
     def add(self, known: Sequence[int] | None = None) -> int:
         """A newcomer, at a place of its own; returns that."""
         place = self._new_place()

@@ -6,8 +6,7 @@ import random
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from benchmarks.takeover.cause import Cause, Trial
-from benchmarks.takeover.judge import Judge
+from benchmarks.takeover.cause import Cause, Judge, Trial
 from benchmarks.takeover.rehearsed import trial
 from benchmarks.takeover.report import drawn, table
 from middleware.directory.presence import EXECUTING

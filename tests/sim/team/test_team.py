@@ -68,7 +68,7 @@ class TeamTests(SynchronousTestCase):
         self.assertNotIn(2, team.living)
         self.assertNotIn(2, team.inside())
         team.run(1.0)
-        team.restart(2)
+        team.start(2)
         self.assertEqual([record.name for record in team.entangled(2).store.get(key)], ["x"])
         entered = team.entered(2)
         self.assertNoResult(entered)
@@ -126,7 +126,7 @@ class TeamTests(SynchronousTestCase):
         """What places send adds up to what the board carried, former lives included."""
         team = self.team(Scenario(nodes=5, join=QUICK, link=LinkSettings("none")))
         team.kill(4)
-        team.restart(4)
+        team.start(4)
         team.run(5.0)
         self.assertEqual(sum(team.traffic(place).sent for place in team.places), team.board.counters["sent"])
         received = sum(team.traffic(place).received for place in team.places)
