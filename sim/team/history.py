@@ -4,15 +4,8 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Hashable, Iterator
-from typing import TypeVar
 
-from twisted.internet.defer import Deferred
-from twisted.python.failure import Failure
-
-from middleware.entangled.errors import EntangledError, Unavailable
 from sim.team.event import Answered, Asked, Event, Unanswered
-
-T = TypeVar("T")
 
 
 class History:
@@ -50,15 +43,6 @@ class History:
     def unanswered(self, number: int, why: object, is_unavailable: bool = False) -> None:
         """The client gave up: it is not known what came of it."""
         self.events.append(Unanswered(self._seconds(), number, str(why), is_unavailable))
-
-    def follow(self, number: int, work: Deferred[T], shown: Callable[[T], object] = lambda result: None) -> None:
-        """Write down what comes of ``work``: what ``shown`` makes of its result, or why it failed."""
-
-        def failed(failure: Failure) -> None:
-            failure.trap(EntangledError)
-            self.unanswered(number, failure.value, failure.check(Unavailable) is not None)
-
-        work.addCallbacks(lambda result: self.answered(number, shown(result)), failed)
 
     def digest(self) -> str:
         """A hash over all events; runs of the same seed have the same."""

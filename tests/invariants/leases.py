@@ -15,6 +15,7 @@ from twisted.internet.defer import Deferred
 from middleware.consensus.lease.lessee import STAGGER
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import EntangledError
+from sim.team.clients import follow
 from sim.team.event import Awaited
 from sim.team.faults.timeline import TimedFault, Timeline
 from sim.team.leases.radio import CALM, Air
@@ -215,7 +216,7 @@ class Leases(LeaseTeam):
         def ended(_: object) -> None:
             lessee.release()
 
-        history.follow(asked, closing.addCallback(ended))
+        follow(history, asked, closing.addCallback(ended))
         self.clock.advance(2 * self.ttl)
         for agent in self.agents:
             self.bidders[agent].lessee(task_id).want()

@@ -12,7 +12,7 @@ from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.overlay import K
 from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import Record, hashed_key
-from sim.team.clients import REMOVE, Clients
+from sim.team.clients import REMOVE, Clients, follow
 from sim.team.event import Counted, Met, Stored
 from sim.team.invariant.durability import Slot
 from sim.team.schedule import Schedule
@@ -90,7 +90,7 @@ class Records(Workload):
     def _find(self, place: int, target: bytes) -> None:
         asked = self._history.asked(place, "look up", target, K)
         looking = self._schedule.node(place).find_node(target)
-        self._history.follow(asked, looking, lambda found: tuple(contact.node_id for contact in found))
+        follow(self._history, asked, looking, lambda found: tuple(contact.node_id for contact in found))
 
     def _meddle(self, place: int) -> None:
         """A member stores what it must not: an old record of another, and one that it made up."""

@@ -18,6 +18,7 @@ from middleware.entangled.space.take_codec import unpack_reply
 from middleware.entangled.space.template import ANY, Field, Tuple
 from middleware.entangled.space.tuplespace import TupleSpace
 from sim.team import event
+from sim.team.clients import follow
 from sim.team.invariant.taking import PUT, RING, SURVEY, TAKE, WAIT
 from sim.team.schedule import Schedule
 from sim.team.takers.witness import Witness
@@ -121,7 +122,7 @@ class Tuples(Workload):
         def acknowledged(_: object) -> None:
             self._acknowledged[fields] = None
 
-        self._history.follow(asked, putting.addCallback(acknowledged))
+        follow(self._history, asked, putting.addCallback(acknowledged))
 
     def _take(self, place: int, space: TupleSpace) -> None:
         self._get(JOB, place, space, timeout=self._rng.choice([0.3, 2.0, 5.0]))
@@ -134,7 +135,7 @@ class Tuples(Workload):
 
     def _taking(self, taking: Deferred[list[Tuple]], place: int) -> None:
         """Write down what a client takes."""
-        self._history.follow(self._history.asked(place, TAKE, "job"), taking, tuple)
+        follow(self._history, self._history.asked(place, TAKE, "job"), taking, tuple)
 
     def _claim(self, place: int, space: TupleSpace) -> None:
         claiming = space.claim(JOB, lease=1.5, timeout=3.0)
@@ -186,7 +187,7 @@ class Tuples(Workload):
     def _ring(self) -> None:
         place = self._rng.choice(sorted(self._spaces))
         asked = self._history.asked(place, RING, "bell")
-        self._history.follow(asked, self._spaces[place].put(("bell", 1)))
+        follow(self._history, asked, self._spaces[place].put(("bell", 1)))
 
     def _survey(self, place: int, space: TupleSpace) -> None:
         asked = self._history.asked(place, SURVEY, "job")
@@ -195,7 +196,7 @@ class Tuples(Workload):
             self._seats()
             return tuple(found)
 
-        self._history.follow(asked, space.read_all(JOB), seen)
+        follow(self._history, asked, space.read_all(JOB), seen)
 
     def _seats(self) -> None:
         self._witness.seated(map(self._schedule.node, self._schedule.alive()))

@@ -33,6 +33,7 @@ from middleware.entangled.wire.session import (
     Invitation,
     derived_key,
 )
+from sim.team.clients import follow
 from sim.team.event import Ran, Shot, Size, Strange
 from sim.team.schedule import Schedule
 from sim.team.workload import Workload
@@ -223,7 +224,7 @@ class Wire(Workload):
             return answer, answerer, life, self._schedule.fleet.life[answerer]
 
         asking = self._schedule.node(asker).endpoint.ask(contact, "run", number, changes=True)
-        self._history.follow(asked, asking, shown)
+        follow(self._history, asked, asking, shown)
 
     # -- tables (R4) ------------------------------------------------------------------------------------------------
 

@@ -12,6 +12,7 @@ from middleware.entangled.space.posting import Posted, posting
 from middleware.entangled.space.template import ANY, Tuple
 from middleware.entangled.space.tuplespace import TupleSpace
 from sim.team.checker import check
+from sim.team.clients import follow
 from sim.team.event import Settled
 from sim.team.invariant.taking import PUT, SURVEY, TAKE
 from sim.team.takers.witness import Witness
@@ -127,7 +128,7 @@ class Trial(World):
             self.number += 1
             place = self.dice.choice(self.alive())
             asked = self.history.asked(place, PUT, fields)
-            self.history.follow(asked, self.spaces[place].put(fields))
+            follow(self.history, asked, self.spaces[place].put(fields))
         if self.dice.random() < 0.1:
             self.look(self.dice.choice(self.alive()))
 
@@ -140,7 +141,7 @@ class Trial(World):
             self.witness.seated(self.living.values())
             return tuple(tuples)
 
-        self.history.follow(asked, self.spaces[place].read_all(("job", int, float)), seen)
+        follow(self.history, asked, self.spaces[place].read_all(("job", int, float)), seen)
 
     def take(self, place: int) -> None:
         """Let the taker of this place take once more, in one way or another."""
