@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import resource
 import statistics
 import subprocess
 import sys
@@ -16,6 +15,8 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+
+from benchmarks.measure import MIB, memory_bytes
 
 TICK_MS = 32.0
 LOOK_S = 2.0
@@ -89,7 +90,7 @@ def _alone(bodies: int, controller: str, seconds: float) -> dict[str, float]:
             self.rays = 1e3 * (time.process_time() - began)
             return met
 
-    before = _peak()
+    before = memory_bytes("VmHWM") / MIB
     crowd = Timed(1, roomy(bodies))
     crowd.place_target_at_random()
     senses, control = Senses(crowd), CONTROLLERS[controller]
@@ -106,7 +107,7 @@ def _alone(bodies: int, controller: str, seconds: float) -> dict[str, float]:
         parts["rays"].append(crowd.rays)
         parts["moves"].append(1e3 * (stepped - controlled) - crowd.rays)
     means = {key: statistics.fmean(costs) for key, costs in parts.items()}
-    return {"robots": bodies, **means, "factor": TICK_MS / means["step"], "mib": _peak() - before}
+    return {"robots": bodies, **means, "factor": TICK_MS / means["step"], "mib": memory_bytes("VmHWM") / MIB - before}
 
 
 def _attached(agents: int) -> dict[str, float]:
@@ -163,11 +164,6 @@ def _tasked(sizes: Sequence[int]) -> list[dict[str, float]]:
         _say(f"{agents:>8}{len(team.words()):>13}{sent[1]:>11,.0f}{sent[0]:>9,.0f}")
         team.stop()
     return rows
-
-
-def _peak() -> float:
-    """MiB that this process has had in use at most."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
 
 
 def _say(line: str) -> None:

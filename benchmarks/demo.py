@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import http.client
 import json
-import os
 import random
 import re
 import signal
@@ -25,13 +24,12 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
+from benchmarks.measure import maps_mib, processor_s, udp_count
 from middleware.admission import operator as operators
 from middleware.admission.membership import MembershipFile, made
 
 START_S = 60.0
 TASK_S = 120.0
-TICKS = os.sysconf("SC_CLK_TCK")
-MIB = 1024.0
 TARGETS = {"pss": 300.0, "cores": 1.0, "page": 60_000, "plain": 40.0}
 """MiB of all processes, cores of all processes, bytes of the page, MiB of a dog's node without vision."""
 
@@ -155,25 +153,6 @@ def _name_of(pid: int) -> str:
     return configuration or next((word for word in words if word in ("sim.robots.server", "sim.demo")), words[0])
 
 
-def memory(pid: int) -> tuple[float, float]:
-    """PSS and RSS of a process, in MiB."""
-    text = Path(f"/proc/{pid}/smaps_rollup").read_text()
-    kib = {line.split(":")[0]: float(line.split()[1]) for line in text.splitlines()[1:] if line.endswith("kB")}
-    return kib["Pss"] / MIB, kib["Rss"] / MIB
-
-
-def spent(pid: int) -> float:
-    """The processor seconds that a process has used."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / TICKS
-
-
-def datagrams() -> int:
-    """The UDP datagrams that this machine has received, whoever sent them."""
-    rows = [line.split() for line in Path("/proc/net/snmp").read_text().splitlines() if line.startswith("Udp:")]
-    return int(rows[1][rows[0].index("InDatagrams")])
-
-
 @contextmanager
 def demonstration(run_dir: Path, seed: int) -> Iterator[tuple[subprocess.Popen[str], str, float]]:
     """The demonstration with its page up: its process, the page's address, the seconds until then."""
@@ -246,32 +225,31 @@ def measured(seed: int, seconds: float, run_dir: Path) -> list[str]:
         viewer = Viewer(page, host)
         viewer.open()
         time.sleep(2.0)
-        before, heard, began = {pid: spent(pid) for pid in names}, datagrams(), time.monotonic()
+        before, heard, began = {pid: processor_s(pid) for pid in names}, udp_count("InDatagrams"), time.monotonic()
         pictures, carried = viewer.pictures, viewer.bytes
         took = task_run(page, seconds)
         span = time.monotonic() - began
-        shares = {pid: (spent(pid) - before[pid]) / span for pid in names}
-        rate = (datagrams() - heard) / span
+        shares = {pid: (processor_s(pid) - before[pid]) / span for pid in names}
+        rate = (udp_count("InDatagrams") - heard) / span
         pictures, carried = viewer.pictures - pictures, viewer.bytes - carried
-        sizes = {pid: memory(pid) for pid in names}
+        sizes = {pid: maps_mib(pid) for pid in names}
         viewer.close()
         with plain_node(run_dir) as plain:
             time.sleep(6.0)
-            plain_pss, plain_rss = memory(plain)
+            plain_maps = maps_mib(plain)
             joined = "plain" in [device["name"] for device in page.state()["devices"]]
         weight = page.weight()
     lines = [f"{'process':12}{'PSS MiB':>9}{'RSS MiB':>9}{'cores':>8}"]
     for pid, name in names.items():
-        pss, rss = sizes[pid]
-        lines.append(f"{name:12}{pss:9.1f}{rss:9.1f}{shares[pid]:8.3f}")
-    pss, cores, page_bytes = sum(size[0] for size in sizes.values()), sum(shares.values()), sum(weight.values())
+        lines.append(f"{name:12}{sizes[pid]['Pss']:9.1f}{sizes[pid]['Rss']:9.1f}{shares[pid]:8.3f}")
+    pss, cores, page_bytes = sum(size["Pss"] for size in sizes.values()), sum(shares.values()), sum(weight.values())
     joining = "" if joined else " (IT HAS NOT JOINED)"
     lines += [
         "",
         _line("memory of all", pss, "MiB PSS", "pss"),
         _line("processor of all", cores, "cores", "cores", f" (over {span:.0f} s, task and page running)"),
         _line("page", page_bytes, "bytes", "page", f" ({len(weight)} files, uncompressed)"),
-        _line("node without vision", plain_rss, "MiB RSS", "plain", f" (PSS {plain_pss:.1f}){joining}"),
+        _line("node without vision", plain_maps["Rss"], "MiB RSS", "plain", f" (PSS {plain_maps['Pss']:.1f}){joining}"),
         f"ready after         {ready_s:8.1f} s; the task took {took:.1f} s",
         f"one open page       {pictures / span:8.1f} pictures a second, {carried / span / 1000:.0f} kB/s",
         f"datagrams           {rate:8.0f} a second (all of this machine's UDP)",

@@ -16,10 +16,11 @@ import random
 import sys
 import time
 from bisect import bisect_left
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from benchmarks.measure import percentile
 from middleware.consensus.bidding.announcement import Announcement
 from middleware.consensus.bidding.auction import Auction
 from middleware.consensus.bidding.bid import Bid
@@ -292,12 +293,6 @@ class Crowd:
         self.views[place] = reports
         if self._rule.decided(reports)[0] != before:
             self.changed_at[place] = self.now
-
-
-def percentile(values: Sequence[float], share: float) -> float:
-    """The value below which that share of ``values`` lies; infinite where there are none."""
-    ordered = sorted(values)
-    return ordered[min(len(ordered) - 1, int(share * len(ordered)))] if ordered else math.inf
 
 
 def measured(n: int, loss: float, dead: float, runs: int, seed: int, **options: object) -> dict[str, object]:

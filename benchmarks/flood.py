@@ -15,7 +15,6 @@ import os
 import random
 import resource
 import socket
-import subprocess
 import sys
 import tempfile
 import time
@@ -24,6 +23,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from benchmarks.measure import Child, percentile
 from middleware.admission import knock, membership
 from middleware.admission.operator import drawn
 from middleware.entangled.identity import Identity
@@ -128,45 +128,6 @@ def _fire(order: dict[str, Any]) -> int:
 # -- the one who measures ------------------------------------------------------------------------------------------
 
 
-class Child:
-    """A process that is asked and answers in lines of JSON."""
-
-    def __init__(self, *arguments: str) -> None:
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", *arguments], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-        )
-
-    def read(self) -> dict[str, Any]:
-        """The next line."""
-        assert self.process.stdout is not None
-        line = self.process.stdout.readline()
-        if not line:
-            raise RuntimeError("a process of the measurement ended early")
-        found: dict[str, Any] = json.loads(line)
-        return found
-
-    def say(self, what: str = "") -> None:
-        """Write a line."""
-        assert self.process.stdin is not None
-        self.process.stdin.write(what + "\n")
-        self.process.stdin.flush()
-
-    def asked(self) -> dict[str, Any]:
-        """A report."""
-        self.say()
-        return self.read()
-
-    def end(self) -> None:
-        """Close it, and wait until it is gone."""
-        assert self.process.stdin is not None
-        self.process.stdin.close()
-        try:
-            self.process.wait(5.0)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            self.process.wait()
-
-
 def _measured(seconds: float, rate: int) -> dict[str, Any]:
     dice = random.SystemRandom()
     operator = drawn("flooded", dice)
@@ -265,9 +226,7 @@ def _between(before: dict[str, Any], now: dict[str, Any], idle: float) -> dict[s
 
 def _high(seconds: Sequence[float]) -> float:
     """What 99 of 100 stay below, in milliseconds."""
-    if not seconds:
-        return float("inf")
-    return 1000.0 * sorted(seconds)[min(len(seconds) - 1, int(0.99 * len(seconds)))]
+    return 1000.0 * percentile(seconds, 0.99)
 
 
 def _printed(found: dict[str, Any]) -> list[str]:

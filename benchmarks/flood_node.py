@@ -22,6 +22,7 @@ from twisted.internet import reactor as running  # noqa: E402
 from twisted.internet.protocol import Protocol  # noqa: E402
 from twisted.internet.stdio import StandardIO  # noqa: E402
 
+from benchmarks.measure import memory_bytes  # noqa: E402
 from middleware.admission.membership import MembershipFile  # noqa: E402
 from middleware.admission.team import Team  # noqa: E402
 from middleware.entangled.contact import Contact  # noqa: E402
@@ -168,7 +169,7 @@ class Node(Protocol):
         report = {
             "at": reactor.seconds(),
             "cpu": times.user + times.system,
-            "rss": _rss(),
+            "rss": memory_bytes(),
             "bytes": dict(self._bytes),
             "calls": self.calls,
             "gaps": self.gaps,
@@ -189,11 +190,6 @@ class Node(Protocol):
         }
         self._clear()
         return report
-
-
-def _rss() -> int:
-    with open("/proc/self/statm") as file:
-        return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
 def main(path: str, known: str, *others: str) -> None:

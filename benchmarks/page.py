@@ -14,12 +14,12 @@ import json
 import resource
 import socket
 import struct
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Coroutine, Sequence
 from typing import Any
 
+from benchmarks.measure import Child, percentile
 from benchmarks.page_team import CODE, MARK, ROBOTS
 from sim.demo import port
 
@@ -158,30 +158,6 @@ def _age(picture: bytes) -> float:
     return time.monotonic() - float(struct.unpack("!d", picture[len(MARK) : len(MARK) + 8])[0])
 
 
-class Child:
-    """One process of the team."""
-
-    def __init__(self, *arguments: object) -> None:
-        command = [sys.executable, "-m", "benchmarks.page_team", *map(str, arguments)]
-        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-        assert self._process.stdout is not None and self._process.stdin is not None
-        self._said, self._asked = self._process.stdout, self._process.stdin
-        if not self._said.readline():
-            raise SystemExit("bench-page: a process of the team ended; its own words are above")
-
-    def figures(self) -> dict[str, float]:
-        """What it measured since the last time."""
-        self._asked.write("?\n")
-        self._asked.flush()
-        told: dict[str, float] = json.loads(self._said.readline())
-        return told
-
-    def stop(self) -> None:
-        """End it."""
-        self._asked.close()
-        self._process.wait(15)
-
-
 async def signed_in(where: int) -> tuple[str, list[str]]:
     """A ticket, and the robots' uuids as soon as all are there."""
     async with Connection(where, 0) as line:
@@ -201,7 +177,7 @@ async def measured(given: Any, web: Child, where: int) -> list[str]:
     ticket, uuids = await signed_in(where)
     load = Load(where, ticket, uuids)
     await asyncio.sleep(2)
-    before = web.figures()
+    before = web.asked()
     kinds = [(load.events, given.streams), (load.camera, given.cameras), (load.dribble, given.dribblers)]
     tasks = [
         asyncio.ensure_future(_after(ARRIVAL_S * number / count, client, number))
@@ -211,9 +187,9 @@ async def measured(given: Any, web: Child, where: int) -> list[str]:
     tasks += [asyncio.ensure_future(load.slowly(1)), asyncio.ensure_future(load.requests(given.rate))]
     await asyncio.sleep(ARRIVAL_S + 1)
     load.forget()
-    midway = web.figures()
+    midway = web.asked()
     await asyncio.sleep(given.seconds)
-    after = web.figures()
+    after = web.asked()
     unfed = given.streams - sum(time.monotonic() - at < 2 for at in load.beats.values())
     open_still = given.dribblers - len(load.closed)
     broken = [task for task in tasks if task.done() and task.exception() is not None]
@@ -221,10 +197,11 @@ async def measured(given: Any, web: Child, where: int) -> list[str]:
         task.cancel()
     await asyncio.gather(*tasks, return_exceptions=True)
     rate = len(load.ages) / given.seconds / max(1, given.cameras)
+    late, age = 1000 * percentile(load.answers, 0.99), 1000 * percentile(load.ages, 0.95)
     return [
         _line("streams not fed", unfed, "of them", "unfed", f" (longest time without a beat {load.longest:.2f} s)"),
-        _line("API, 99 of 100", 1000 * _part(load.answers, 0.99), "ms", "api", f" ({len(load.answers)} answers)"),
-        _line("picture's age, p95", 1000 * _part(load.ages, 0.95), "ms", "glass", f" ({rate:.1f} a second and viewer)"),
+        _line("API, 99 of 100", late, "ms", "api", f" ({len(load.answers)} answers)"),
+        _line("picture's age, p95", age, "ms", "glass", f" ({rate:.1f} a second and viewer)"),
         _line("slow viewer, oldest", max(load.slow, default=99.0), "s", "lag", f" ({len(load.slow)} pictures)"),
         _line("dribblers closed", max(load.closed, default=0.0), "s", "closed", f" ({open_still} are still open)"),
         _line("timers late", after["late_ms"], "ms", "late", f" (99 of 100: {after['late_p99_ms']:.1f} ms)"),
@@ -239,10 +216,6 @@ async def measured(given: Any, web: Child, where: int) -> list[str]:
 async def _after(seconds: float, client: Callable[[int], Coroutine[Any, Any, None]], number: int) -> None:
     await asyncio.sleep(seconds)
     await client(number)
-
-
-def _part(values: list[float], part: float) -> float:
-    return sorted(values)[int(part * len(values))] if values else 99.0
 
 
 def _line(what: str, value: float, unit: str, target: str, note: str) -> str:
@@ -263,13 +236,15 @@ def main(arguments: Sequence[str]) -> int:
     # Both ends of each connection are files; the children inherit this.
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(4096, most), most))
     udp, where = port.free("udp", "127.0.0.1", 1)[0], port.free("tcp", "127.0.0.1", 1)[0]
-    web = Child("web", udp, where)
-    robots = Child("robots", udp)
+    web = Child("benchmarks.page_team", "web", udp, where)
+    robots = Child("benchmarks.page_team", "robots", udp)
     try:
+        for child in (web, robots):
+            child.read()
         lines = asyncio.run(measured(given, web, where))
     finally:
-        robots.stop()
-        web.stop()
+        robots.end()
+        web.end()
     sys.stdout.write("\n".join(lines) + "\n")
     return 1 if any(word in line for line in lines for word in ("MISSED", "REFUSED", "BROKE")) else 0
 

@@ -11,12 +11,12 @@ import struct
 import sys
 import time
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from twisted.internet.stdio import StandardIO
 from twisted.protocols.basic import LineReceiver
 
+from benchmarks.measure import MIB, memory_bytes, percentile
 from middleware.config.settings import Settings
 from middleware.entangled.clock import use_monotonic_time
 from middleware.node import CAMERA
@@ -44,11 +44,6 @@ def settings(name: str, port: int, **tables: Any) -> Settings:
     return Settings.from_mapping({"node": {**node, "team_key": KEY, "roles": roles, "store": ":memory:"}, **tables}, "")
 
 
-def rss() -> float:
-    """The memory of this process, in MiB."""
-    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / (1 << 20)
-
-
 class Orders(LineReceiver):
     """Answers each line with figures; the end of the input ends the process."""
 
@@ -67,8 +62,12 @@ class Orders(LineReceiver):
         """Say how late the timers were since the last line, in ms, the memory in MiB, and the processor's seconds."""
         late = sorted(self._late) or [0.0]
         self._late.clear()
-        told = {"late_ms": 1000 * late[-1], "late_p99_ms": 1000 * late[int(0.99 * len(late))], "rss": rss()}
-        told["processor_s"] = time.process_time()
+        told = {
+            "late_ms": 1000 * late[-1],
+            "late_p99_ms": 1000 * percentile(late, 0.99),
+            "rss": memory_bytes() / MIB,
+            "processor_s": time.process_time(),
+        }
         self.sendLine(json.dumps(told).encode())
 
     def connectionLost(self, reason: Any = None) -> None:

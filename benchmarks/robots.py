@@ -16,13 +16,13 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
+from benchmarks.measure import MIB, memory_bytes, processor_s
 from drivers.reading import Observation
 
 DOGS = 3
 SERVICES = ("main", "estop", "state", "walk", "head", "camera")
 START_S = 30.0
 COMMAND_S = 0.1
-TICKS = os.sysconf("SC_CLK_TCK")
 TARGETS = {"frame_s": 0.032, "late_s": 0.020, "fps": 30.0, "wheel_ms": 20.0, "core": 0.05, "rss_mib": 45.0}
 """Seconds between world states and how late 95 of 100 may be, pictures a second, and what a driver may take."""
 
@@ -108,7 +108,7 @@ class Driven:
 
     def _begin(self) -> None:
         self._ends_at = self._reactor.seconds() + self._seconds
-        self._before = (time.monotonic(), _processor(os.getpid()))
+        self._before = (time.monotonic(), processor_s(os.getpid()))
         self._driver.subscribe(self._on_observation)
         self._command()
 
@@ -137,8 +137,8 @@ class Driven:
             "frames": self._frames,
             "pictures": len(self._pictures) / took,
             "commands": self._commands,
-            "core": (_processor(os.getpid()) - spent) / took,
-            "rss_mib": _rss(os.getpid()),
+            "core": (processor_s(os.getpid()) - spent) / took,
+            "rss_mib": memory_bytes() / MIB,
             "bad": self._driver.diagnostics()["bad_frames"],
         }
         print(json.dumps(told), flush=True)
@@ -171,7 +171,7 @@ def _measure(seconds: float) -> int:
         if yard.stdout.readline().strip() != "ready":
             raise SystemExit("the yard did not start")
         parts = {}
-        spent = _processor(yard.pid)
+        spent = processor_s(yard.pid)
         began = time.monotonic()
         for part, fps in (("30 pictures a second", 30.0), ("no camera", 0.0)):
             drivers.clear()
@@ -180,7 +180,7 @@ def _measure(seconds: float) -> int:
                 command = [*module, "--seconds", str(seconds), "--drive", options]
                 drivers.append(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
             parts[part] = [json.loads(one.communicate(timeout=seconds + START_S)[0]) for one in drivers]
-        share = (_processor(yard.pid) - spent) / (time.monotonic() - began)
+        share = (processor_s(yard.pid) - spent) / (time.monotonic() - began)
     finally:
         for one in drivers:
             one.kill()
@@ -232,19 +232,6 @@ def _waits(commands: list[list[float]], legs: list[list[str]]) -> list[float]:
         if place < len(legs):
             found.append(float(legs[place][2]) - at)
     return found
-
-
-def _processor(pid: int) -> float:
-    """Seconds of processor that a process has taken."""
-    with open(f"/proc/{pid}/stat", encoding="ascii") as stat:
-        fields = stat.read().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / TICKS
-
-
-def _rss(pid: int) -> float:
-    """MiB of memory that a process has in use."""
-    with open(f"/proc/{pid}/status", encoding="ascii") as status:
-        return next(int(line.split()[1]) for line in status if line.startswith("VmRSS")) / 1024.0
 
 
 if __name__ == "__main__":

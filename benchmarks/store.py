@@ -24,6 +24,7 @@ from typing import cast
 
 from twisted.internet.interfaces import IReactorFromThreads
 
+from benchmarks.measure import MIB, memory_bytes, percentile
 from middleware.entangled.data.sqlite import SqliteStore
 from middleware.entangled.record import MAX_VALUE, Record, hashed_key
 
@@ -35,7 +36,6 @@ TTL = 1e6
 RESTART_S = 2.0
 STALL_S = 0.05
 """What the reactor may be later by than an idle one, at the 99th percentile, while the store writes all it can."""
-MIB = 2**20
 
 
 def written_as(number: int) -> Record:
@@ -155,16 +155,10 @@ def serve(path: str) -> None:
 
     def serving() -> None:
         service.startService()
-        _say(len(seams.store), *_memory())
+        _say(len(seams.store), memory_bytes(), memory_bytes("VmHWM"))
 
     reactor.callWhenRunning(serving)
     reactor.run()
-
-
-def _memory() -> tuple[int, int]:
-    """Resident memory of this process, now and at its highest, in bytes."""
-    lines = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines())
-    return int(lines["VmRSS"].split()[0]) * 1024, int(lines["VmHWM"].split()[0]) * 1024
 
 
 def restarted(folder: str, rows: int, times: int = 5) -> bool:
@@ -201,10 +195,6 @@ def restarted(folder: str, rows: int, times: int = 5) -> bool:
 
 
 # -- rate -------------------------------------------------------------------------------------------------------------
-
-
-def _percentile(figures: list[float], share: float) -> float:
-    return sorted(figures)[min(len(figures) - 1, int(share * len(figures)))]
 
 
 class Rate:
@@ -271,7 +261,7 @@ async def _rates(folder: str, outcome: list[bool]) -> None:
     with closing(SqliteStore.open(os.path.join(folder, "idle.sqlite"), 0.0, deliver=deliver)) as store:
         idle = Rate(store, 0, 0, 0, 0)
         await idle.run()
-    usual = _percentile(idle.late, 0.99)
+    usual = percentile(idle.late, 0.99)
     _say(f"{'idle':>9} {'':61} {usual * 1000:12.2f} {max(idle.late) * 1000:8.2f}")
     for size, count, in_flight in ((200, 1500, 1), (200, 6000, 64), (10_000, 400, 16), (MIB, 24, 4)):
         if size > MAX_VALUE and size > 10_000:
@@ -286,12 +276,12 @@ async def _rates(folder: str, outcome: list[bool]) -> None:
             for key in keys * max(1, 20_000 // len(keys)):
                 store.get(key)
             gets = len(keys) * max(1, 20_000 // len(keys)) / (time.perf_counter() - started)
-        late = _percentile(rate.late, 0.99)
+        late = percentile(rate.late, 0.99)
         outcome.append(late <= usual + STALL_S)
         _say(
-            f"{size:9} {in_flight:10} {count / seconds:8.0f} {_percentile(rate.latencies, 0.5) * 1000:15.2f}"
-            f" {_percentile(rate.latencies, 0.99) * 1000:8.2f} {max(rate.latencies) * 1000:8.2f}"
-            f" {late * 1000:12.2f} {max(rate.late) * 1000:8.2f} {gets:9.0f} {_memory()[0] / MIB:8.1f}"
+            f"{size:9} {in_flight:10} {count / seconds:8.0f} {percentile(rate.latencies, 0.5) * 1000:15.2f}"
+            f" {percentile(rate.latencies, 0.99) * 1000:8.2f} {max(rate.latencies) * 1000:8.2f}"
+            f" {late * 1000:12.2f} {max(rate.late) * 1000:8.2f} {gets:9.0f} {memory_bytes() / MIB:8.1f}"
         )
 
 
@@ -303,7 +293,7 @@ def _sync_s(folder: str) -> float:
             file.write(bytes(4096))
             os.fsync(file.fileno())
             took.append(time.perf_counter() - started)
-    return _percentile(took, 0.5)
+    return percentile(took, 0.5)
 
 
 def rated(folder: str) -> bool:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from collections import Counter
 
 from sim.team.takers.light import LightTrial
 from sim.team.takers.trial import Trial
@@ -38,17 +39,18 @@ def main(arguments: list[str] | None = None) -> int:
         trial = kind(wanted.seed + number, tuples, loss, not wanted.calm, wanted.takers, wanted.nodes)
         sent = trial.board.counters["sent"]
         trial.play()
+        found = trial.violations()
         trial.stop()
+        broken = Counter(line[:2] for line in found)
         confirmed = len(trial.witness.posted) - len(trial.witness.open())
         print(
             f"{trial.seed:4d}  {loss:4.2f}  {'no' if wanted.calm else 'yes':>5}  {tuples:6d}  {confirmed:9d}"
-            f"  {len(trial.witness.split()) + len(trial.twice()):5d}  {len(trial.lost()):4d}"
-            f"  {len(trial.seen_again()):10d}"
+            f"  {broken['T1']:5d}  {broken['T2'] + broken['T5']:4d}  {broken['T3']:10d}"
             f"  {trial.clock.seconds():11.0f}  {(trial.board.counters['sent'] - sent) / max(1, tuples):15.0f}"
             f"  {time.monotonic() - began:6.0f}",
             flush=True,
         )
-        wrong += [f"seed {trial.seed}, loss {loss:.2f}: {text}" for text in trial.violations()]
+        wrong += [f"seed {trial.seed}, loss {loss:.2f}: {text}" for text in found]
     for text in wrong[:20]:
         print(text)
     return 1 if wrong else 0

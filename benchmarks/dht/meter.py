@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-MIB = 1024.0
+from benchmarks.measure import TICKS, maps_mib, udp_count
 
 
 def percentile(values: list[float], percent: float) -> float | None:
@@ -31,24 +31,14 @@ def cpu_s(pids: Iterable[int]) -> float:
 
 def memory_mib(pid: int) -> tuple[float, float]:
     """Resident memory of a process, and the part of it that is its own (RSS, USS)."""
-    text = Path(f"/proc/{pid}/smaps_rollup").read_text()
-    kib = {line.split(":")[0]: float(line.split()[1]) for line in text.splitlines()[1:] if line.endswith("kB")}
-    return kib["Rss"] / MIB, (kib["Private_Clean"] + kib["Private_Dirty"]) / MIB
-
-
-def datagrams() -> tuple[int, int]:
-    """The UDP datagrams that this machine has sent, and those that it dropped at full buffers, whosever they are.
-
-    In a network namespace of its own (``benchmarks/README.md``) the figures are of the nodes alone.
-    """
-    rows = [line.split() for line in Path("/proc/net/snmp").read_text().splitlines() if line.startswith("Udp:")]
-    return int(rows[1][rows[0].index("OutDatagrams")]), int(rows[1][rows[0].index("RcvbufErrors")])
+    mib = maps_mib(pid)
+    return mib["Rss"], mib["Private_Clean"] + mib["Private_Dirty"]
 
 
 def busy_s() -> float:
     """The seconds that all processors together were busy with anything."""
     fields = [int(field) for field in Path("/proc/stat").read_text().splitlines()[0].split()[1:9]]
-    return (sum(fields) - fields[3] - fields[4]) / os.sysconf("SC_CLK_TCK")
+    return (sum(fields) - fields[3] - fields[4]) / TICKS
 
 
 @dataclass
@@ -88,5 +78,5 @@ class Meter:
         return Cost(seconds, cpu, sent, dropped, max(0.0, foreign))
 
     def _now(self) -> tuple[float, ...]:
-        sent, dropped = datagrams()
+        sent, dropped = udp_count("OutDatagrams"), udp_count("RcvbufErrors")
         return time.monotonic(), cpu_s(self._pids), time.process_time(), float(sent), float(dropped), busy_s()

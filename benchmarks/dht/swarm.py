@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import os
 import random
 import time
@@ -22,13 +21,12 @@ from middleware.entangled.network.network import Address
 from middleware.entangled.network.udp import UdpNetwork
 from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import Record, hashed_key
+from middleware.entangled.space.tuplespace import TupleSpace
 
 TEAM_KEY = b"the key of a team that only runs"
 NAME = "bench"
 STANDS_AFTER_S = 0.2
 """A watch does not tell when its replicas have taken note of it."""
-FAST: Any = {"concern": "fast"} if "concern" in inspect.signature(EntangledNode.get).parameters else {}
-"""What ``get`` is asked for: the first answer, as the peers give it, where there is a choice."""
 reactor: Any = _reactor
 
 
@@ -84,8 +82,8 @@ class SwarmPeer:
         _tell(maybeDeferred(self._node.put, hashed_key(key), NAME, value), lambda held: done(held is not None))
 
     def get(self, key: str, value: bytes, done: Got) -> None:
-        """Read."""
-        _tell(self._node.get(hashed_key(key), **FAST), lambda found: done(found[0].value if found else None))
+        """Read; the first answer counts, as the peers give it."""
+        _tell(self._node.get(hashed_key(key), "fast"), lambda found: done(found[0].value if found else None))
 
     def holds(self, keys: list[str]) -> list[bool | None]:
         """Look into the store."""
@@ -104,10 +102,6 @@ class SwarmPeer:
     def space(self, verb: str, fields: list[object], limit_s: float, done: Done) -> None:
         """Do ``verb`` in the tuple space; "open" makes this node a part of it."""
         if self._space is None:
-            try:
-                from middleware.entangled.space.tuplespace import TupleSpace
-            except ImportError as error:
-                raise NotImplementedError(f"there is no tuple space here: {error}") from None
             self._space = TupleSpace(self._node, reactor, self._rng, NAME)
         if verb == "open":
             done(True)

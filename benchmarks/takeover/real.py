@@ -18,8 +18,7 @@ from typing import Any
 from twisted.internet.defer import Deferred
 from twisted.internet.task import deferLater
 
-from benchmarks.takeover.cause import PHASE_S, WEB, WITNESSES, Cause, Trial
-from benchmarks.takeover.judge import LOOK_S, Judge
+from benchmarks.takeover.cause import LOOK_S, PHASE_S, WEB, WITNESSES, Cause, Judge, Trial
 from benchmarks.takeover.lan import PORT, Lan
 from drivers.link import TcpConnector
 from drivers.sim.operator import YardOperator

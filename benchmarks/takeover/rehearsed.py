@@ -8,8 +8,7 @@ from dataclasses import replace
 from twisted.internet.defer import Deferred
 
 from agents.catalogue import task_named
-from benchmarks.takeover.cause import PHASE_S, WEB, WITNESSES, Cause, Trial
-from benchmarks.takeover.judge import LOOK_S, Judge
+from benchmarks.takeover.cause import LOOK_S, PHASE_S, WEB, WITNESSES, Cause, Judge, Trial
 from middleware.entangled.network.switchboard import Weather
 from middleware.entangled.record import Record
 from middleware.tasks.task import Task, outcome_of

@@ -9,7 +9,9 @@ tuples, R of the wire.  Each is a function of the events; what was asked and nev
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Iterator
+from types import ModuleType
 
 from sim.team.event import Event
 from sim.team.invariant import agreement, durability, execution, taking, wire
@@ -17,46 +19,14 @@ from sim.team.invariant import agreement, durability, execution, taking, wire
 Invariant = Callable[[Iterable[Event]], Iterator[str]]
 Kinds = tuple[type[Event], ...]
 
-PARTS: tuple[tuple[Kinds, tuple[tuple[str, Invariant], ...]], ...] = (
-    (
-        execution.KINDS,
-        (
-            ("E1", execution.e1),
-            ("E2", execution.e2),
-            ("E3", execution.e3),
-            ("E5", execution.e5),
-            ("E8", execution.e8),
-            ("E9", execution.e9),
-        ),
-    ),
-    (
-        agreement.KINDS,
-        (("E4", agreement.e4), ("E5", agreement.e5), ("E6", agreement.e6), ("E7", agreement.e7)),
-    ),
-    (
-        durability.KINDS,
-        (
-            ("D1", durability.d1),
-            ("D2", durability.d2),
-            ("D3", durability.d3),
-            ("D4", durability.d4),
-            ("D5", durability.d5),
-            ("D6", durability.d6),
-            ("D7", durability.d7),
-        ),
-    ),
-    (
-        taking.KINDS,
-        (
-            ("T1", taking.t1),
-            ("T2", taking.t2),
-            ("T3", taking.t3),
-            ("T4", taking.t4),
-            ("T5", taking.t5),
-            ("T6", taking.t6),
-        ),
-    ),
-    (wire.KINDS, (("R1", wire.r1), ("R2", wire.r2), ("R3", wire.r3), ("R4", wire.r4))),
+
+def _named(part: ModuleType) -> tuple[tuple[str, Invariant], ...]:
+    """The invariants of a module, which are its functions of one letter and a number."""
+    return tuple((name.upper(), found) for name, found in vars(part).items() if re.fullmatch(r"[a-z]\d", name))
+
+
+PARTS: tuple[tuple[Kinds, tuple[tuple[str, Invariant], ...]], ...] = tuple(
+    (part.KINDS, _named(part)) for part in (execution, agreement, durability, taking, wire)
 )
 """Of each part of a team the events that it goes by, and the invariants; E5 binds devices, and agents as well."""
 

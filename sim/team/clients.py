@@ -6,7 +6,8 @@ Who runs them judges nothing: the checker does, by what stands in the history (`
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
+from typing import TypeVar
 
 from twisted.internet.defer import Deferred
 from twisted.python.failure import Failure
@@ -21,6 +22,21 @@ from sim.team.invariant.durability import Slot
 
 WRITE, REMOVE, READ = "write", "remove", "read"
 """As the checker knows what is asked."""
+
+
+T = TypeVar("T")
+
+
+def follow(
+    history: History, number: int, work: Deferred[T], shown: Callable[[T], object] = lambda result: None
+) -> None:
+    """Write down what comes of ``work``, asked under ``number``: what is ``shown`` of its result, or why it failed."""
+
+    def failed(failure: Failure) -> None:
+        failure.trap(EntangledError)
+        history.unanswered(number, failure.value, failure.check(Unavailable) is not None)
+
+    work.addCallbacks(lambda result: history.answered(number, shown(result)), failed)
 
 
 class Clients:

@@ -14,12 +14,10 @@ from sim.team.load.catalogue import LOADS
 from sim.team.memory import Read, check, resident
 from sim.team.picture import drawn
 from sim.team.progress import Progress
-from sim.team.report import Cost, again, packed, text
+from sim.team.report import Cost, Samples, Trace, again, packed, text
 from sim.team.run import Run
-from sim.team.samples import Samples
 from sim.team.scenario import Scenario, loaded, names, place_of, remedy_of
 from sim.team.standing import STANDING
-from sim.team.trace import Trace
 from sim.team.workload import Kinds
 
 KINDS: Kinds = {"standing": STANDING, **LOADS}

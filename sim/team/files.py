@@ -167,10 +167,6 @@ class DiskFleet(Fleet):
         """Which memory the node of a place has."""
         return self._memories[place]
 
-    def forgets(self, place: int) -> bool:
-        """It may: what was put a moment ago is not in the file yet, and a file may rot."""
-        return True
-
     def disk(self, place: int) -> DiskStore:
         """The store of the node of a place."""
         store = self.stores[place]
@@ -189,9 +185,12 @@ class DiskFleet(Fleet):
             self.lost += [f"node {place} lost what was safe: {line}" for line in former.lost(store)]
         return store
 
-    def kill(self, place: int) -> None:
-        """End a node as a loss of power does: its file is left as it is, or with half a commit."""
-        super().kill(place)
+    def kill(self, place: int, forgets: bool = True) -> None:
+        """End a node as a loss of power does: its file is left as it is, or with half a commit.
+
+        The next life may lack what was put a moment ago and is not in the file yet, and a file may rot.
+        """
+        super().kill(place, forgets)
         store, path = self.disk(place), self._path(place)
         self._memories[place] += 1
         later = self._path(place)

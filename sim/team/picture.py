@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from html import escape
 
-from sim.team.samples import Series
+from sim.team.report import Series
 
 WIDE, HIGH, LEFT, TOP, GAP, COLUMNS = 360, 120, 62, 46, 46, 2
 LINE, AXIS, FAULT = "#2563a8", "#6b7280", "#c2410c"

@@ -59,7 +59,7 @@ class Progress:
         share = min(1.0, moment / end) if end else 0.0
         done = round(BAR * share)
         bar = f"[{'#' * done}{'.' * (BAR - done)}] " if self._columns else ""
-        alive, inside = len(team.nodes), len(team.inside())
+        alive, inside = len(team.living), len(team.inside())
         who = f"{alive:,} alive" + (f", {alive - inside:,} of them not in" if alive != inside else "")
         sent = team.board.counters["sent"]
         memory = f", {self._resident() / 2**20:,.0f} MiB" if self._resident() else ""

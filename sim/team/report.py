@@ -1,4 +1,4 @@
-"""Report: what came of a run, for people and as JSON, with the line that repeats it."""
+"""What came of a run, for people and as JSON, with the line that repeats it; its figures over time, and its trace."""
 
 from __future__ import annotations
 
@@ -6,14 +6,61 @@ import json
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TextIO
 
 from sim.team.figure import table
-from sim.team.run import Outcome
-from sim.team.samples import Series
+from sim.team.run import Outcome, Run
 from sim.team.scenario import Scenario
 
 VERSION = 1
 MOST_SHOWN = 20
+MOST_SAMPLES = 240
+"""Samples of a run; where it takes longer than was thought, every other one is dropped."""
+FIGURES_EVERY = 6
+"""The workloads' figures are asked for in every sixth sample only: some of them look at all there is."""
+
+Series = dict[str, list[tuple[float, float]]]
+
+
+class Samples:
+    """What was there at moments of the team's time; by name, (moment, value)."""
+
+    def __init__(self) -> None:
+        self.series: Series = {}
+        self._every = 0.0
+        self._next = 0.0
+        self._taken = 0
+        self._before = (0.0, 0, 0)
+
+    def looked(self, run: Run) -> None:
+        """Take a sample where it is time for one."""
+        now = run.team.clock.seconds()
+        if now < self._next:
+            return
+        self._every = self._every or run.expected_end / MOST_SAMPLES
+        self._next = now + self._every
+        self._taken += 1
+        team, (then, sent, size) = run.team, self._before
+        total = team.board.counters["sent"]
+        bytes_sent = sum(team.traffic(place).sent_bytes for place in team.places)
+        passed, alive = now - then, len(team.living)
+        self._add("nodes alive", now, alive)
+        self._add("nodes in the network", now, len(team.inside()))
+        if passed and alive:
+            self._add("datagrams per node and second", now, (total - sent) / passed / alive)
+            self._add("bytes per node and second", now, (bytes_sent - size) / passed / alive)
+        self._before = now, total, bytes_sent
+        if run.began_at is not None and self._taken % FIGURES_EVERY == 0:
+            for figure in run.figures():
+                if figure.is_exact and figure.value is not None:
+                    self._add(figure.name, now, figure.value)
+        if self._taken > 2 * MOST_SAMPLES:
+            self.series = {name: points[::2] for name, points in self.series.items()}
+            self._every *= 2
+            self._taken //= 2
+
+    def _add(self, name: str, now: float, value: float) -> None:
+        self.series.setdefault(name, []).append((round(now, 3), value))
 
 
 @dataclass(frozen=True)
@@ -82,3 +129,40 @@ def _jagged(series: Series) -> dict[str, Sequence[tuple[float, float | None]]]:
         name: [(moment, value if abs(value) != float("inf") and value == value else None) for moment, value in points]
         for name, points in series.items()
     }
+
+
+MOST_LINES = 200_000
+"""Lines; after these only the last one follows, which says how many are not there."""
+
+
+class Trace:
+    """Writes to ``out`` what a team tells (``Team.told``)."""
+
+    def __init__(self, out: TextIO, most: int = MOST_LINES) -> None:
+        self._out = out
+        self._most = most
+        self._told = 0
+
+    def begin(self, **facts: object) -> None:
+        """Write what run this is."""
+        self._write({"trace": 1, **facts})
+
+    def told(self, now: float, event: str, place: int, more: str) -> None:
+        """Write one event: the moment in seconds, what happened, at which place, and more about it."""
+        self._told += 1
+        if self._told > self._most:
+            return
+        line: dict[str, object] = {"at": round(now, 6), "event": event}
+        if place >= 0:
+            line["place"] = place
+        if more:
+            line["more"] = more
+        self._write(line)
+
+    def end(self, **facts: object) -> None:
+        """Write how it ended, and how many events are not there."""
+        self._write({"end": True, "events": self._told, "left_out": max(0, self._told - self._most), **facts})
+        self._out.flush()
+
+    def _write(self, line: dict[str, object]) -> None:
+        self._out.write(json.dumps(line, separators=(",", ":")) + "\n")

@@ -158,7 +158,7 @@ class Run:
         self._pass(last)
         self._pass(within, until=team.is_standing)
         self.expected_end += team.clock.seconds() - last
-        outside = len(team.nodes) - len(team.inside())
+        outside = len(team.living) - len(team.inside())
         if outside and not self._is_ended:
             self.violations.append(f"join: {outside} nodes are not in {within:g} s after the last came")
 

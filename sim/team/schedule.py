@@ -7,18 +7,16 @@ the repair interval is over the workloads give their verdicts.
 from __future__ import annotations
 
 import random
-from collections.abc import Callable, Sequence
-from typing import Protocol
+from collections.abc import Sequence
 
-from middleware.entangled.errors import NotRunning
 from middleware.entangled.network.network import Address
 from middleware.entangled.network.switchboard import CALM, Weather
 from middleware.entangled.node import EntangledNode
 from sim.team.checker import check
-from sim.team.event import Born, Died, Settled
+from sim.team.event import Settled
 from sim.team.faults.timeline import TimedFault, Timeline
-from sim.team.history import History
 from sim.team.shrink import WHOLE, Trim
+from sim.team.workload import Workload
 from sim.team.world import Fleet
 
 STRANDED = 0.15
@@ -28,29 +26,12 @@ SETTLE = 45.0
 """Seconds after which a healed team is as it should be: tries, three rounds of mending, and a struck member."""
 
 
-Watcher = Callable[[int, EntangledNode], object]
-"""Called with a place and its node."""
-
-
-class Workload(Protocol):
-    """What clients do beside the faults; they write down in the history what they asked for and what they got."""
-
-    def step(self) -> None:
-        """Do something, every ``STEP`` seconds while the faults last."""
-
-    def settled(self) -> None:
-        """The faults are over and the repair interval has passed: ask what is to be asked; 10 s are left for it."""
-
-    def verdict(self) -> list[str]:
-        """Write down how things stand at the end; what only the workload itself can judge, a line each."""
-
-
 class Schedule:
     """The run of ``seed``: a fleet, its weather and its faults.
 
     ``workloads`` are made with the schedule when the fleet stands.  ``rng`` is for the first of them; the others have
-    dice of their own, so that the seeds that show a bug go on showing it.  ``world`` is what makes the nodes;
-    ``life`` has the number of each place's present life.  ``trim`` says what is left of it.
+    dice of their own, so that the seeds that show a bug go on showing it.  ``world`` is what makes the nodes; ``trim``
+    says what is left of it.
     """
 
     def __init__(self, seed: int, world: type[Fleet] = Fleet, trim: Trim = WHOLE) -> None:
@@ -61,7 +42,7 @@ class Schedule:
         self.n = dice.choice([3, 4, 5, 5, 6, 7, 9, 10, 11])
         self.seconds = dice.choice([20.0, 30.0, 45.0])
         self.fleet = world(self.n, seed, Weather(delay_s=0.002))
-        self.history = History(self.fleet.clock.seconds)
+        self.history = self.fleet.history
         self.liar: int | None = dice.randrange(self.n) if dice.random() < 0.2 else None
         self.weather = Weather(
             delay_s=dice.choice([0.001, 0.01, 0.05]),
@@ -78,30 +59,15 @@ class Schedule:
             self.faults += self._stranded(dice)
         self.seconds = trim.within(self.seconds)
         self.down: set[int] = set()
-        self.dead: set[int] = set()
-        self.life: dict[int, int] = {}
-        self._on_birth: list[Watcher] = []
-        self._on_death: list[Watcher] = []
-        self.attend(self._born, lambda place, node: self.history.note(Died, place, self.fleet.forgets(place)))
+        """The places whose nodes are to come back."""
 
     def alive(self) -> list[int]:
         """The places whose nodes run."""
-        return [place for place in range(self.n) if place not in self.down and place not in self.dead]
+        return self.fleet.alive()
 
     def node(self, place: int) -> EntangledNode:
         """The node of a place, in its present life."""
         return self.fleet.nodes[place]
-
-    def attend(self, born: Watcher, died: Watcher) -> None:
-        """Call ``born`` with every node that lives, and with each that is made later before it starts, and ``died``."""
-        self._on_birth.append(born)
-        self._on_death.append(died)
-        for place in self.alive():
-            born(place, self.node(place))
-
-    def is_calm(self) -> bool:
-        """Whether no fault lasts and the weather is over."""
-        return self.fleet.board.weather is CALM and not self.down
 
     def addresses(self, places: Sequence[int]) -> list[Address]:
         """Where those places listen."""
@@ -136,20 +102,10 @@ class Schedule:
     def restart(self, place: int) -> None:
         """Let the node of a place live again, on the store of its former life."""
         self.down.discard(place)
-        others = self.alive()
-        known = [other for other in self.rng.sample(others, min(2, len(others))) if other != place]
-        node = self.fleet.nodes[place] = self.fleet.made(place)
-        for born in self._on_birth:
-            born(place, node)
-        # It may be killed again before it has found anybody.
-        self.fleet.enter(node, self.addresses(known)).addErrback(lambda failure: failure.trap(NotRunning))
+        others = sorted({*self.alive(), place})
+        self.fleet.restart(place, [one for one in self.rng.sample(others, min(2, len(others))) if one != place])
 
     # -- inside -----------------------------------------------------------------------------------------------------
-
-    def _born(self, place: int, node: EntangledNode) -> None:
-        life = self.life[place] = self.life.get(place, 0) + 1
-        identity, address = node.identity, self.fleet.address(place)
-        self.history.note(Born, place, life, identity.public, identity.node_id, str(address))
 
     def _faults(self, dice: random.Random) -> list[TimedFault]:
         places, faults = list(range(self.n)), []
@@ -181,22 +137,14 @@ class Schedule:
         first = at + dice.choice([0.5, 2.0, 5.0])
         return faults + [TimedFault(first + n, first + n, "join", (place, *few)) for n, place in enumerate(newcomers)]
 
-    def _join(self, place: int, known: Sequence[int]) -> None:
-        """A newcomer joins through ``known``."""
-        node = self.fleet.made(place)
-        self.fleet.nodes.append(node)
-        self.n += 1
-        for born in self._on_birth:
-            born(place, node)
-        self.fleet.enter(node, self.addresses(known)).addErrback(lambda failure: failure.trap(NotRunning))
-
     def _begin(self, fault: TimedFault) -> None:
         board = self.fleet.board
         if fault.kind == "join":
-            place, *known = len(self.fleet.nodes), *fault.places[1:]
-            if self.dead.issuperset(known):
+            known: Sequence[int] = fault.places[1:]
+            if not {*self.alive(), *self.down}.intersection(known):
                 known = self.alive()[:1]  # who knows nobody but the dead never gets in
-            self._join(place, known)
+            self.fleet.restart(len(self.fleet.nodes), known)
+            self.n += 1
         elif fault.kind == "cut":
             board.partition(self.addresses(fault.places))
         elif fault.kind == "one way":
@@ -204,12 +152,10 @@ class Schedule:
             board.cut(source, target, one_way=True)
         else:
             for place in fault.places:
-                if place in self.down or place in self.dead:
-                    continue
-                (self.dead if fault.kind == "die" else self.down).add(place)
-                for died in self._on_death:
-                    died(place, self.node(place))
-                self.fleet.kill(place)
+                if place in self.fleet.living:
+                    if fault.kind != "die":
+                        self.down.add(place)
+                    self.fleet.kill(place)
 
     def _end(self, fault: TimedFault) -> None:
         if fault.kind in ("cut", "one way"):

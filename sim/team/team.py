@@ -7,7 +7,6 @@ scenario and the seed: ``digest`` is the same wherever they are, and whatever el
 from __future__ import annotations
 
 import hashlib
-import random
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
@@ -17,28 +16,20 @@ from twisted.internet.interfaces import IDelayedCall, IReactorTime
 from twisted.logger import Logger
 
 from middleware.directory.presence import Device
-from middleware.entangled.clock import HeapClock
 from middleware.entangled.errors import NotRunning
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.nat import Nat
 from middleware.entangled.network.network import Address, Network
-from middleware.entangled.network.switchboard import Switchboard, Traffic
+from middleware.entangled.network.switchboard import Traffic
 from middleware.entangled.node import EntangledNode
 from middleware.node import SwarmNode
 from sim.team.disk import Disk, Memory, next_life
-from sim.team.event import Born, Died
-from sim.team.history import History
 from sim.team.link import TeamLink
 from sim.team.machine import Machine, MachineNetwork
 from sim.team.scenario import Scenario
-
-KEY = b"t" * 32
-PORT = 7000
-CAPABILITIES = {"camera": {"width": 208}}
+from sim.team.world import CAPABILITIES, PORT, TEAM, World
 
 Node = EntangledNode | SwarmNode
-Watcher = Callable[[int, Node], object]
-"""Called with a place and its node."""
 Told = Callable[[float, str, int, str], object]
 """Called with the moment, what happened, at which place (-1: at none), and more about it."""
 
@@ -51,14 +42,13 @@ def core(node: Node) -> EntangledNode:
 class Place:
     """What stays at a place from life to life; ``step`` is how wrong its wall clock is."""
 
-    __slots__ = ("address", "identity", "store", "traffic", "lives", "step", "rate", "home", "machine", "entered")
+    __slots__ = ("address", "identity", "store", "traffic", "step", "rate", "home", "machine", "entered")
 
     def __init__(self, address: Address, identity: Identity, store: Memory) -> None:
         self.address = address
         self.identity = identity
         self.store = store
         self.traffic = Traffic()
-        self.lives = 0
         self.step = 0.0
         self.rate = 1.0
         self.home: Nat | None = None
@@ -67,47 +57,33 @@ class Place:
         """Those who wait for it to be in the network; None: it is."""
 
 
-class Team:
+class Team(World):
     """The team of a ``scenario``; nobody is there before ``stand`` or ``come``."""
 
+    seed: int
+    living: dict[int, Node]
     _log = Logger()
 
     def __init__(self, scenario: Scenario, seed: int = 1) -> None:
+        super().__init__(seed)
         self.scenario = scenario
-        self.seed = seed
-        self.clock = HeapClock()
-        self.board = Switchboard(self.clock, self.rng("board"))
         self.link = TeamLink(scenario.link, f"{seed}/spots")
         self.board.link = self.link
-        self.nodes: dict[int, Node] = {}
-        """By place, the nodes that live."""
         self.told: list[Told] = []
-        self.on_birth: list[Watcher] = []
-        self.on_death: list[Watcher] = []
-        self.history = History(self.clock.seconds)
-        """What happened, for the checker: who lived, and what clients asked for and were told."""
         self._places: list[Place] = []
-        self._dice = self.rng("team")
+        self._dice = self.generator("team")
         self._inside: list[int] = []
         self._inside_at: dict[int, int] = {}
-        self._history = hashlib.blake2b(digest_size=32)
+        self._hash = hashlib.blake2b(digest_size=32)
         for _ in range(scenario.nodes):
             self._new_place()
 
     # -- who is there -----------------------------------------------------------------------------------------------
 
-    def rng(self, name: str) -> random.Random:
-        """Dice of that name, which fall as the seed says, whoever else throws."""
-        return random.Random(f"{self.seed}/{name}")
-
     @property
     def places(self) -> range:
         """Every place that ever was."""
         return range(len(self._places))
-
-    def alive(self) -> list[int]:
-        """The places whose nodes run, those included that stand still."""
-        return sorted(self.nodes)
 
     def inside(self) -> list[int]:
         """The places whose nodes are in the network, in no order that means anything; not to be changed."""
@@ -119,11 +95,11 @@ class Team:
 
     def node(self, place: int) -> Node:
         """The node of a place in its present life; ``KeyError`` where there is none."""
-        return self.nodes[place]
+        return self.living[place]
 
     def entangled(self, place: int) -> EntangledNode:
         """The peer of the network that the node of a place is, or has."""
-        return core(self.nodes[place])
+        return core(self.living[place])
 
     def identity(self, place: int) -> Identity:
         """Who the node of a place is."""
@@ -137,18 +113,11 @@ class Team:
         """What stays at a place from life to life."""
         return self._places[place]
 
-    def attend(self, born: Watcher, died: Watcher) -> None:
-        """Call ``born`` with every node that lives, and with each that is made later before it starts, and ``died``."""
-        self.on_birth.append(born)
-        self.on_death.append(died)
-        for place in self.alive():
-            born(place, self.nodes[place])
-
     def entered(self, place: int) -> Deferred[bool]:
         """Fire when the node of a place is in the network: with True, or with False if it ends before."""
         done: Deferred[bool] = Deferred()
         waiting = self._places[place].entered
-        if place not in self.nodes:
+        if place not in self.living:
             done.callback(False)
         elif waiting is None:
             done.callback(True)
@@ -158,10 +127,6 @@ class Team:
 
     # -- time -------------------------------------------------------------------------------------------------------
 
-    def run(self, seconds: float) -> None:
-        """Let time pass."""
-        self.clock.advance(seconds)
-
     def at(self, seconds: float, call: Callable[[], object]) -> IDelayedCall:
         """Call in so many seconds from now."""
         return self.clock.callLater(seconds, call)
@@ -169,13 +134,13 @@ class Team:
     def tell(self, event: str, place: int = -1, more: str = "") -> None:
         """Write down what happened; it is part of the digest."""
         now = self.clock.seconds()
-        self._history.update(f"{now!r} {event} {place} {more}\n".encode())
+        self._hash.update(f"{now!r} {event} {place} {more}\n".encode())
         for told in self.told:
             told(now, event, place, more)
 
     def digest(self) -> str:
         """The hash of every datagram that was delivered and of everything that was told, in hex."""
-        whole = self._history.copy()
+        whole = self._hash.copy()
         whole.update(self.board.digest().encode())
         return whole.hexdigest()
 
@@ -196,7 +161,7 @@ class Team:
 
     def is_standing(self) -> bool:
         """Whether every node that lives is in the network."""
-        return len(self._inside) == len(self.nodes)
+        return len(self._inside) == len(self.living)
 
     def stand(self) -> None:
         """Let the team come and settle; who is not in by then is still trying."""
@@ -211,20 +176,17 @@ class Team:
 
     def start(self, place: int, known: Sequence[int] | None = None) -> Node:
         """The next life of the node of a place; it joins through the ``known`` places (None: some that are in)."""
-        if place in self.nodes:
+        if place in self.living:
             raise ValueError(f"the node of place {place} lives")
         here = self._places[place]
-        if here.lives:
+        if self.life[place]:
             here.store = next_life(here.store, self._store(place), self.clock.seconds())
-        here.lives += 1
         here.entered = []
         through = [self.address(other) for other in (self._known(place) if known is None else known)]
-        node = self.nodes[place] = self._made(place, here, through)
-        who, life = here.identity, here.lives
-        self.tell("born", place, who.node_id.hex())
-        self.history.note(Born, place, life, who.public, who.node_id, str(here.address))
-        for born in self.on_birth:
-            born(place, node)
+        node = self._made(place, here, through)
+        self.tell("born", place, here.identity.node_id.hex())
+        self.begin_life(place, node, here.identity)
+        life = self.life[place]
         if isinstance(node, SwarmNode):
             node.startService()
             joined: Deferred[Any] = node.joined
@@ -236,8 +198,6 @@ class Team:
         joined.addErrback(lambda failure: failure.trap(NotRunning))
         joined.addErrback(lambda failure: self._log.failure("while joining", failure))
         return node
-
-    restart = start
 
     def add(self, known: Sequence[int] | None = None) -> int:
         """A newcomer, at a place of its own; returns that."""
@@ -270,10 +230,10 @@ class Team:
 
     def replace(self, place: int) -> None:
         """Let somebody else have the place of a node that has ended: another identity, and an empty store."""
-        if place in self.nodes:
+        if place in self.living:
             raise ValueError(f"the node of place {place} lives")
         here = self._places[place]
-        here.identity = self._identity(place, here.lives)
+        here.identity = self._identity(place, self.life[place])
         here.store = self._store(place)  # which is empty, and so is what is left of it
 
     def freeze(self, place: int) -> None:
@@ -297,7 +257,7 @@ class Team:
         place = len(self._places)
         address = Address(f"10.{place >> 16}.{place >> 8 & 255}.{place & 255}", PORT)
         here = Place(address, self._identity(place, 0), self._store(place))
-        scenario, dice = self.scenario, self.rng(f"place/{place}")
+        scenario, dice = self.scenario, self.generator(f"place/{place}")
         if scenario.clocks.drift:
             here.rate = 1 + dice.uniform(-1, 1) * scenario.clocks.drift
         if scenario.clocks.wall:
@@ -310,7 +270,7 @@ class Team:
         return place
 
     def _identity(self, place: int, lives: int) -> Identity:
-        return Identity(self.rng(f"identity/{place}/{lives}").randbytes(32))
+        return Identity(self.generator(f"identity/{place}/{lives}").randbytes(32))
 
     def _store(self, place: int) -> Memory:
         return Disk(self.clock, self._dice) if self.scenario.has_disks else Memory()
@@ -322,20 +282,20 @@ class Team:
         if self.scenario.has_machines:
             clock = here.machine = Machine(self.clock, here.rate)
             network = MachineNetwork(here.machine, port)
-        rng = self.rng(f"{place}/{here.lives}")  # dice never fall as those of a former life
+        rng = self.generator(f"{place}/{self.life[place] + 1}")  # dice never fall as those of a former life
 
         def wall() -> float:
             return self.clock.seconds() + here.step
 
         lease = self.scenario.lease
         if self.scenario.kind == "entangled":
-            return EntangledNode(here.identity, KEY, network, here.store, clock, rng, lease, wall)
+            return EntangledNode(here.identity, TEAM, network, here.store, clock, rng, lease, wall)
         device = Device("", f"dog{place}", capabilities=CAPABILITIES)
-        return SwarmNode(device, here.identity, KEY, known, network, here.store, clock, rng, wall, lease)
+        return SwarmNode(device, here.identity, TEAM, known, network, here.store, clock, rng, wall, lease)
 
     def _known(self, place: int) -> list[int]:
         """Whom a node knows: some that are in the network, and first of all the first one."""
-        others = self._inside if self._inside else [other for other in list(self.nodes)[:1] if other != place]
+        others = self._inside if self._inside else [other for other in list(self.living)[:1] if other != place]
         count = min(self.scenario.join.known, len(others))
         if self.scenario.nat.share:  # who is behind a router cannot be written to by strangers
             others = [other for other in others if self._places[other].home is None]
@@ -344,7 +304,7 @@ class Team:
 
     def _is_in(self, place: int, life: int) -> None:
         here = self._places[place]
-        if here.lives != life or place not in self.nodes or here.entered is None:
+        if self.life[place] != life or place not in self.living or here.entered is None:
             return
         self._inside_at[place] = len(self._inside)
         self._inside.append(place)
@@ -354,17 +314,13 @@ class Team:
             done.callback(True)
 
     def _ends(self, place: int, how: str) -> Node:
-        node = self.nodes[place]
-        for died in self.on_death:
-            died(place, node)
-        del self.nodes[place]
+        node: Node = self.end_life(place)
         at = self._inside_at.pop(place, None)
         if at is not None:
             last = self._inside.pop()
             if last != place:
                 self._inside[at], self._inside_at[last] = last, at
         self.tell(how, place)
-        self.history.note(Died, place)
         waiting, self._places[place].entered = self._places[place].entered or [], None
         for done in waiting:
             done.callback(False)

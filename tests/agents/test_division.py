@@ -17,7 +17,7 @@ from middleware.consensus.guard import Guard
 from middleware.consensus.strategy import strategy_for
 from middleware.directory.presence import EXECUTING, SEARCHING, WAITING
 from middleware.tasks.task import Member, Task
-from tests.invariants.groups import Groups
+from tests.invariants.tasks import Groups
 
 AGENTS = ("a", "b", "c")
 Costs = dict[str, dict[str, float | None]]

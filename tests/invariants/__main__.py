@@ -15,8 +15,7 @@ from middleware.errors import BadSetting
 from sim.team import logbook
 from sim.team.shrink import Trim
 from tests.invariants.bug import BUGS, FINDERS
-from tests.invariants.least import Least, least, line
-from tests.invariants.run import ALONE, WORKLOADS, Outcome, hunt_all, run_all
+from tests.invariants.run import ALONE, WORKLOADS, Least, Outcome, hunt_all, least, line, run_all
 
 BOUND = 400
 """Schedules within which each bug must show, unless fewer are asked for."""
@@ -61,7 +60,7 @@ def main() -> int:
     if wanted.log and (wanted.bug or wanted.bugs):
         parser.error("--log: runs with a bug put in are not logged")
     if wanted.bug:
-        only = only or FINDERS.get(wanted.bug, ("records",))
+        only = only or FINDERS[wanted.bug]
     try:
         seeds = range(wanted.seed, wanted.seed + count)
         if wanted.bugs:

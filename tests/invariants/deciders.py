@@ -16,11 +16,12 @@ from benchmarks.consensus.mission import Mission
 from middleware.consensus.strategies.nearest import Nearest
 from middleware.consensus.strategy import Report
 from sim.team.schedule import Schedule
+from sim.team.workload import Workload
 
 LINE = 12
 
 
-class Deciders:
+class Deciders(Workload):
     """Reports of random teams, and bidders on a line, beside the schedule of ``schedule.seed``."""
 
     def __init__(self, schedule: Schedule) -> None:

@@ -11,11 +11,11 @@ from collections.abc import Sequence
 from typing import Any
 
 from twisted.internet.defer import Deferred
-from twisted.python.failure import Failure
 
 from middleware.consensus.lease.lessee import STAGGER
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import EntangledError
+from sim.team.clients import follow
 from sim.team.event import Awaited
 from sim.team.faults.timeline import TimedFault, Timeline
 from sim.team.leases.radio import CALM, Air
@@ -89,8 +89,8 @@ class Leases(LeaseTeam):
 
     @property
     def digest(self) -> str:
-        """The hash of every message, and of who won when."""
-        return self.radio.digest()
+        """The hash of every message that arrived, and when."""
+        return self.board.digest()
 
     def __str__(self) -> str:
         """What the schedule was."""
@@ -99,7 +99,7 @@ class Leases(LeaseTeam):
             "; ".join(map(str, self.faults))
         )
 
-    def run(self) -> list[str]:
+    def run(self) -> list[str]:  # type: ignore[override]
         """Faults, then health; the violations, a line each."""
         self.clock.advance(self.ttl + 0.1)
         self.radio.air = self.air
@@ -215,13 +215,8 @@ class Leases(LeaseTeam):
 
         def ended(_: object) -> None:
             lessee.release()
-            history.answered(asked)
 
-        def failed(failure: Failure) -> None:
-            failure.trap(EntangledError)
-            history.unanswered(asked, failure.value)
-
-        closing.addCallbacks(ended, failed)
+        follow(history, asked, closing.addCallback(ended))
         self.clock.advance(2 * self.ttl)
         for agent in self.agents:
             self.bidders[agent].lessee(task_id).want()

@@ -12,16 +12,17 @@ from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.overlay import K
 from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import Record, hashed_key
-from sim.team.clients import REMOVE, Clients
+from sim.team.clients import REMOVE, Clients, follow
 from sim.team.event import Counted, Met, Stored
 from sim.team.invariant.durability import Slot
 from sim.team.schedule import Schedule
+from sim.team.workload import Workload
 
 KEYS = [hashed_key(f"key {number}") for number in range(4)]
 NAMES = ("a", "b")
 
 
-class Records:
+class Records(Workload):
     """Clients of every node write their own slots under a few keys and read all of them."""
 
     def __init__(self, schedule: Schedule) -> None:
@@ -32,7 +33,7 @@ class Records:
         self._held: dict[tuple[int, int, Slot], tuple[int, bytes]] = {}
         self._met: dict[int, set[Contact]] = {}
         self._old: list[Record] = []
-        schedule.attend(lambda place, node: self._met.update({place: set()}), lambda place, node: None)
+        schedule.fleet.attend(lambda place, node: self._met.update({place: set()}), lambda place, node: None)
         if schedule.liar is not None:
             self._let_lie(schedule.node(schedule.liar))
 
@@ -80,7 +81,7 @@ class Records:
         self._get(place, self._rng.choice(KEYS), self._rng.choice(["majority", "majority", "fast"]))
 
     def _get(self, place: int, key: bytes, concern: Any) -> None:
-        life = self._schedule.life[place]
+        life = self._schedule.fleet.life[place]
         self._clients.read(place, life, self._schedule.node(place), key, concern).addCallback(self._keep)
 
     def _keep(self, records: list[Record]) -> None:
@@ -88,10 +89,8 @@ class Records:
 
     def _find(self, place: int, target: bytes) -> None:
         asked = self._history.asked(place, "look up", target, K)
-        self._schedule.node(place).find_node(target).addCallbacks(
-            lambda found: self._history.answered(asked, tuple(contact.node_id for contact in found)),
-            lambda failure: self._history.unanswered(asked, failure.value),
-        )
+        looking = self._schedule.node(place).find_node(target)
+        follow(self._history, asked, looking, lambda found: tuple(contact.node_id for contact in found))
 
     def _meddle(self, place: int) -> None:
         """A member stores what it must not: an old record of another, and one that it made up."""

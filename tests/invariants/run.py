@@ -4,22 +4,22 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Protocol
 
 from sim.team.files import DiskFleet
-from sim.team.schedule import Schedule, Workload
-from sim.team.shrink import WHOLE, Trim
+from sim.team.schedule import Schedule
+from sim.team.shrink import WHOLE, Trim, shrunk
 from sim.team.sweep import sweep
+from sim.team.workload import Workload
 from sim.team.world import Fleet
 from tests.invariants.bug import BUGS, FINDERS, seeded
 from tests.invariants.deciders import Deciders
-from tests.invariants.groups import Groups
 from tests.invariants.leases import Leases
 from tests.invariants.records import Records
 from tests.invariants.stores import Stores
-from tests.invariants.tasks import Tasks
+from tests.invariants.tasks import Groups, Tasks
 from tests.invariants.tuples import Tuples
 from tests.invariants.wire import Wire
 
@@ -130,7 +130,7 @@ Hunted = tuple[str, tuple[str, ...], int, Outcome | None]
 def hunt(number: int, seeds: Sequence[int]) -> Hunted:
     """Look for the bug of this number, one schedule after the other."""
     bug = list(BUGS)[number]
-    only = FINDERS.get(bug, ("records",))
+    only = FINDERS[bug]
     for needed, seed in enumerate(seeds, start=1):
         outcome = run(seed, only, bug)
         if outcome.found:
@@ -141,3 +141,58 @@ def hunt(number: int, seeds: Sequence[int]) -> Hunted:
 def hunt_all(seeds: Sequence[int], jobs: int, scheduler: str = "") -> Iterator[Hunted]:
     """Look for every bug, several at a time; what came of each in the order in which they are listed."""
     return sweep(range(len(BUGS)), partial(hunt, seeds=seeds), jobs, scheduler)
+
+
+@dataclass(frozen=True)
+class Least:
+    """The ``trim`` that is left, what came of it, and in how many ``runs`` it was found."""
+
+    trim: Trim
+    outcome: Outcome
+    runs: int
+
+
+def least(
+    outcome: Outcome, bug: str | None = None, is_over: Callable[[], bool] = lambda: False, whole: Trim = WHOLE
+) -> Least:
+    """The least of a failed schedule that breaks the same invariant; when ``is_over`` says so it ends with what it has.
+
+    The schedule was ``whole`` before, or what that says was left of it.
+    """
+    invariant = outcome.found[0].partition(":")[0]
+    best, runs = Least(replace(whole, only=outcome.names), outcome, 0), 0
+
+    def fails(trim: Trim) -> bool:
+        nonlocal best, runs
+        if is_over():
+            return False
+        runs += 1
+        again = run(outcome.seed, (), bug, trim)
+        is_same = any(line.startswith(f"{invariant}:") for line in again.found)
+        if is_same:
+            best = Least(trim, again, runs)
+        return is_same
+
+    worlds = outcome.worlds
+    if len(worlds) > 1:
+        # They know nothing of each other: it is in one of them.
+        any(fails(replace(whole, only=world)) for world in worlds)
+    left = best.outcome
+    shrunk(best.trim, left.faults, left.names if len(left.worlds) == 1 else (), left.seconds, fails)
+    return replace(best, runs=runs)
+
+
+def line(seed: int, trim: Trim, bug: str | None = None) -> str:
+    """The command that repeats it."""
+    words = ["python -m tests.invariants --schedules 1", f"--seed {seed}"]
+    if trim.only:
+        words.append(f"--only {','.join(trim.only)}")
+    if trim.keep is not None:
+        words.append(f"--keep {','.join(map(str, trim.keep)) or 'none'}")
+    if trim.calm:
+        words.append("--calm")
+    if trim.seconds is not None:
+        words.append(f"--seconds {trim.seconds:g}")
+    if bug:
+        words.append(f"--bug {bug!r}")
+    return " ".join(words)

@@ -12,6 +12,7 @@ from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import Record, hashed_key
 from sim.team.files import DiskFleet, DiskStore
 from sim.team.schedule import Schedule
+from sim.team.workload import Workload
 from tests.invariants.records import KEYS
 
 PROBE = hashed_key("probe of a full disk")
@@ -22,7 +23,7 @@ RECOVERY = 2.0
 """Seconds within which a node writes again when there is room (S-c)."""
 
 
-class Stores:
+class Stores(Workload):
     """Fills the disk of one node after the other for a while, and lets one store rot."""
 
     def __init__(self, schedule: Schedule) -> None:
@@ -33,7 +34,7 @@ class Stores:
         self._found: list[str] = []
         self._full: tuple[int, DiskStore] | None = None
         self._number = 0
-        schedule.attend(self._born, lambda place, node: None)
+        schedule.fleet.attend(self._born, lambda place, node: None)
         voters = min(schedule.n, 8)
         deaths = sum(len(fault.places) for fault in schedule.faults if fault.kind == "die")
         # A store that rots is one replica less; beyond what a majority can do without, nothing is promised.

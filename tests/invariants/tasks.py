@@ -278,6 +278,23 @@ class Tasks:
                     self.history.note(Open, name, place, state, is_docketed)
 
 
+class Groups(Tasks):
+    """The workload of groups: as that of tasks, with tasks divided together, and the leases that agents hold (E8)."""
+
+    def submit(self) -> None:
+        """One to three tasks, most of them of one group; all of a schedule are divided by one strategy."""
+        rng = self.rng
+        strategy = ("group_optimal", "cbba", "nearest")[self.n % 3]
+        for _ in range(rng.choice([1, 2, 3])):
+            task = self.any_task()
+            self.enter(replace(task, strategy=strategy, group=rng.choice(["g", "g", "g", ""])))
+
+    def holding(self, agent: Agent) -> tuple[str, ...]:
+        """The tasks whose leases an agent holds."""
+        lessees = {name: part.engagement.lessee for name, part in agent._parts.items()}
+        return tuple(name for name, lessee in lessees.items() if lessee is not None and lessee.lease is not None)
+
+
 def faded(task: Task, **changes: Any) -> Task:
     """The task with an edit of an operator's."""
     return replace(task, generation=task.generation + 1, **changes)

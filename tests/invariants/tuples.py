@@ -12,22 +12,20 @@ from twisted.python.failure import Failure
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.node import EntangledNode
 from middleware.entangled.quorum.acceptor import Event
-from middleware.entangled.record import Record
-from middleware.entangled.space.posting import Place, Posted
+from middleware.entangled.space.posting import Posted
 from middleware.entangled.space.take_codec import unpack_reply
 from middleware.entangled.space.taker import Claim
 from middleware.entangled.space.template import ANY, Field, Tuple
 from middleware.entangled.space.tuplespace import TupleSpace
 from sim.team import event
-from sim.team.history import History
+from sim.team.clients import follow
 from sim.team.invariant.taking import PUT, RING, SURVEY, TAKE, WAIT
 from sim.team.schedule import Schedule
 from sim.team.takers.witness import Witness
+from sim.team.workload import Workload
 
 JOB = ("job", int, ANY)
 BELL = ("bell", int)
-INCARNATION = "decree/incarnation"
-"""The note in which a member of councils keeps which life it is in."""
 MOST_WAITING = 6
 SWEEP = 3.0
 """Seconds after the repair interval at which somebody takes whatever is left, many in one question."""
@@ -38,30 +36,7 @@ and one that knows the counter of that bid.  A sweep that took anything ends aft
 second sweep from elsewhere begins where the first did: that a tuple was left by both does not show that it is stuck."""
 
 
-class Minutes(Witness):
-    """A witness that writes down in the history whatever it sees for the first time."""
-
-    def __init__(self, history: History) -> None:
-        super().__init__()
-        self._history = history
-
-    def stored(self, record: Record) -> None:
-        """Take note of a tuple that some replica holds now."""
-        known = len(self.posted)
-        super().stored(record)
-        if len(self.posted) > known:
-            posted = self.posted[next(reversed(self.posted))]
-            seats = [(member.contact.public, member.incarnation) for member in posted.council]
-            self._history.note(event.Posted, posted.place, posted.fields, *map(tuple, zip(*seats, strict=True)))
-
-    def accepted(self, place: Place, ballot: tuple[int, bytes, bytes], member: bytes) -> None:
-        """Take note of what a member of the council accepted."""
-        if member not in self.bids[place][ballot]:
-            self._history.note(event.Voted, place, ballot[:2], ballot[2], member)
-        super().accepted(place, ballot, member)
-
-
-class Tuples:
+class Tuples(Workload):
     """Clients of every node put, take, claim and read jobs; two of them wait for a bell that rings at the end."""
 
     def __init__(self, schedule: Schedule) -> None:
@@ -69,13 +44,13 @@ class Tuples:
         self._clock = schedule.fleet.clock
         self._rng = random.Random(f"tuples/{schedule.seed}")
         self._history = schedule.history
-        self._witness = Minutes(schedule.history)
+        self._witness = Witness(schedule.history)
         self._spaces: dict[int, TupleSpace] = {}
         self._lives = 0
         self._number = 0
         self._acknowledged: dict[Tuple, None] = {}
         self._waiting: dict[int, int] = {}
-        schedule.attend(self._born, self._died)
+        schedule.fleet.attend(self._born, self._died)
 
     def step(self) -> None:
         """A few operations at random nodes."""
@@ -146,9 +121,8 @@ class Tuples:
 
         def acknowledged(_: object) -> None:
             self._acknowledged[fields] = None
-            self._history.answered(asked)
 
-        putting.addCallbacks(acknowledged, self._failed, errbackArgs=(asked,))
+        follow(self._history, asked, putting.addCallback(acknowledged))
 
     def _take(self, place: int, space: TupleSpace) -> None:
         self._get(JOB, place, space, timeout=self._rng.choice([0.3, 2.0, 5.0]))
@@ -161,10 +135,7 @@ class Tuples:
 
     def _taking(self, taking: Deferred[list[Tuple]], place: int) -> None:
         """Write down what a client takes."""
-        asked = self._history.asked(place, TAKE, "job")
-        taking.addCallbacks(
-            lambda taken: self._history.answered(asked, tuple(taken)), self._failed, errbackArgs=(asked,)
-        )
+        follow(self._history, self._history.asked(place, TAKE, "job"), taking, tuple)
 
     def _claim(self, place: int, space: TupleSpace) -> None:
         claiming = space.claim(JOB, lease=1.5, timeout=3.0)
@@ -216,26 +187,19 @@ class Tuples:
     def _ring(self) -> None:
         place = self._rng.choice(sorted(self._spaces))
         asked = self._history.asked(place, RING, "bell")
-        self._spaces[place].put(("bell", 1)).addCallbacks(
-            lambda _: self._history.answered(asked), self._failed, errbackArgs=(asked,)
-        )
+        follow(self._history, asked, self._spaces[place].put(("bell", 1)))
 
     def _survey(self, place: int, space: TupleSpace) -> None:
         asked = self._history.asked(place, SURVEY, "job")
 
-        def seen(found: list[Tuple]) -> None:
+        def seen(found: list[Tuple]) -> tuple[Tuple, ...]:
             self._seats()
-            self._history.answered(asked, tuple(found))
+            return tuple(found)
 
-        space.read_all(JOB).addCallbacks(seen, self._failed, errbackArgs=(asked,))
+        follow(self._history, asked, space.read_all(JOB), seen)
 
     def _seats(self) -> None:
-        """Write down who lives now, and what it is to the councils; to ask it would make it take its seat."""
-        members = []
-        for place in self._schedule.alive():
-            node, noted = self._schedule.node(place), self._schedule.fleet.stores[place].noted(INCARNATION)
-            members.append((node.identity.public, node.seat._life or noted or b""))
-        self._history.note(event.Seated, tuple(members))
+        self._witness.seated(map(self._schedule.node, self._schedule.alive()))
 
     def _sweep(self) -> None:
         place = self._rng.choice(sorted(self._spaces))
@@ -246,10 +210,6 @@ class Tuples:
         for posted in self._left():
             place = self._rng.choice(sorted(self._spaces))
             self._get(posted.fields, place, self._spaces[place])
-
-    def _failed(self, failure: Failure, asked: int) -> None:
-        failure.trap(EntangledError)
-        self._history.unanswered(asked, failure.value)
 
 
 def _weather(failure: Failure) -> None:

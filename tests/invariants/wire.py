@@ -11,10 +11,8 @@ from collections import deque
 from typing import Any
 
 from twisted.logger import ILogObserver, LogLevel, globalLogPublisher
-from twisted.python.failure import Failure
 from zope.interface import implementer
 
-from middleware.entangled.errors import EntangledError
 from middleware.entangled.identity import Identity, exchange_key
 from middleware.entangled.kademlia.overlay import MAX_FOUND, K
 from middleware.entangled.network.network import Address
@@ -35,8 +33,10 @@ from middleware.entangled.wire.session import (
     Invitation,
     derived_key,
 )
+from sim.team.clients import follow
 from sim.team.event import Ran, Shot, Size, Strange
 from sim.team.schedule import Schedule
+from sim.team.workload import Workload
 from sim.team.world import TEAM
 from tests.fuzz.ground import state_of
 
@@ -61,7 +61,7 @@ class Ear:
             self.heard.append(str(event.get("log_format")))
 
 
-class Wire:
+class Wire(Workload):
     """Shoots at nodes while they work, counts how often a method runs, and looks at every table at the end."""
 
     def __init__(self, schedule: Schedule) -> None:
@@ -96,7 +96,8 @@ class Wire:
                 )
 
         vars(self._board).update(_carry=tapped_carry, _deliver=tapped_deliver)
-        schedule.attend(self._born, self._died)
+        # The recordings outlive a node: they are fired at its next life.
+        schedule.fleet.attend(self._born, lambda place, node: None)
 
     def step(self) -> None:
         """A shot or two, and a question that may run once."""
@@ -205,7 +206,7 @@ class Wire:
 
     def _born(self, place: int, node: EntangledNode) -> None:
         self._born_at[self._schedule.fleet.address(place)] = self._schedule.fleet.clock.seconds()
-        life = self._schedule.life[place]
+        life = self._schedule.fleet.life[place]
 
         def run(peer: object, number: int) -> int:
             self._history.note(Ran, place, life, number)
@@ -213,24 +214,17 @@ class Wire:
 
         node.endpoint.expose("run", run, changes=True)
 
-    def _died(self, place: int, node: EntangledNode) -> None:
-        """The recordings stay: they are fired at the next life."""
-
     def _ask(self, asker: int, answerer: int) -> None:
         self._number += 1
-        number, life = self._number, self._schedule.life[answerer]
+        number, life = self._number, self._schedule.fleet.life[answerer]
         contact = self._schedule.node(answerer).contact
         asked = self._history.asked(asker, "run", number)
 
-        def answered(answer: object) -> None:
-            self._history.answered(asked, (answer, answerer, life, self._schedule.life[answerer]))
+        def shown(answer: object) -> object:
+            return answer, answerer, life, self._schedule.fleet.life[answerer]
 
         asking = self._schedule.node(asker).endpoint.ask(contact, "run", number, changes=True)
-        asking.addCallbacks(answered, self._failed, errbackArgs=(asked,))
-
-    def _failed(self, failure: Failure, asked: int) -> None:
-        failure.trap(EntangledError)
-        self._history.unanswered(asked, failure.value)
+        follow(self._history, asked, asking, shown)
 
     # -- tables (R4) ------------------------------------------------------------------------------------------------
 

@@ -9,9 +9,8 @@ from sim.team.schedule import Schedule
 from sim.team.shrink import Trim
 from tests.invariants.bug import FINDERS, seeded
 from tests.invariants.leases import Leases
-from tests.invariants.least import least, line
 from tests.invariants.records import Records
-from tests.invariants.run import WORKLOADS, run, run_all
+from tests.invariants.run import WORKLOADS, least, line, run, run_all
 from tests.invariants.tasks import Tasks
 from tests.replay import replayed
 

@@ -16,8 +16,7 @@ from middleware.entangled.quorum.register import Kind, Reply
 from middleware.entangled.record import Record
 from sim.team.figure import Figure
 from sim.team.load.catalogue import LOADS
-from sim.team.load.census import Census
-from sim.team.load.pace import Pace
+from sim.team.load.residents import Census, Pace
 from sim.team.load.values import NAME
 from sim.team.run import Outcome, Run
 from sim.team.scenario import scenario_of

@@ -3,72 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import replace
-from typing import Any
-
-from twisted.internet.defer import Deferred
-from twisted.trial.unittest import SynchronousTestCase
 
 from agents.catalogue import task_named
 from drivers.link import MemoryLink
 from middleware.tasks.task import Task
 from sim.demo.experiment import TOUCH_M
 from sim.demo.trials import trial
-from sim.robots.scene import FOOTPRINT
-from swarmnode.rehearsal import LAN, VirtualTeam
-
-LOOK_S = 0.05
+from swarmnode.rehearsal import VirtualTeam
+from tests.swarm.case import LOOK_S, TeamCase
 
 
-class TeamTests(SynchronousTestCase):
-    """What the tests of one team share."""
-
-    def team(self, seed: int = 3, dogs: tuple[str, ...] = VirtualTeam.DOGS, loss: float = 0.0) -> VirtualTeam:
-        """A team that ends with the test."""
-        team = VirtualTeam(seed, weather=replace(LAN, loss=loss), dogs=dogs)
-        self.addCleanup(team.stop)
-        return team
-
-    def until(self, team: VirtualTeam, is_so: Callable[[], bool], limit: float = 90.0) -> float:
-        """Let the team live until something is so; the seconds that took, a failure after ``limit``."""
-        began = team.clock.seconds()
-        while not is_so():
-            if team.clock.seconds() - began > limit:
-                self.fail(f"not so within {limit:g} s: {team.state()['tasks']}")
-            team.clock.advance(LOOK_S)
-        return team.clock.seconds() - began
-
-    def task(self, team: VirtualTeam) -> dict[str, Any]:
-        """The newest task as the page shows it."""
-        tasks = team.state()["tasks"]
-        return dict(tasks[0]) if tasks else {"status": "absent"}
-
-    def device(self, team: VirtualTeam, name: str) -> dict[str, Any]:
-        """A device as the page shows it."""
-        return next((dict(row) for row in team.state()["devices"] if row["name"] == name), {"status": "absent"})
-
-    def statuses(self, team: VirtualTeam) -> dict[str, str]:
-        """The status of each device."""
-        return {row["name"]: row["status"] for row in team.state()["devices"]}
-
-    def lines(self, team: VirtualTeam, name: str) -> list[str]:
-        """The messages of a device."""
-        return [text for _, text in self.device(team, name)["messages"]]
-
-    def executing(self, team: VirtualTeam) -> list[str]:
-        """Who executes the newest task."""
-        groups = team.state()["groups"]
-        return [m["name"] for m in groups[0]["members"] if m["status"] == "EXECUTING"] if groups else []
-
-    def gap(self, team: VirtualTeam, name: str) -> float:
-        """Metres between the dog's footprint and the target."""
-        dog, target = team.yard.world.dogs[name], team.yard.world.target
-        assert target is not None
-        return math.hypot(dog.x - target.x, dog.y - target.y) - target.radius - FOOTPRINT
-
-
-class ExperimentTests(SynchronousTestCase):
+class ExperimentTests(TeamCase):
     def test_nearest_dog_reaches_the_target(self) -> None:
         """Experiment 1: all find the target, all name the same dog, it is the nearest, and it gets there."""
         for seed in (2, 3):
@@ -91,10 +36,10 @@ class ExperimentTests(SynchronousTestCase):
             self.assertNotEqual(outcome.by, outcome.killed)
 
 
-class TaskTests(TeamTests):
+class TaskTests(TeamCase):
     def test_task_that_nobody_can_do_stays_open_and_says_why(self) -> None:
         """A task with a requirement that no device meets stays open, and its note says what each device lacks."""
-        team = self.team()
+        team = self.start_team()
         answer = team.desk.assign("fetch-the-ball")
         team.clock.advance(5.0)
         task = self.task(team)
@@ -105,7 +50,7 @@ class TaskTests(TeamTests):
 
     def test_device_is_done_or_idle_until_its_next_task(self) -> None:
         """After the end the dog that did it shows DONE, the others IDLE, and all take up the next task."""
-        team = self.team()
+        team = self.start_team()
         team.desk.assign("turn-around")
         shown: list[dict[str, str]] = []
 
@@ -129,7 +74,7 @@ class TaskTests(TeamTests):
 
     def test_tasks_are_done_one_after_the_other(self) -> None:
         """A task that comes while a dog is busy waits, and is done after."""
-        team = self.team()
+        team = self.start_team()
         team.desk.assign("turn-around")
         team.clock.advance(0.2)
         team.desk.assign("turn-around")
@@ -137,14 +82,13 @@ class TaskTests(TeamTests):
 
     def test_urgent_task_has_the_bodies_first(self) -> None:
         """A task of a higher priority puts a preemptible one aside, which is resumed and done after."""
-        team = self.team()
-        node = team.services["vaio"].assembly.node
+        team = self.start_team()
         turn = Task("slow", "turn-around", "Slow", parameters={"turns": 3.0}, waiting_period=1.0, preemptible=True)
-        Deferred.fromCoroutine(node.submit(turn))
+        self.submit(team, turn)
         self.until(team, lambda: bool(self.executing(team)))
         team.clock.advance(2.0)
         urgent = Task("fast", "turn-around", "Fast", waiting_period=1.0, priority=5, created=1.0)
-        Deferred.fromCoroutine(node.submit(urgent))
+        self.submit(team, urgent)
         shown: list[dict[str, str]] = []
 
         def is_done(name: str) -> bool:
@@ -159,13 +103,13 @@ class TaskTests(TeamTests):
 
     def test_paused_task_rests_until_it_is_resumed(self) -> None:
         """Paused, no dog moves and the page says who paused it; resumed, it is completed."""
-        team = self.team()
+        team = self.start_team()
         team.run_demo()
         self.until(team, lambda: bool(self.executing(team)))
         task_id = self.task(team)["id"]
         team.desk.pause(task_id)
         team.clock.advance(1.0)
-        self.assertEqual([dog.name for dog in team.yard.world.dogs.values() if dog.is_moving], [])
+        self.assertEqual(self.moving(team), [])
         task = self.task(team)
         self.assertEqual((task["status"], task["paused"]), ("ASSIGNED", True))
         self.assertIn("paused by vaio", {*self.lines(team, "dog1")})
@@ -176,10 +120,9 @@ class TaskTests(TeamTests):
 
     def test_deadline_fails_the_task_and_says_so(self) -> None:
         """A task that nobody finishes in time fails once, for all, with the reason on the page."""
-        team = self.team()
-        node = team.services["vaio"].assembly.node
+        team = self.start_team()
         task = Task("late", "find-target", "Late", created=team.clock.seconds(), deadline=4.0)
-        Deferred.fromCoroutine(node.submit(task))
+        self.submit(team, task)
         self.until(team, lambda: self.task(team)["status"] == "FAILED", 6.0)
         self.assertIn("past its deadline of 4 s", self.task(team)["note"])
         team.clock.advance(0.5)
@@ -187,20 +130,20 @@ class TaskTests(TeamTests):
 
     def test_cancel_stops_the_robot(self) -> None:
         """A cancelled task ends for everybody within half a second: no dog moves, no dog has a task."""
-        team = self.team()
+        team = self.start_team()
         team.run_demo()
         self.until(team, lambda: bool(self.executing(team)))
         team.clock.advance(1.0)
-        self.assertTrue(any(dog.is_moving for dog in team.yard.world.dogs.values()))
+        self.assertTrue(self.moving(team))
         team.desk.cancel(self.task(team)["id"])
         team.clock.advance(0.5)
-        self.assertEqual([dog.name for dog in team.yard.world.dogs.values() if dog.is_moving], [])
+        self.assertEqual(self.moving(team), [])
         self.assertEqual(self.task(team)["status"], "CANCELLED")
         self.assertEqual(set(self.statuses(team).values()), {"IDLE"})
 
     def test_moved_target_is_reached(self) -> None:
         """The target is moved away while a dog walks to it: a dog still gets there, and no dog only believes so."""
-        team = self.team()
+        team = self.start_team()
         team.run_demo()
         self.until(team, lambda: bool(self.executing(team)))
         team.clock.advance(1.0)
@@ -215,10 +158,10 @@ class TaskTests(TeamTests):
         self.assertLessEqual(self.gap(team, self.task(team)["result"]["by"]), TOUCH_M)
 
 
-class MembershipTests(TeamTests):
+class MembershipTests(TeamCase):
     def test_task_assigned_to_one_dog_draws_in_those_that_come(self) -> None:
         """A task that one dog began is joined by two that come later; all report, and all name the same dog."""
-        team = self.team(dogs=("dog1",))
+        team = self.start_team(dogs=("dog1",))
         team.run_demo()
         team.clock.advance(1.0)
         self.assertEqual([m["name"] for m in team.state()["groups"][0]["members"]], ["dog1"])
@@ -237,7 +180,7 @@ class MembershipTests(TeamTests):
 
     def test_others_spread_when_one_leaves(self) -> None:
         """When the dog on its way is lost, the one that stands by moves around the target, as far from it as before."""
-        team = self.team(1)
+        team = self.start_team(1)
         team.scatter(3)
         team.run_demo()
         self.until(team, lambda: bool(self.executing(team)))
@@ -269,12 +212,12 @@ class MembershipTests(TeamTests):
     def test_newcomer_takes_over_only_if_it_is_clearly_better(self) -> None:
         """A dog that joins mid-task is drawn in, and takes over where it stands far nearer to the target."""
         for place, takes_over in (((1.5, 0.75), True), ((2.8, 2.2), False)):
-            team = self.team(6, dogs=("dog1",))
+            team = self.start_team(6, dogs=("dog1",))
             world = team.yard.world
             world.move_dog("dog2", 2.8, 0.2, 0.0)
             world.move_dog("dog1", 0.3, 0.3, 0.0)
             world.move_dog("dog3", *place, math.pi / 2)
-            Deferred.fromCoroutine(team.services["vaio"].assembly.node.submit(task_named("find-red-target", "t", 0.0)))
+            self.submit(team, task_named("find-red-target", "t", 0.0))
             world.place_target(1.5, 1.3)
             self.until(team, lambda team=team: self.executing(team) == ["dog1"])  # type: ignore[misc]
             team.add("dog3")
@@ -283,7 +226,7 @@ class MembershipTests(TeamTests):
 
     def test_dog_alone_finishes(self) -> None:
         """One dog that is all there is does the task by itself."""
-        team = self.team(dogs=("dog2",))
+        team = self.start_team(dogs=("dog2",))
         team.run_demo()
         self.until(team, lambda: self.task(team)["status"] == "COMPLETED")
         self.assertEqual(self.task(team)["result"]["by"], "dog2")
@@ -291,7 +234,7 @@ class MembershipTests(TeamTests):
 
     def test_winner_that_died_is_still_named(self) -> None:
         """While the others still name the dog that died, the page shows its name and not its number."""
-        team = self.team()
+        team = self.start_team()
         team.run_demo()
         self.until(team, lambda: bool(self.executing(team)))
         first = self.executing(team)[0]
@@ -305,7 +248,7 @@ class MembershipTests(TeamTests):
 
     def test_killed_dog_says_nothing_more(self) -> None:
         """A killed node sends no datagram at all, not even that it gives its lease back, and its robot stops."""
-        team = self.team()
+        team = self.start_team()
         team.run_demo()
         self.until(team, lambda: bool(self.executing(team)))
         first = self.executing(team)[0]
@@ -319,7 +262,7 @@ class MembershipTests(TeamTests):
 
     def test_disconnected_dog_comes_back(self) -> None:
         """A dog told to leave for 5 s is gone for the others, returns as the same device, and another does its task."""
-        team = self.team()
+        team = self.start_team()
         team.run_demo()
         self.until(team, lambda: bool(self.executing(team)))
         first = self.executing(team)[0]
@@ -335,7 +278,7 @@ class MembershipTests(TeamTests):
 
     def test_at_no_time_do_two_dogs_walk_to_the_target(self) -> None:
         """Through loss of a dog and its return at most one dog holds a lease at any look."""
-        team = self.team(4)
+        team = self.start_team(4)
         team.run_demo()
         killed = ""
         while self.task(team)["status"] not in ("COMPLETED", "FAILED"):
@@ -353,10 +296,10 @@ class MembershipTests(TeamTests):
         self.assertTrue(killed)
 
 
-class WeatherTests(TeamTests):
+class WeatherTests(TeamCase):
     def test_loss_of_a_fifth_still_completes(self) -> None:
         """With 20 % of all datagrams lost the team still finds the target and one dog gets there."""
-        team = self.team(2, loss=0.2)
+        team = self.start_team(2, loss=0.2)
         team.run_demo()
         self.until(team, lambda: self.task(team)["status"] == "COMPLETED")
         self.assertGreater(team.board.counters["lost"], 100)
@@ -364,7 +307,7 @@ class WeatherTests(TeamTests):
 
     def test_garbage_on_a_robots_link_costs_frames_only(self) -> None:
         """Bytes that are no frames on the way from a robot are counted and skipped, and the task is done as ever."""
-        team = self.team()
+        team = self.start_team()
         driver = team.services["dog1"].assembly.driver
         assert driver is not None
         connector = team.connectors["dog1"]
@@ -381,7 +324,7 @@ class WeatherTests(TeamTests):
 
     def test_broken_link_of_the_dog_on_its_way_moves_another(self) -> None:
         """A robot that its living node cannot reach any more loses the task to another dog."""
-        team = self.team()
+        team = self.start_team()
         team.run_demo()
         self.until(team, lambda: bool(self.executing(team)))
         first = self.executing(team)[0]

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from itertools import permutations
 
-from twisted.internet.defer import Deferred
-from twisted.trial.unittest import SynchronousTestCase
-
-from agents.behaviour import KINDS
-from middleware.consensus.verdict import verdict_of, verdicts_key
 from middleware.diagnostics.explanation import Ruling, explained
-from middleware.tasks.task import Member, Task, group_key, member_of
+from middleware.tasks.task import Task
 from swarmnode.rehearsal import VirtualTeam
+from tests.swarm.case import TeamCase
 
 TASKS = {"t0": 1.5, "t1": 2.5, "t2": -2.5}
 """Where to face.  Task by task the nearest dog would have to turn more in all than these three need."""
@@ -21,36 +16,25 @@ SLOW = 0.25
 DOGS = VirtualTeam.DOGS
 
 
-class GroupTests(SynchronousTestCase):
+class GroupTests(TeamCase):
     def setUp(self) -> None:
-        KINDS["facing"] = "tests.swarm.facing:Facing"
-        self.addCleanup(KINDS.pop, "facing")
+        self.use_facing()
         self.costs: dict[str, dict[str, float]] = {}
         self.began: dict[str, list[str]] = {}
         self.twice: list[object] = []
         self.agreed = False
 
-    def team(self, dogs: tuple[str, ...] = DOGS, strategy: str = "group_optimal") -> VirtualTeam:
+    def busy_team(self, dogs: tuple[str, ...] = DOGS, strategy: str = "group_optimal") -> VirtualTeam:
         """A team that has just been given the tasks, one after the other."""
-        team = VirtualTeam(5, dogs=dogs)
-        self.addCleanup(team.stop)
+        team = self.start_team(5, dogs)
         team.clock.advance(0.5)
         for name, towards in TASKS.items():
             parameters = {"towards": towards, "speed": SLOW}
             shared = {"requirements": {"compass": {}}, "strategy": strategy, "waiting_period": 3.0, "group": "g"}
             task = Task(name, "facing", name, parameters=parameters, created=team.clock.seconds(), **shared)  # type: ignore[arg-type]
-            Deferred.fromCoroutine(team.services["vaio"].assembly.node.submit(task))
+            self.submit(team, task)
             team.clock.advance(0.15)
         return team
-
-    def until(self, team: VirtualTeam, is_so: Callable[[], bool], limit: float = 40.0) -> None:
-        """Let the team live until something is so, and look on."""
-        end = team.clock.seconds() + limit
-        while not is_so():
-            if team.clock.seconds() > end:
-                self.fail(f"not so within {limit:g} s: {team.state()['tasks']}")
-            team.clock.advance(0.05)
-            self.look(team)
 
     def look(self, team: VirtualTeam) -> None:
         """Note the first costs, who began what, and who acts on two at a time."""
@@ -67,10 +51,6 @@ class GroupTests(SynchronousTestCase):
         self.agreed = self.agreed or (len(digests) == 1 and "" not in digests)
         self.twice += [pair for pair in acting.items() if len(pair[1]) > 1]
 
-    def members(self, team: VirtualTeam, name: str) -> list[Member]:
-        """What is reported on a task."""
-        return [m for record in team.desk.read(group_key(name)) if (m := member_of(record)) is not None]
-
     def are_done(self, team: VirtualTeam) -> bool:
         """Whether all tasks are completed."""
         return [task["status"] for task in team.state()["tasks"]] == ["COMPLETED"] * len(TASKS)
@@ -81,15 +61,14 @@ class GroupTests(SynchronousTestCase):
 
     def ruling(self, team: VirtualTeam, name: str) -> Ruling:
         """What all say together of the newest decision on a task."""
-        verdicts = [v for record in team.desk.read(verdicts_key(name)) if (v := verdict_of(record)) is not None]
-        return explained(verdicts).epochs[0]
+        return explained(self.verdicts(team, name)).epochs[0]
 
     def test_each_dog_does_one(self) -> None:
         """Three dogs do three tasks at once, one each; of what they reported no assignment costs less; all agree.
 
         They agree on the reports on all three tasks: there is one digest.
         """
-        team = self.team()
+        team = self.busy_team()
         self.until(team, lambda: len(self.began) == len(TASKS))
         self.assertTrue(self.agreed)
         team.clock.advance(1.0)
@@ -107,7 +86,7 @@ class GroupTests(SynchronousTestCase):
 
     def test_nearest_one_by_one_costs_more(self) -> None:
         """The same tasks under ``nearest`` are divided as well, one by one, and cost more: so the strategy is asked."""
-        team = self.team(strategy="nearest")
+        team = self.busy_team(strategy="nearest")
         self.until(team, lambda: self.are_done(team), 60.0)
         best = min(sum(self.costs[t][d] for t, d in zip(TASKS, order, strict=True)) for order in permutations(DOGS))
         self.assertGreater(sum(self.costs[name][dogs[0]] for name, dogs in self.began.items()), best + 0.5)
@@ -115,7 +94,7 @@ class GroupTests(SynchronousTestCase):
 
     def test_task_of_a_dead_dog_is_done_by_another(self) -> None:
         """A dog that dies at its task leaves it to one of the others, as soon as one of them is free; theirs go on."""
-        team = self.team()
+        team = self.busy_team()
         self.until(team, lambda: len(self.began) == len(TASKS))
         lost = max(TASKS, key=lambda name: self.costs[name][self.began[name][0]])
         dead = self.began[lost][0]
@@ -131,8 +110,7 @@ class GroupTests(SynchronousTestCase):
 
     def test_operator_gives_a_group(self) -> None:
         """Predefined tasks that are assigned to a group are done at once, one by each dog; the page names the group."""
-        team = VirtualTeam(5)
-        self.addCleanup(team.stop)
+        team = self.start_team(5)
         for _ in DOGS:
             team.desk.assign("turn-around", group="yard")
         self.until(team, lambda: self.are_done(team))
@@ -144,7 +122,7 @@ class GroupTests(SynchronousTestCase):
 
     def test_newcomer_takes_what_is_left(self) -> None:
         """Two dogs leave the third task alone while they are busy; a dog that joins takes it."""
-        team = self.team(("dog1", "dog2"))
+        team = self.busy_team(("dog1", "dog2"))
         self.until(team, lambda: len(self.began) == 2)
         (left,) = set(TASKS) - set(self.began)
         self.assertIn("everybody who bid for it has enough to do", {m.why for m in self.members(team, left)})

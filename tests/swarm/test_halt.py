@@ -5,41 +5,31 @@ from __future__ import annotations
 from typing import Any
 
 from twisted.internet.defer import Deferred
-from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.stop.halt import HALT, SLOT, UNHEARD
-from swarmnode.rehearsal import VirtualTeam
+from tests.swarm.case import TeamCase
 from webnode.halting import TeamHalts
 
 BRAKING = 0.2
 """Seconds in which all three dogs stand, from the press of the button."""
 
 
-class HaltTests(SynchronousTestCase):
+class HaltTests(TeamCase):
     def setUp(self) -> None:
-        self.team = VirtualTeam(5)
-        self.addCleanup(self.team.stop)
+        self.team = self.start_team(5)
         self.halts = TeamHalts(self.team.client)
 
     def node(self, name: str) -> Any:
         """The node of a device."""
         return self.team.services[name].assembly.node
 
-    def moving(self) -> list[str]:
-        """The dogs that move now."""
-        return [dog.name for dog in self.team.yard.world.dogs.values() if dog.is_moving]
-
     def moved_in(self, seconds: float) -> set[str]:
         """The dogs that move in the next seconds."""
         moved: set[str] = set()
         for _ in range(round(seconds / 0.05)):
             self.team.clock.advance(0.05)
-            moved.update(self.moving())
+            moved.update(self.moving(self.team))
         return moved
-
-    def executing(self) -> list[str]:
-        """Who acts, as the page tells."""
-        return [row["name"] for row in self.team.state()["devices"] if row["status"] == "EXECUTING"]
 
     def told(self, asked: Deferred[dict[str, str]]) -> dict[str, str]:
         """What each device says, by name."""
@@ -52,11 +42,8 @@ class HaltTests(SynchronousTestCase):
     def until_executing(self) -> str:
         """Run the demonstration until one acts; its name."""
         self.team.run_demo()
-        for _ in range(400):
-            self.team.clock.advance(0.1)
-            if self.executing() and self.moving():
-                return self.executing()[0]
-        self.fail("nobody acts")
+        self.until(self.team, lambda: bool(self.executing(self.team) and self.moving(self.team)))
+        return self.executing(self.team)[0]
 
     def test_all_stand_at_once_and_go_on(self) -> None:
         """Pressed while one acts, all dogs stand in 0.2 s and none moves for 10 s; released, the same one goes on."""
@@ -64,12 +51,12 @@ class HaltTests(SynchronousTestCase):
         token = self.team.services[acting].assembly.agent.engagement.lessee.token  # type: ignore[union-attr]
         asked = self.halts.halt("ann")
         self.team.clock.advance(BRAKING)
-        self.assertEqual(self.moving(), [])
+        self.assertEqual(self.moving(self.team), [])
         said = {"vaio": "has no robot", "dog1": "stands", "dog2": "stands", "dog3": "stands"}
         self.assertEqual(self.told(asked), said)
         self.assertEqual(self.moved_in(10.0), set())
         self.assertTrue(self.team.state()["halted"])
-        self.assertEqual(self.executing(), [acting])
+        self.assertEqual(self.executing(self.team), [acting])
         agent: Any = self.team.services[acting].assembly.agent
         self.assertEqual(agent.engagement.lessee.lease.token, token)
         self.halts.release("ann")
@@ -91,8 +78,7 @@ class HaltTests(SynchronousTestCase):
 
     def test_who_comes_later_stands(self) -> None:
         """A dog that joins a halted team, and finds a task there, does not move until the team is released."""
-        team = VirtualTeam(6, dogs=("dog1", "dog2"))
-        self.addCleanup(team.stop)
+        team = self.start_team(6, ("dog1", "dog2"))
         halts = TeamHalts(team.client)
         halts.halt("ann")
         team.clock.advance(0.5)
@@ -101,12 +87,12 @@ class HaltTests(SynchronousTestCase):
         moved: set[str] = set()
         for _ in range(100):
             team.clock.advance(0.05)
-            moved.update(dog.name for dog in team.yard.world.dogs.values() if dog.is_moving)
+            moved.update(self.moving(team))
         self.assertEqual(moved, set())
         self.assertTrue(team.services["dog3"].assembly.node.halt.is_stopped)
         halts.release("ann")
         team.clock.advance(2.0)
-        self.assertTrue([dog.name for dog in team.yard.world.dogs.values() if dog.is_moving])
+        self.assertTrue(self.moving(team))
 
     def test_who_cannot_be_told_reads_it(self) -> None:
         """A dog that is out of reach is told of as such, and stands as soon as it hears the others again."""
@@ -142,7 +128,7 @@ class HaltTests(SynchronousTestCase):
         self.team.silence(silent)
         self.halts.halt("ann")
         self.team.clock.advance(BRAKING)
-        self.assertNotIn(acting, self.moving())
+        self.assertNotIn(acting, self.moving(self.team))
         self.assertTrue(self.node(acting).halt.is_stopped)
         self.team.clock.advance(3.0)
         state = self.team.state()

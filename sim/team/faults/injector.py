@@ -24,8 +24,8 @@ class TeamFaults:
     def __init__(self, team: Team) -> None:
         self._team = team
         self._sessions = team.scenario.sessions
-        self._dice = team.rng("trouble")
-        self._session_dice = team.rng("sessions")
+        self._dice = team.generator("trouble")
+        self._session_dice = team.generator("sessions")
         self._is_on = False
         self._undo: dict[int, Callable[[], None]] = {}
         self._number = 0
@@ -78,13 +78,13 @@ class TeamFaults:
             self._plan_end(place, stays.drawn(self._session_dice))
 
     def _plan_end(self, place: int, seconds: float) -> None:
-        self._team.at(seconds, partial(self._session_over, place, self._team.place(place).lives))
+        self._team.at(seconds, partial(self._session_over, place, self._team.life[place]))
 
     def _session_over(self, place: int, life: int) -> None:
         team, sessions, dice = self._team, self._sessions, self._session_dice
         if not self._is_on or not self._lives(place, life):
             return
-        if len(team.nodes) <= FEW:
+        if len(team.living) <= FEW:
             self._plan_end(place, sessions.breaks.drawn(dice))
             return
         if dice.random() < sessions.goodbye:
@@ -103,7 +103,7 @@ class TeamFaults:
         self._team.start(place)
 
     def _lives(self, place: int, life: int) -> bool:
-        return place in self._team.nodes and self._team.place(place).lives == life
+        return place in self._team.living and self._team.life[place] == life
 
     # -- faults -----------------------------------------------------------------------------------------------------
 
@@ -116,7 +116,7 @@ class TeamFaults:
         """Those that a fault befalls, in the order in which it comes to them."""
         here = sorted(self._team.inside())
         if fault.places:
-            return [place for place in fault.places if place in self._team.nodes]
+            return [place for place in fault.places if place in self._team.living]
         count = fault.count or round(fault.share * len(here))
         return self._dice.sample(here, min(count, len(here)))
 
@@ -153,9 +153,9 @@ class TeamFaults:
 
     def _end_life(self, place: int, lasts: float, kill: bool) -> None:
         team = self._team
-        if place not in team.nodes:
+        if place not in team.living:
             return
-        life = team.place(place).lives
+        life = team.life[place]
         if kill:
             team.kill(place)
         else:
@@ -175,9 +175,9 @@ class TeamFaults:
     def _freeze_one(self, place: int, lasts: float) -> None:
         team = self._team
         machine = team.place(place).machine
-        if place not in team.nodes or machine is None or machine.is_still:
+        if place not in team.living or machine is None or machine.is_still:
             return
-        life = team.place(place).lives
+        life = team.life[place]
         team.freeze(place)
         self._for_a_while(lasts, lambda: team.thaw(place) if self._lives(place, life) else None)
 
@@ -233,7 +233,7 @@ class TeamFaults:
         def come() -> None:
             place = self._team.add()
             if fault.lasts:
-                self._team.at(fault.lasts, partial(self._end_life_of, place, self._team.place(place).lives))
+                self._team.at(fault.lasts, partial(self._end_life_of, place, self._team.life[place]))
 
         self._spread(fault, [come] * fault.count)
 

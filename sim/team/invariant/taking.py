@@ -70,6 +70,7 @@ def t2(events: Iterable[Event]) -> Iterator[str]:
     space = _Space()
     asked: dict[int, Asked] = {}
     acknowledged: dict[Hashable, None] = {}
+    wanted: dict[int, tuple[Hashable, ...]] = {}
     is_over, is_rung = False, True
     for event in events:
         space.read(event)
@@ -79,13 +80,15 @@ def t2(events: Iterable[Event]) -> Iterator[str]:
             case Asked(_, number, _, what):
                 asked[number] = event
                 is_rung = is_rung and what != RING
+                if what == SURVEY:
+                    wanted[number] = tuple(acknowledged)
             case Answered(_, number, result) if number in asked:
                 what, subject = asked[number].what, asked[number].subject
                 if what == PUT:
                     acknowledged[subject] = None
                 is_rung = is_rung or what == RING
                 if what == SURVEY and isinstance(result, tuple):
-                    yield from _unseen(space, acknowledged, set(result), asked[number].client)
+                    yield from _unseen(space, wanted.pop(number), set(result), asked[number].client)
             case Unanswered(_, number, why) if is_over and number in asked and asked[number].what in (SURVEY, RING):
                 what = "a put" if asked[number].what == RING else "a read of all tuples"
                 yield f"{what} fails after everything healed: {why}"
@@ -102,25 +105,28 @@ def _unseen(space: _Space, acknowledged: Iterable[Hashable], seen: set[Hashable]
 
 
 def t3(events: Iterable[Event]) -> Iterator[str]:
-    """Finality: what was confirmed to a taker is seen by nobody when all is settled."""
+    """Finality: what was confirmed to a taker is seen by no survey that begins later."""
     space = _Space()
     asked: dict[int, Asked] = {}
     told: dict[Hashable, str] = {}
+    over: dict[int, dict[Hashable, str]] = {}
     for event in events:
         space.read(event)
         match event:
-            case Asked(_, number):
+            case Asked(_, number, _, what):
                 asked[number] = event
+                if what == SURVEY:
+                    over[number] = dict(told)
             case Answered(at, number, tuple() as result) if number in asked:
                 client = asked[number].client
                 if asked[number].what == TAKE:
                     for fields in result:
                         told.setdefault(fields, f"node {client} at {at:.1f}")
                 elif asked[number].what == SURVEY:
-                    known = {posted.fields: posted for posted in space.posted.values()}
+                    before, known = over.pop(number), {posted.fields: posted for posted in space.posted.values()}
                     for fields in result:
-                        if fields in told and space.can_decide(known[fields]):
-                            yield f"{fields} was taken by {told[fields]}; node {client} still sees it"
+                        if fields in before and space.can_decide(known[fields]):
+                            yield f"{fields} was taken by {before[fields]}; node {client} still sees it"
 
 
 def t4(events: Iterable[Event]) -> Iterator[str]:

@@ -1,14 +1,13 @@
-"""Radio: a light simulated link between machines; datagrams are lost, late, doubled, and overtake each other."""
+"""Radio: a link on which datagrams are lost, late, doubled, and overtake each other (``switchboard.Link``)."""
 
 from __future__ import annotations
 
-import hashlib
 import random
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
-from middleware.entangled.clock import HeapClock
+from middleware.entangled.network.network import Address
+from sim.team.world import PORT
 
 
 @dataclass(frozen=True)
@@ -29,16 +28,15 @@ CALM = Air()
 
 
 class Radio:
-    """Carries calls between places; ``cut`` holds the directed pairs that do not hear each other."""
+    """The link between all places; ``cut`` holds the directed pairs of places that do not hear each other.
 
-    def __init__(self, clock: HeapClock, rng: random.Random, air: Air = CALM) -> None:
+    What is on its way when a pair is cut arrives.
+    """
+
+    def __init__(self, air: Air = CALM) -> None:
         self._air = self._slowest = air
         self.cut: set[tuple[int, int]] = set()
-        self.sent = 0
-        self._clock = clock
-        self._rng = rng
-        self._bad: dict[tuple[int, int], bool] = {}
-        self._hash = hashlib.blake2b(digest_size=8)
+        self._bad: dict[tuple[Address, Address], bool] = {}
 
     @property
     def air(self) -> Air:
@@ -55,31 +53,23 @@ class Radio:
         """Seconds within which a datagram arrives, but for one in twenty thousand."""
         return self._slowest.delay + 10 * self._slowest.jitter
 
-    def send(self, source: int, to: int, deliver: Callable[..., object], *arguments: Any) -> None:
-        """Have ``deliver`` called at the other end, perhaps."""
-        self.sent += 1
-        self.note(source, to, self._clock.seconds())
-        copies = 2 if self.air.double and self._rng.random() < self.air.double else 1
-        for _ in range(copies):
-            if (source, to) not in self.cut and not self._is_lost(source, to):
-                late = self._rng.expovariate(1.0 / self.air.jitter) if self.air.jitter else 0.0
-                self._clock.callLater(self.air.delay + late, deliver, *arguments)
+    def delays(self, source: Address, to: Address, size: int, now: float, rng: random.Random) -> Sequence[float]:
+        """The seconds that each copy of a datagram takes; none where it is lost."""
+        air, is_cut = self._air, (source.port - PORT, to.port - PORT) in self.cut
+        copies = 2 if air.double and rng.random() < air.double else 1
+        return [
+            air.delay + (rng.expovariate(1.0 / air.jitter) if air.jitter else 0.0)
+            for _ in range(copies)
+            if not is_cut and not self._is_lost(source, to, rng)
+        ]
 
-    def digest(self) -> str:
-        """A hash of everything that was sent."""
-        return self._hash.hexdigest()
-
-    def note(self, *facts: object) -> None:
-        """Let something count for the digest."""
-        self._hash.update(repr(facts).encode())
-
-    def _is_lost(self, source: int, to: int) -> bool:
-        loss, burst = self.air.loss, self.air.burst
+    def _is_lost(self, source: Address, to: Address, rng: random.Random) -> bool:
+        loss, burst = self._air.loss, self._air.burst
         if loss == 0.0:
             return False
         if burst <= 1.0:
-            return self._rng.random() < loss
+            return rng.random() < loss
         is_bad = self._bad.get((source, to), False)
         turns = 1.0 / burst if is_bad else loss / (burst * (1.0 - loss))
-        self._bad[source, to] = is_bad = is_bad != (self._rng.random() < turns)
+        self._bad[source, to] = is_bad = is_bad != (rng.random() < turns)
         return is_bad

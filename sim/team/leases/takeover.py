@@ -64,17 +64,17 @@ def takeover(seed: int, loss: float = 0.1, ttl: float = 1.5, is_polite: bool = F
 def false_takeovers(seed: int, hours: float, loss: float = 0.2, ttl: float = 1.5) -> tuple[int, float]:
     """How often a healthy executor lost its lease in ``hours``, and the datagrams a second meanwhile."""
     team = standing(seed, loss, ttl)
-    before, sent = team.referee.wins, team.radio.sent
+    before, sent = team.referee.wins, team.board.counters["sent"]
     team.clock.advance(3600.0 * hours)
-    return team.referee.wins - before, (team.radio.sent - sent) / (3600.0 * hours)
+    return team.referee.wins - before, (team.board.counters["sent"] - sent) / (3600.0 * hours)
 
 
 def upkeep(ttl: float = 1.5) -> float:
     """Datagrams a second, questions and answers, of an executor alone on a link that loses nothing."""
     team = standing(1, 0.0, ttl, stand_bys=0)
-    sent = team.radio.sent
+    sent = team.board.counters["sent"]
     team.clock.advance(60.0)
-    return (team.radio.sent - sent) / 60.0
+    return (team.board.counters["sent"] - sent) / 60.0
 
 
 CASES = (

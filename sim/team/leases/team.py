@@ -18,19 +18,18 @@ from middleware.consensus.lease.charter import Charter, Judge, pin
 from middleware.consensus.lease.council import Council
 from middleware.consensus.lease.desk import Desk
 from middleware.consensus.lease.lessee import Lessee
-from middleware.entangled.clock import HeapClock
 from middleware.entangled.contact import Contact
-from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.data.store import Store
 from middleware.entangled.errors import Refused
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.network import Address
+from middleware.entangled.network.switchboard import Switchboard
 from middleware.entangled.quorum.ballot import majority
 from sim.team.checker import check
 from sim.team.event import Born, Commanded, Died, Halted, Held, Issued, Reached, Terms, Won
-from sim.team.history import History
 from sim.team.leases.radio import Radio
 from sim.team.machine import Machine
+from sim.team.world import World
 
 TICK = 0.1
 ACT = 0.002
@@ -152,7 +151,7 @@ class Referee:
     """The history of a team, and of each task its device's gate, what that accepted, and who won."""
 
     def __init__(self, world: LeaseTeam) -> None:
-        self.history = History(world.clock.seconds)
+        self.history = world.history
         self.gates: dict[str, Gate] = {}
         self.accepted: dict[str, list[tuple[float, int, int]]] = {}
         self.wins = 0
@@ -187,7 +186,6 @@ class Referee:
         self.history.note(Held, task_id, bidder.place, tuple(others))
         if is_new:
             self.wins += 1
-            self._world.radio.note("won", task_id, bidder.place, lease.token, self._world.clock.seconds())
             self.history.note(Won, task_id, bidder.place, lease.token)
 
     def on_issue(self, bidder: Bidder, task_id: str, permit: Permit) -> None:
@@ -233,7 +231,18 @@ class Referee:
                     self.history.note(Reached, *mine, is_reached)
 
 
-class LeaseTeam:
+class _Call(bytes):
+    """A datagram that stands for a call at the other end."""
+
+    def __new__(cls, call: Callable[[], object]) -> _Call:
+        made = super().__new__(cls)
+        made.call = call
+        return made
+
+    call: Callable[[], object]
+
+
+class LeaseTeam(World):
     """Places whose clocks run at ``rates``; the first ``agents`` of them have agents.  ``seed`` names its dice.
 
     ``stop_time`` is how long a robot takes to come to rest, ``drift`` the largest error of a clock.
@@ -250,6 +259,7 @@ class LeaseTeam:
         has_stores: bool = True,
         tick: float = TICK,
     ) -> None:
+        super().__init__(seed)
         self.ttl = ttl
         self.stop_time = stop_time
         self.drift = drift
@@ -257,22 +267,22 @@ class LeaseTeam:
         self.n = len(rates)
         self.agents = list(range(agents))
         self.has_stores = has_stores
-        self.clock = HeapClock()
-        self.radio = Radio(self.clock, random.Random(f"{seed}/radio"))
+        self.radio = Radio()
+        self.board = Switchboard(self.clock, self.generator("radio"))
+        self.board.link = self.radio
+        self._ports = [self.network(place) for place in range(self.n)]
+        for port in self._ports:
+            port.listen(_run)
         self.referee = Referee(self)
         self.referee.agree()
-        keys = random.Random(f"{seed}/keys")
+        keys = self.generator("keys")
         self.identities = [Identity(keys.randbytes(32)) for _ in range(self.n)]
         self.operator = Identity(keys.randbytes(32))
         self.judge = Judge(lambda public, task_id: public == self.operator.public)
-        places = enumerate(self.identities)
-        self.contacts = [Contact(one.public, Address("10.0.0.1", 7000 + n)) for n, one in places]
+        self.contacts = [Contact(one.public, self.address(place)) for place, one in enumerate(self.identities)]
         self.councils: dict[str, Charter] = {}
-        self._seed = seed
         self._rates = rates
         self._places = {contact.public: n for n, contact in enumerate(self.contacts)}
-        self._stores = [MemoryStore() for _ in range(self.n)]
-        self._lives = 0
         self.bidders = [self.born(place) for place in range(self.n)]
 
     def add_task(self, task_id: str, council: Sequence[int]) -> None:
@@ -297,6 +307,10 @@ class LeaseTeam:
             self.councils[task_id] = council.charter
             self.referee.look_at_cuts()
 
+    def send(self, source: int, to: int, call: Callable[[], object]) -> None:
+        """Have a call made at the other end, if the link lets it."""
+        self._ports[source].send(_Call(call), self.address(to))
+
     def ask(
         self, me: Bidder, to: int, method: str, arguments: tuple[Any, ...], answered: Callable[[object], object]
     ) -> None:
@@ -307,7 +321,7 @@ class LeaseTeam:
 
             def reply(answer: object) -> None:
                 if answer is not None:
-                    self.radio.send(to, me.place, me.machine.take, answered, answer)
+                    self.send(to, me.place, lambda: me.machine.take(answered, answer))
 
             def run() -> None:
                 answer = peer.answer(me.place, method, arguments)
@@ -318,7 +332,7 @@ class LeaseTeam:
 
             peer.machine.take(run)
 
-        self.radio.send(me.place, to, arrive)
+        self.send(me.place, to, arrive)
 
     def tell(self, source: int, contact: Contact, method: str, arguments: tuple[Any, ...]) -> None:
         """Carry what nobody answers."""
@@ -327,7 +341,7 @@ class LeaseTeam:
         def arrive() -> None:
             self.bidders[to].machine.take(self.bidders[to].answer, source, method, arguments)
 
-        self.radio.send(source, to, arrive)
+        self.send(source, to, arrive)
 
     # -- lives ------------------------------------------------------------------------------------------------------
 
@@ -339,13 +353,17 @@ class LeaseTeam:
         """End a machine as a loss of power does; what it has in a store stays."""
         self.bidders[place].machine.die()
         if not self.has_stores:
-            self._stores[place] = MemoryStore()
-        self.referee.history.note(Died, place, not self.has_stores)
+            self.stores.pop(place, None)
+        self.history.note(Died, place, not self.has_stores)
 
     def born(self, place: int) -> Bidder:
         """The next life at a place."""
-        self._lives += 1
-        self.referee.history.note(Born, place, self._lives)
-        rng = random.Random(f"{self._seed}/{place}/{self._lives}")
+        rng = self.rng(place)
+        self.history.note(Born, place, self.lives)
         machine = Machine(self.clock, self._rates[place], rng.uniform(0.0, 1e4))
-        return Bidder(self, place, machine, self._stores[place], rng)
+        return Bidder(self, place, machine, self.store(place), rng)
+
+
+def _run(datagram: bytes, source: Address) -> None:
+    assert isinstance(datagram, _Call)
+    datagram.call()

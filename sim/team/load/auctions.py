@@ -16,9 +16,8 @@ from formats.convert import Unit
 from middleware.tasks.task import Task
 from sim.team.figure import Figure, mean, share, spread
 from sim.team.load.contest import Contest
-from sim.team.load.deputies import deputies_of
-from sim.team.load.deputy import Deputy
-from sim.team.load.residents import Residents
+from sim.team.load.deputies import Deputy, deputies_of
+from sim.team.load.residents import Load
 from sim.team.team import Team
 
 
@@ -39,14 +38,12 @@ class AuctionSettings:
     """Seconds within which all of them bid."""
 
 
-class Auctions:
+class Auctions(Load):
     """The workload ``auctions``."""
 
     def __init__(self, team: Team, settings: AuctionSettings) -> None:
-        self._team = team
+        super().__init__(team, "auctions")
         self._settings = settings
-        self._rng = team.rng("auctions")
-        self._residents = Residents(team)
         self._deputies = deputies_of(team)
         self._contest: Contest | None = None
         self._begun = 0
@@ -62,7 +59,7 @@ class Auctions:
 
     def step(self) -> None:
         """Read an auction when its time is over, and begin the next one."""
-        now = self._team.clock.seconds()
+        now = self._clock.seconds()
         if now >= self._next_at:
             self._end()
             if self._begun < self._settings.count:
@@ -96,10 +93,10 @@ class Auctions:
         self._begun += 1
         self._before = {deputy.place: _counts(deputy) for deputy in self._deputies.present()}
         task = Task(f"auction {self._begun}", "none", "nothing", waiting_period=self._settings.waiting)
-        dice = self._team.rng(f"auction/{self._begun}")
+        dice = self._team.generator(f"auction/{self._begun}")
         places = self._residents.places()
         dice.shuffle(places)  # who is first asks for the council
-        contest = Contest(task, self._deputies, places, self._team.clock, dice, self._settings.spread)
+        contest = Contest(task, self._deputies, places, self._clock, dice, self._settings.spread)
         self._contest = contest
         Deferred.fromCoroutine(contest.begin())
 

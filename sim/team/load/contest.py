@@ -20,8 +20,7 @@ from middleware.consensus.strategies.nearest import Nearest
 from middleware.consensus.strategy import Report
 from middleware.entangled.errors import EntangledError
 from middleware.tasks.task import Task
-from sim.team.load.deputies import Deputies
-from sim.team.load.deputy import Deputy
+from sim.team.load.deputies import Deputies, Deputy
 
 HEIRS = 2
 """So many stand by, as in a team of agents."""

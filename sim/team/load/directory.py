@@ -17,7 +17,7 @@ from middleware.directory.presence import device_of, devices_of
 from middleware.entangled.record import Record
 from middleware.node import SwarmNode
 from sim.team.figure import Figure, mean, share, spread
-from sim.team.load.residents import Residents
+from sim.team.load.residents import Load
 from sim.team.team import Team
 
 
@@ -32,14 +32,12 @@ class DirectorySettings:
     """Seconds that each of them is given."""
 
 
-class Directory:
+class Directory(Load):
     """The workload ``directory``."""
 
     def __init__(self, team: Team, settings: DirectorySettings) -> None:
-        self._team = team
+        super().__init__(team, "directory")
         self._settings = settings
-        self._rng = team.rng("directory")
-        self._residents = Residents(team)
         self._begun = 0
         self._next_at = -math.inf
         self._stop: Callable[[], object] = lambda: None
@@ -49,7 +47,7 @@ class Directory:
 
     def step(self) -> None:
         """Let the next one list all devices, when it is time."""
-        now = self._team.clock.seconds()
+        now = self._clock.seconds()
         if now < self._next_at:
             return
         self._end()
@@ -64,10 +62,6 @@ class Directory:
     def settled(self) -> None:
         """The last one has had its time."""
         self._end()
-
-    def verdict(self) -> list[str]:
-        """Nothing: a device that is missing from a list is a figure."""
-        return []
 
     def figures(self) -> list[Figure]:
         """How many devices a node holds, the share of the busiest, and how soon and how wholly they are listed."""
@@ -93,13 +87,13 @@ class Directory:
         node = self._team.node(place)
         if not isinstance(node, SwarmNode):
             return
-        began, wanted = self._team.clock.seconds(), len(self._team.inside())
+        began, wanted = self._clock.seconds(), len(self._team.inside())
         self._most = 0
 
         def changed(records: list[Record]) -> None:
             before, self._most = self._most, max(self._most, len(devices_of(records)))
             if before < wanted <= self._most:
-                self.seconds.append(self._team.clock.seconds() - began)
+                self.seconds.append(self._clock.seconds() - began)
 
         watch = node.watch_devices(changed)
 

@@ -27,8 +27,7 @@ from middleware.entangled.identity import ID_BYTES
 from middleware.entangled.kademlia.overlay import K
 from middleware.entangled.node import EntangledNode
 from sim.team.figure import Figure, at_most, mean, share, spread
-from sim.team.load.pace import Pace
-from sim.team.load.residents import Residents
+from sim.team.load.residents import Load, Pace
 from sim.team.team import Team
 
 LISTED = 20
@@ -59,14 +58,12 @@ class Trial:
     began: float
 
 
-class Lookups:
+class Lookups(Load):
     """The workload ``lookups``."""
 
     def __init__(self, team: Team, settings: LookupSettings) -> None:
+        super().__init__(team, "lookups")
         self._settings = settings
-        self._clock = team.clock
-        self._rng = team.rng("lookups")
-        self._residents = Residents(team)
         self._pace = Pace(team.clock, settings.rate)
         self._open: dict[int, Trial] = {}
         self._begun = 0

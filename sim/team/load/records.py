@@ -14,8 +14,7 @@ from msgspec import Meta
 from middleware.entangled.record import hashed_key
 from sim.team.clients import READ, REMOVE, WRITE, Clients
 from sim.team.figure import Figure, share
-from sim.team.load.pace import Pace
-from sim.team.load.residents import Residents
+from sim.team.load.residents import Load, Pace
 from sim.team.team import Team
 
 NAME = "r"
@@ -36,13 +35,11 @@ class RecordSettings:
     """Writes, removals and reads in a second, in all."""
 
 
-class Records:
+class Records(Load):
     """The workload ``records``."""
 
     def __init__(self, team: Team, settings: RecordSettings) -> None:
-        self._team = team
-        self._rng = team.rng("records")
-        self._residents = Residents(team)
+        super().__init__(team, "records")
         self._pace = Pace(team.clock, settings.rate)
         self._keys = [hashed_key(f"records {number}") for number in range(settings.keys)]
         self._clients = Clients(team.history)
@@ -63,10 +60,6 @@ class Records:
             for key in self._keys:
                 self._read(place, key)
 
-    def verdict(self) -> list[str]:
-        """Nothing: the checker has it."""
-        return []
-
     def figures(self) -> list[Figure]:
         """How much was answered; what was not may have been done."""
         asked, answered = self._clients.asked, self._clients.answered
@@ -78,4 +71,4 @@ class Records:
     # -- inside -----------------------------------------------------------------------------------------------------
 
     def _read(self, place: int, key: bytes) -> None:
-        self._clients.read(place, self._team.place(place).lives, self._residents.node(place), key)
+        self._clients.read(place, self._team.life[place], self._residents.node(place), key)

@@ -19,10 +19,8 @@ from middleware.consensus.lease.lessee import Lessee
 from middleware.entangled.errors import EntangledError
 from middleware.tasks.task import Task
 from sim.team.figure import Figure, at_most, share, spread
-from sim.team.load.deputies import deputies_of
-from sim.team.load.deputy import Deputy
-from sim.team.load.pace import Pace
-from sim.team.load.residents import Residents
+from sim.team.load.deputies import Deputy, deputies_of
+from sim.team.load.residents import Load, Pace
 from sim.team.team import Team
 
 AGENTS = 3
@@ -59,15 +57,12 @@ class Trial:
         self.has_quorum = True
 
 
-class Takeovers:
+class Takeovers(Load):
     """The workload ``takeovers``."""
 
     def __init__(self, team: Team, settings: TakeoverSettings) -> None:
-        self._team = team
+        super().__init__(team, "takeovers")
         self._settings = settings
-        self._clock = team.clock
-        self._rng = team.rng("takeovers")
-        self._residents = Residents(team)
         self._deputies = deputies_of(team)
         self._pace = Pace(team.clock, settings.rate, settings.count)
         self._begun = self._due = 0
@@ -80,9 +75,6 @@ class Takeovers:
         self._due += self._pace.due()
         while self._due and self._begin():
             self._due -= 1
-
-    def settled(self) -> None:
-        """Nothing is left to do."""
 
     def verdict(self) -> list[str]:
         """Leases that two held at once (E2), and tasks that nobody took over (E3)."""
@@ -170,7 +162,7 @@ class Takeovers:
         self._end(trial)
 
     def _return(self, place: int) -> None:
-        if place not in self._team.nodes:
+        if place not in self._team.living:
             self._team.start(place)
 
     def _end(self, trial: Trial) -> None:

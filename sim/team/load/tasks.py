@@ -18,7 +18,7 @@ from sim.team.figure import Figure, at_most, share, spread
 from sim.team.load.contest import Contest
 from sim.team.load.deputies import deputies_of
 from sim.team.load.lookups import LISTED
-from sim.team.load.residents import Residents
+from sim.team.load.residents import Load
 from sim.team.team import Team
 
 
@@ -42,14 +42,12 @@ class TaskSettings:
     """Seconds after the first step at which they are published."""
 
 
-class Tasks:
+class Tasks(Load):
     """The workload ``tasks``."""
 
     def __init__(self, team: Team, settings: TaskSettings) -> None:
-        self._team = team
+        super().__init__(team, "tasks")
         self._settings = settings
-        self._rng = team.rng("tasks")
-        self._residents = Residents(team)
         self._deputies = deputies_of(team)
         self._due_at: float | None = None
         self._contests: list[Contest] = []
@@ -58,7 +56,7 @@ class Tasks:
 
     def step(self) -> None:
         """Publish all of them when it is time."""
-        now = self._team.clock.seconds()
+        now = self._clock.seconds()
         if self._due_at is None:
             self._due_at = now + self._settings.after
         if now < self._due_at or self._contests:
@@ -67,7 +65,7 @@ class Tasks:
             waiting, ttl = self._settings.waiting, self._settings.ttl
             task = Task(f"task {number}", "none", "nothing", waiting_period=waiting, lease_ttl=ttl)
             places = self._residents.any(self._rng, self._settings.bidders)
-            contest = Contest(task, self._deputies, places, self._team.clock, self._rng, claims=True)
+            contest = Contest(task, self._deputies, places, self._clock, self._rng, claims=True)
             self._contests.append(contest)
             if contest.bidders:
                 Deferred.fromCoroutine(contest.begin())

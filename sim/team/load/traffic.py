@@ -16,6 +16,7 @@ from msgspec import Meta
 
 from sim.team.figure import Figure, mean, percentile
 from sim.team.team import Team
+from sim.team.workload import Workload
 
 PAGE = resource.getpagesize()
 
@@ -38,7 +39,7 @@ def resident_bytes() -> int:
         return most if sys.platform == "darwin" else most * 1024
 
 
-class Traffic:
+class Traffic(Workload):
     """The workload ``traffic``; it asks nothing of anybody."""
 
     def __init__(self, team: Team, settings: TrafficSettings) -> None:
@@ -58,15 +59,8 @@ class Traffic:
             self._began = self._last_at = now
             self._cpu = time.process_time()
             self._before = {place: self._sent(place) for place in self._team.places}
-        self._node_seconds += (now - self._last_at) * len(self._team.nodes)
+        self._node_seconds += (now - self._last_at) * len(self._team.living)
         self._last_at = now
-
-    def settled(self) -> None:
-        """Nothing is left to do."""
-
-    def verdict(self) -> list[str]:
-        """Nothing: what it costs is a figure."""
-        return []
 
     def figures(self) -> list[Figure]:
         """Of a node and a second of its life; its contacts; and what it costs here."""
@@ -80,7 +74,7 @@ class Traffic:
                 (datagrams, size), (past, past_size) = self._sent(place), self._before.get(place, (0, 0))
                 sent, volume = sent + datagrams - past, volume + size - past_size
                 busiest = max(busiest, size - past_size)
-        n = len(self._team.nodes)
+        n = len(self._team.living)
         memory = (resident_bytes() - self._bare_bytes) / 1024 / max(1, n) if lived else None
         return [
             Figure("traffic.datagrams", _per(sent, lived), "a node and s", n=n),

@@ -28,8 +28,7 @@ from middleware.entangled.record import Record, Slot, hashed_key
 from middleware.entangled.replication.owner import Stored
 from sim.team.figure import Figure, at_most, mean, share, spread
 from sim.team.load.lookups import LISTED
-from sim.team.load.pace import Pace
-from sim.team.load.residents import Residents
+from sim.team.load.residents import Load, Pace
 from sim.team.team import Team
 
 QUORUM, NONE = "quorum", "none"
@@ -80,15 +79,12 @@ class Value:
         return b"value %d" % self.number
 
 
-class Values:
+class Values(Load):
     """The workload ``values``."""
 
     def __init__(self, team: Team, settings: ValueSettings) -> None:
-        self._team = team
+        super().__init__(team, "values")
         self._settings = settings
-        self._clock = team.clock
-        self._rng = team.rng("values")
-        self._residents = Residents(team)
         self._pace = Pace(team.clock, settings.rate, settings.count)
         self._begun = 0
         self._waiting: list[Value] = []
@@ -183,7 +179,7 @@ class Values:
             self._clock.callLater(self._settings.away, self._return, place)
 
     def _return(self, place: int) -> None:
-        if place not in self._team.nodes:
+        if place not in self._team.living:
             self._team.replace(place)
             self._team.start(place)
 

@@ -14,8 +14,7 @@ from middleware.entangled.errors import EntangledError, NotAcknowledged
 from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import Record, hashed_key
 from sim.team.figure import Figure, share, spread
-from sim.team.load.pace import Pace
-from sim.team.load.residents import Residents
+from sim.team.load.residents import Load, Pace
 from sim.team.team import Team
 
 NAME = "watched"
@@ -59,14 +58,12 @@ class Change:
     """By place, those that have not heard of it."""
 
 
-class Watches:
+class Watches(Load):
     """The workload ``watches``."""
 
     def __init__(self, team: Team, settings: WatchSettings) -> None:
+        super().__init__(team, "watches")
         self._settings = settings
-        self._clock = team.clock
-        self._rng = team.rng("watches")
-        self._residents = Residents(team)
         self._pace = Pace(team.clock, settings.rate)
         self._keys = [hashed_key(f"watched {number}") for number in range(settings.keys)]
         self._followers: dict[bytes, list[Follower]] = {}
@@ -84,12 +81,8 @@ class Watches:
         self._drop_late()
 
     def settled(self) -> None:
-        """Nothing is left to do."""
+        """Count what was not heard."""
         self._drop_late()
-
-    def verdict(self) -> list[str]:
-        """Nothing: a change that comes late is a figure."""
-        return []
 
     def figures(self) -> list[Figure]:
         """How many heard in time, and the seconds."""

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 from sim.team.figure import Figure
+from sim.team.leases.radio import Air, Radio
 from sim.team.link import LinkSettings
 from sim.team.load.auctions import Auctions, AuctionSettings
 from sim.team.load.deputies import deputies_of
@@ -20,11 +21,12 @@ from sim.team.load.directory import Directory, DirectorySettings
 from sim.team.load.lookups import Lookups, LookupSettings
 from sim.team.load.takeovers import Takeovers, TakeoverSettings
 from sim.team.load.traffic import Traffic, TrafficSettings
-from sim.team.scale.floor import Floor
 from sim.team.scenario import Join, Scenario
 from sim.team.team import Team
 from sim.team.workload import Workload
 
+DELAY, JITTER = 0.02, 0.01
+"""Seconds one way on the link of the figures in ``docs/consensus.md``, and the mean of what an exponential adds."""
 STEP = 0.5
 SLICE = 0.25
 """Seconds of the team's time between two looks at whether a person wants an end."""
@@ -134,7 +136,7 @@ class Survey:
         """Auctions and takeovers, by nodes of the library with the rooms for bids beside them."""
         nodes, settings = self._nodes, self._settings
         team = Team(self._scenario, settings.seed)
-        team.board.link = Floor(settings.loss)
+        team.board.link = Radio(Air(DELAY, JITTER, settings.loss))
         bidding = Auctions(team, AuctionSettings(count=settings.auctions, every=4.0))
         # No more are away at once than a small team can do without.
         rate = min(5.0, max(0.12, nodes / 200))
@@ -164,7 +166,7 @@ class Survey:
         self._pass(team, team.come())
         self._pass(team, self._scenario.join.within, team.is_standing)
         if not team.is_standing():
-            self._sized.violations.append(f"join: {len(team.nodes) - len(team.inside())} nodes are not in")
+            self._sized.violations.append(f"join: {len(team.living) - len(team.inside())} nodes are not in")
         self._pass(team, self._scenario.join.settle)
 
     def _play(self, team: Team, workload: Workload, seconds: float) -> None:

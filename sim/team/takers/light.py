@@ -128,7 +128,7 @@ class LightTrial(Trial):
 
     def living_nodes(self) -> list[LightNode]:
         """Those who live."""
-        return [cast(LightNode, node) for node in self.nodes if node is not None]
+        return [self.living[place] for place in self.alive()]
 
     def node(self, place: int, identity: Identity, rng: random.Random) -> EntangledNode:
         """A node of this kind for the node of this place."""

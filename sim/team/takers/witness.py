@@ -1,14 +1,15 @@
-"""A record of every vote of every council member of a tuple space, over all lives of its nodes."""
+"""A record of every vote of every council member of a tuple space, over all lives of its nodes, for the checker."""
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from twisted.internet.defer import maybeDeferred
 
 from middleware.entangled.contact import Contact
+from middleware.entangled.node import EntangledNode
 from middleware.entangled.quorum.acceptor import Event
 from middleware.entangled.quorum.ballot import NONE
 from middleware.entangled.quorum.register import Kind, Reply
@@ -16,12 +17,18 @@ from middleware.entangled.record import Record
 from middleware.entangled.space.posting import Place, Posted, place_unpacked, posting
 from middleware.entangled.space.seat import Seat
 from middleware.entangled.space.take_codec import unpack_reply
+from sim.team import event
+from sim.team.history import History
+
+INCARNATION = "decree/incarnation"
+"""The note in which a member of councils keeps which life it is in."""
 
 
 class Witness:
     """Writes down every acceptance of every council member, in all of its lives."""
 
-    def __init__(self) -> None:
+    def __init__(self, history: History) -> None:
+        self._history = history
         self.posted: dict[Place, Posted] = {}
         self.bids: dict[Place, dict[tuple[int, bytes, bytes], set[bytes]]] = defaultdict(lambda: defaultdict(set))
 
@@ -29,6 +36,9 @@ class Witness:
         """Take note of a tuple that some replica holds now."""
         said = posting(record)
         if isinstance(said, Posted):
+            if said.place not in self.posted:
+                seats = [(member.contact.public, member.incarnation) for member in said.council]
+                self._history.note(event.Posted, said.place, said.fields, *map(tuple, zip(*seats, strict=True)))
             self.posted[said.place] = said
 
     def attend(self, seat: Seat, expose: Callable[..., object], member: bytes) -> None:
@@ -36,8 +46,8 @@ class Witness:
         confirm: Callable[..., Any] = seat.answer_confirm
         claim: Callable[..., Any] = seat.answer_claim
 
-        def told(event: Event, key: bytes, places: list[object], answers: list[object]) -> list[tuple[Place, Reply]]:
-            pairs = [(place_unpacked(key, p), unpack_reply(a, event)) for p, a in zip(places, answers, strict=True)]
+        def told(asked: Event, key: bytes, places: list[object], answers: list[object]) -> list[tuple[Place, Reply]]:
+            pairs = [(place_unpacked(key, p), unpack_reply(a, asked)) for p, a in zip(places, answers, strict=True)]
             return [(place, reply) for place, reply in pairs if place is not None and reply is not None]
 
         def confirmed(peer: Contact, key: bytes, places: list[object], incarnation: bytes, *ballot: Any) -> Any:
@@ -65,7 +75,14 @@ class Witness:
 
     def accepted(self, place: Place, ballot: tuple[int, bytes, bytes], member: bytes) -> None:
         """Take note of what a member of the council accepted."""
+        if member not in self.bids[place][ballot]:
+            self._history.note(event.Voted, place, ballot[:2], ballot[2], member)
         self.bids[place][ballot].add(member)
+
+    def seated(self, nodes: Iterable[EntangledNode]) -> None:
+        """Write down who lives now, and what it is to the councils; to ask it would make it take its seat."""
+        members = [(node.identity.public, node.seat._life or node.store.noted(INCARNATION) or b"") for node in nodes]
+        self._history.note(event.Seated, tuple(members))
 
     def takers(self, place: Place) -> set[bytes]:
         """Everybody for whom a majority of the council ever accepted a take; more than one is a violation."""
@@ -75,7 +92,3 @@ class Witness:
     def open(self) -> list[Posted]:
         """The tuples that no majority has given to anybody."""
         return [posted for place, posted in self.posted.items() if not self.takers(place)]
-
-    def split(self) -> list[str]:
-        """Tuples that two majorities gave to different takers, at any two moments."""
-        return [f"{p.fields} was accepted for two" for place, p in self.posted.items() if len(self.takers(place)) > 1]

@@ -11,6 +11,7 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.errors import BadSetting
 from sim.team.command import ENDED, KINDS, MISSED, Environment, run
+from sim.team.report import Trace
 
 SCENARIO = """
 about = "a small team"
@@ -128,3 +129,26 @@ class CommandTests(SynchronousTestCase):
         """A folder that is not there is refused before anything runs."""
         error = self.assertRaises(BadSetting, self.run_it, "--json", str(self.folder / "no" / "r.json"))
         self.assertEqual((error.key, self.err.getvalue()), ("--json", ""))
+
+
+class TraceTests(SynchronousTestCase):
+    """Behaviour of ``Trace``."""
+
+    def test_each_event_is_a_line_up_to_a_bound(self) -> None:
+        """Head, events and end are one JSON object a line; beyond the bound they are only counted."""
+        out = io.StringIO()
+        trace = Trace(out, 2)
+        trace.begin(seed=3)
+        trace.told(1.25, "born", 0, "")
+        trace.told(2.0, "fault", -1, "1: crash")
+        trace.told(3.0, "killed", 0, "")
+        trace.end(partial=False)
+        self.assertEqual(
+            [json.loads(line) for line in out.getvalue().splitlines()],
+            [
+                {"trace": 1, "seed": 3},
+                {"at": 1.25, "event": "born", "place": 0},
+                {"at": 2.0, "event": "fault", "more": "1: crash"},
+                {"end": True, "events": 3, "left_out": 1, "partial": False},
+            ],
+        )

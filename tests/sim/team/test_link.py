@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import random
+from itertools import combinations
 from statistics import fmean
 
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.network.network import Address
+from sim.team.faults.barrier import clog, cut, deaf, mute, pairs
 from sim.team.link import LinkSettings, TeamLink
 
 NODES = [Address(f"10.0.0.{number}", 7000) for number in range(200)]
-A, B = NODES[:2]
+A, B, C = NODES[:3]
 
 
 def _sent(link: TeamLink, count: int, gap: float = 0.001, source: Address = A, to: Address = B) -> list[list[float]]:
@@ -82,3 +84,28 @@ class TeamLinkTests(SynchronousTestCase):
         self.assertApproximates(sum(not delays for delays in _sent(link, 4000)) / 4000, 0.5, 0.03)
         link.worse = 0.0
         self.assertTrue(all(_sent(link, 100)))
+
+
+class BarrierTests(SynchronousTestCase):
+    """Who can still write to whom."""
+
+    def test_each_kind_stops_what_it_should(self) -> None:
+        """Cut both ways, deaf and mute one way, all three but among themselves; clogged from and to everybody."""
+        table = {
+            cut([A.host, B.host]): {(A, C), (C, A), (B, C), (C, B)},
+            deaf([A.host, B.host]): {(C, A), (C, B)},
+            mute([A.host, B.host]): {(A, C), (B, C)},
+            clog(A.host): {(A, B), (B, A), (A, C), (C, A)},
+        }
+        for barrier, stopped in table.items():
+            found = {(x, y) for x in (A, B, C) for y in (A, B, C) if x != y and barrier(x, y)}
+            self.assertEqual(found, stopped)
+
+    def test_pairs_are_a_share_and_the_same_both_ways(self) -> None:
+        """About that share of all pairs is cut, in both directions, and others with another salt."""
+        nodes = NODES[:150]
+        barrier, other = pairs(0.05, "1"), pairs(0.05, "2")
+        cut_off = [(a, b) for a, b in combinations(nodes, 2) if barrier(a, b)]
+        self.assertApproximates(len(cut_off) / (150 * 149 / 2), 0.05, 0.01)
+        self.assertTrue(all(barrier(b, a) for a, b in cut_off))
+        self.assertLess(sum(other(a, b) for a, b in cut_off) / len(cut_off), 0.2)

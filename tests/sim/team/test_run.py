@@ -15,7 +15,7 @@ from sim.team.link import LinkSettings
 from sim.team.run import DONE, JOINING, RUNNING, Run
 from sim.team.scenario import Clocks, Join, Scenario, Sessions
 from sim.team.team import Team
-from sim.team.workload import Kind
+from sim.team.workload import Kind, Workload
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class _Nothing:
     pass
 
 
-class _Steps:
+class _Steps(Workload):
     """A workload that counts what is asked of it, and finds what it is told to find."""
 
     found: tuple[str, ...] = ()
@@ -213,7 +213,7 @@ class RunTests(SynchronousTestCase):
         assert stays is not None
         expected = 12 * 60.0 / (stays.mean + sessions.breaks.mean)
         self.assertApproximates(len(ended) / expected, 1.0, 0.35)
-        self.assertGreaterEqual(len(run.team.nodes), 2)
+        self.assertGreaterEqual(len(run.team.living), 2)
         self.assertGreater(len([1 for _, event, _ in told if event == "born"]), 0.7 * len(ended))
 
     def test_sessions_may_bring_others(self) -> None:

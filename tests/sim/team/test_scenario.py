@@ -5,12 +5,14 @@ from __future__ import annotations
 import random
 import re
 from dataclasses import dataclass
+from statistics import fmean, median
 from typing import Annotated
 
 from msgspec import Meta
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.errors import BadSetting
+from sim.team import session
 from sim.team.command import KINDS
 from sim.team.scenario import FOLDER, Scenario, loaded, names, scenario_of
 
@@ -180,3 +182,30 @@ class ScenarioTests(SynchronousTestCase):
         """A scenario that is not there is refused, and so is a file that cannot be read."""
         self.assertIn("steady", self.assertRaises(BadSetting, loaded, "stedy", {}).remedy)
         self.assertIn("cannot be read", self.assertRaises(BadSetting, loaded, "/nowhere/x.toml", {}).problem)
+
+
+class SessionTests(SynchronousTestCase):
+    """Behaviour of ``Session``."""
+
+    def test_half_of_them_are_shorter_than_the_median(self) -> None:
+        """Drawn durations have the median and the mean that they should have."""
+        for kind in session.KINDS:
+            stays, rng = session.Session(kind, 60.0), random.Random(1)
+            drawn = [stays.drawn(rng) for _ in range(40_000)]
+            self.assertApproximates(median(drawn), 60.0, 2.0, kind)
+            self.assertApproximates(fmean(drawn) / stays.mean, 1.0, 0.06, kind)
+
+    def test_rate_of_leaving_is_the_same_from_the_start(self) -> None:
+        """Of many sessions met under way, as many end in the first seconds as in any others: n / mean a second."""
+        for kind in session.KINDS:
+            stays, rng = session.Session(kind, 60.0), random.Random(2)
+            ends = []
+            for _ in range(20_000):
+                moment = stays.left(rng)
+                while moment < 60.0:
+                    ends.append(moment)
+                    moment += stays.drawn(rng)
+            expected = 20_000 / stays.mean * 20.0
+            for start in (0.0, 20.0, 40.0):
+                count = sum(start <= moment < start + 20 for moment in ends)
+                self.assertApproximates(count / expected, 1.0, 0.08, f"{kind} from {start}")

@@ -7,7 +7,8 @@ import io
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from benchmarks.dissemination import BUSIEST, Crowd, Outcome, Weather, main, percentile
+from benchmarks.dissemination import BUSIEST, Crowd, Outcome, Weather, main
+from benchmarks.measure import percentile
 from middleware.consensus.bidding.scale import DIRECT
 
 AFTER = 4.0

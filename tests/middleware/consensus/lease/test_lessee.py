@@ -116,7 +116,7 @@ class LesseeTests(RoomCase):
     def test_member_that_keeps_silent(self) -> None:
         """A holder goes on under its ballot while a member may grant nothing yet: another would serve no better."""
         self.room.kill(3)
-        self.room._stores[3] = MemoryStore()
+        self.room.stores[3] = MemoryStore()
         self.room.bidders[3] = self.room.born(3)
         self.wanting(0)
         first = self.room.bidders[4].acceptor.log.get(T).holder  # type: ignore[union-attr]

@@ -93,7 +93,7 @@ class RuleTests(RoomCase):
             for member in (3, 4):
                 self.room.kill(member)
                 if is_lost:
-                    self.room._stores[member] = MemoryStore()
+                    self.room.stores[member] = MemoryStore()
                 self.room.bidders[member] = self.room.born(member)
             self.lessee(0).release()
             self.wanting(1, 0.2)

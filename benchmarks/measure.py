@@ -1,0 +1,86 @@
+"""What benchmarks share: percentiles, processes that report in JSON, and the figures of ``/proc`` (Linux)."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+MIB = 2**20
+TICKS = os.sysconf("SC_CLK_TCK")
+
+
+def percentile(values: Sequence[float], share: float) -> float:
+    """The value below which that share of ``values`` lies; infinite where there are none."""
+    ordered = sorted(values)
+    return ordered[min(len(ordered) - 1, int(share * len(ordered)))] if ordered else math.inf
+
+
+def processor_s(pid: int) -> float:
+    """The processor seconds that a process has used."""
+    fields = Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / TICKS
+
+
+def memory_bytes(field: str = "VmRSS", pid: int | str = "self") -> int:
+    """The memory of a process: resident now (``VmRSS``), or at its highest (``VmHWM``)."""
+    lines = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text(encoding="ascii").splitlines())
+    return int(lines[field].split()[0]) * 1024
+
+
+def maps_mib(pid: int) -> dict[str, float]:
+    """The memory of a process in MiB by kind: ``Rss``, ``Pss``, ``Private_Clean``, ``Private_Dirty`` and others."""
+    lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()[1:]
+    return {line.split(":")[0]: float(line.split()[1]) / 1024 for line in lines if line.endswith("kB")}
+
+
+def udp_count(name: str) -> int:
+    """A counter of this machine's UDP, such as ``InDatagrams``, whosever datagrams they are.
+
+    In a network namespace of its own (``benchmarks/README.md``) the figures are of the nodes alone.
+    """
+    rows = [line.split() for line in Path("/proc/net/snmp").read_text().splitlines() if line.startswith("Udp:")]
+    return int(rows[1][rows[0].index(name)])
+
+
+class Child:
+    """A process that is asked and answers in lines of JSON."""
+
+    def __init__(self, module: str, *arguments: object) -> None:
+        command = [sys.executable, "-m", module, *map(str, arguments)]
+        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+    def read(self) -> dict[str, Any]:
+        """The next line."""
+        assert self.process.stdout is not None
+        line = self.process.stdout.readline()
+        if not line:
+            raise RuntimeError("a process of the measurement ended early")
+        found: dict[str, Any] = json.loads(line)
+        return found
+
+    def say(self, what: str = "") -> None:
+        """Write a line."""
+        assert self.process.stdin is not None
+        self.process.stdin.write(what + "\n")
+        self.process.stdin.flush()
+
+    def asked(self) -> dict[str, Any]:
+        """A report."""
+        self.say()
+        return self.read()
+
+    def end(self) -> None:
+        """Close its input, and wait until it is gone."""
+        assert self.process.stdin is not None
+        self.process.stdin.close()
+        try:
+            self.process.wait(15.0)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()

@@ -1,0 +1,97 @@
+"""What the tests of whole teams in memory share."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+from twisted.internet.defer import Deferred
+from twisted.trial.unittest import SynchronousTestCase
+
+from agents.behaviour import KINDS
+from middleware.consensus.verdict import Verdict, verdict_of, verdicts_key
+from middleware.tasks.task import Member, Task, group_key, member_of
+from sim.robots.scene import FOOTPRINT
+from swarmnode.rehearsal import LAN, VirtualTeam
+
+LOOK_S = 0.05
+
+
+class TeamCase(SynchronousTestCase):
+    """Tests of a team of a laptop and three dogs."""
+
+    def start_team(
+        self,
+        seed: int = 3,
+        dogs: tuple[str, ...] = VirtualTeam.DOGS,
+        loss: float = 0.0,
+        others: tuple[str, ...] = (),
+    ) -> VirtualTeam:
+        """A team that ends with the test."""
+        team = VirtualTeam(seed, weather=replace(LAN, loss=loss), dogs=dogs, others=others)
+        self.addCleanup(team.stop)
+        return team
+
+    def until(self, team: VirtualTeam, is_so: Callable[[], bool], limit: float = 90.0) -> float:
+        """Let the team live until something is so; the seconds that took, a failure after ``limit``."""
+        began = team.clock.seconds()
+        while not is_so():
+            if team.clock.seconds() - began > limit:
+                self.fail(f"not so within {limit:g} s: {team.state()['tasks']}")
+            team.clock.advance(LOOK_S)
+            self.look(team)
+        return team.clock.seconds() - began
+
+    def look(self, team: VirtualTeam) -> None:
+        """Called after each step of ``until``."""
+
+    def task(self, team: VirtualTeam) -> dict[str, Any]:
+        """The newest task as the page shows it."""
+        tasks = team.state()["tasks"]
+        return dict(tasks[0]) if tasks else {"status": "absent"}
+
+    def device(self, team: VirtualTeam, name: str) -> dict[str, Any]:
+        """A device as the page shows it."""
+        return next((dict(row) for row in team.state()["devices"] if row["name"] == name), {"status": "absent"})
+
+    def statuses(self, team: VirtualTeam) -> dict[str, str]:
+        """The status of each device."""
+        return {row["name"]: row["status"] for row in team.state()["devices"]}
+
+    def lines(self, team: VirtualTeam, name: str) -> list[str]:
+        """The messages of a device."""
+        return [text for _, text in self.device(team, name)["messages"]]
+
+    def executing(self, team: VirtualTeam) -> list[str]:
+        """Who executes the newest task."""
+        groups = team.state()["groups"]
+        return [m["name"] for m in groups[0]["members"] if m["status"] == "EXECUTING"] if groups else []
+
+    def gap(self, team: VirtualTeam, name: str) -> float:
+        """Metres between the dog's footprint and the target."""
+        dog, target = team.yard.world.dogs[name], team.yard.world.target
+        assert target is not None
+        return math.hypot(dog.x - target.x, dog.y - target.y) - target.radius - FOOTPRINT
+
+    def moving(self, team: VirtualTeam) -> list[str]:
+        """The dogs that move now."""
+        return [dog.name for dog in team.yard.world.dogs.values() if dog.is_moving]
+
+    def submit(self, team: VirtualTeam, task: Task) -> None:
+        """Let the laptop publish a task."""
+        Deferred.fromCoroutine(team.services["vaio"].assembly.node.submit(task))
+
+    def members(self, team: VirtualTeam, task_id: str) -> list[Member]:
+        """What is reported on a task."""
+        return [m for record in team.desk.read(group_key(task_id)) if (m := member_of(record)) is not None]
+
+    def verdicts(self, team: VirtualTeam, task_id: str) -> list[Verdict]:
+        """What each device says of its decisions on a task."""
+        return [v for record in team.desk.read(verdicts_key(task_id)) if (v := verdict_of(record)) is not None]
+
+    def use_facing(self) -> None:
+        """Let the tasks of this test have the behaviour ``facing``."""
+        KINDS["facing"] = "tests.swarm.facing:Facing"
+        self.addCleanup(KINDS.pop, "facing")
