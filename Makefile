@@ -30,11 +30,12 @@ RUNTIME := $(VENV)/.stamp-runtime
 DEV     := $(VENV)/.stamp-dev
 BROWSER := $(VENV)/.stamp-browser
 BENCH   := $(VENV)/.stamp-bench
+DOCUMENTS := $(VENV)/.stamp-docs
 CONTRACT := $(VENV)/contract
 
 .PHONY: help demo test trials check format cov live contract schedules stops bugs slice browser \
     live-nat bench-demo bench-page bench-dht bench-consensus bench-takeover bench-flood bench-robots bench-crowd \
-    bench-scale api dist clean
+    bench-scale docs dist clean
 
 help:
 	@echo 'make demo [HEADLESS=1] [SEED=1]       three robots, a red target and the page; HEADLESS: both experiments, then exit'
@@ -66,7 +67,7 @@ help:
 	@echo 'make bench-robots                     three AIBOs driven at once: frames, pictures, command to wheel, memory'
 	@echo 'make bench-crowd [QUICK=1]            a yard for many: 3 to 10,000 robots, a hundred agents attached, a task; QUICK: no agents'
 	@echo 'make bench-scale [NODES=3,10,30]      teams of 3 to 10,000 nodes, simulated: hops, bytes, memory, seconds; resumable'
-	@echo 'make api                              the reference of every class, from the docstrings, in build/api'
+	@echo 'make docs                             the documentation as a site with search and API reference, in build/docs'
 	@echo 'make dist                             sdist and wheel, installed into a fresh environment and asked for help'
 	@echo 'make clean                            remove what the above left behind, the environment included'
 
@@ -159,9 +160,10 @@ bench-flood: $(RUNTIME)
 	@mkdir -p build
 	$(PY) -m benchmarks.flood --out build/bench-flood.json
 
-api: $(DEV)
-	$(PIP) 'pydoctor>=25.10,<26'
-	$(VENV)/bin/pydoctor --config=setup.cfg
+# Builds without the network once set up.  A warning is an error.
+docs: $(DOCUMENTS)
+	$(PY) -m sphinx -W --keep-going -q -b html docs build/docs
+	@echo 'open build/docs/index.html'
 
 dist: $(DEV)
 	rm -rf build dist
@@ -205,6 +207,11 @@ $(BROWSER): setup.cfg pyproject.toml | $(PY)
 $(BENCH): setup.cfg pyproject.toml | $(PY)
 	@$(PIP) 'setuptools>=77'
 	@$(INSTALL) '.[all,bench]'
+	@touch $@ $(RUNTIME)
+
+$(DOCUMENTS): setup.cfg pyproject.toml | $(PY)
+	@$(PIP) 'setuptools>=77'
+	@$(INSTALL) '.[all,docs]'
 	@touch $@ $(RUNTIME)
 
 # Its tool brings a test runner of its own along, so it has an environment of its own.

@@ -104,7 +104,7 @@ class Body:
     def halt(self) -> float:
         """Stand still; returns for how many seconds it may still move where it does not hear that: as its permit says.
 
-        A robot that knows no permits moves for as long as its own timer lets it (docs/robots/stopping.md).
+        A robot that knows no permits moves for as long as its own timer lets it (docs/explanation/stopping-a-robot.md).
         """
         self.driver.stop()
         if not self.driver.description.limits or self.driver.state in ("ready", "stopped"):

@@ -39,7 +39,10 @@ def main(
     if not found:
         there = f"there are those of {', '.join(each.name for each in here)}" if here else "start a node with the role"
         whose = "no node with a page" if wishes.node is None else f"no page of a node {wishes.node!r}"
-        sys.stderr.write(printable(f"swarm web: {whose} runs on this machine; {there}; ") + "see docs/safety.md\n")
+        sys.stderr.write(
+            printable(f"swarm web: {whose} runs on this machine; {there}; ")
+            + "see docs/explanation/access-and-robot-safety.md\n"
+        )
         return 2
     for each in found:
         if wishes.json:

@@ -1,7 +1,7 @@
 """The layers of the tree as data: the job of each package, and the packages that its modules may import.
 
 ``tests.test_house`` checks every import against it, and ``python -m tests.layers`` writes the tables of
-docs/architecture.md from it.
+docs/explanation/architecture.md from it.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-PAGE = Path(__file__).parents[1] / "docs" / "architecture.md"
+PAGE = Path(__file__).parents[1] / "docs" / "explanation" / "architecture.md"
 BEGIN, END = "<!-- layers: python -m tests.layers -->\n", "<!-- end of the layers -->\n"
 TOP = ("agents", "drivers", "formats", "middleware", "sim", "swarmnode", "webnode")
 """The packages of the product."""
@@ -56,7 +56,7 @@ LAYERS: dict[str, Layer] = {
     ),
     "middleware.entangled.quorum": Layer("agreement by a majority: Paxos with leases ([quorum.md](quorum.md))"),
     "middleware.entangled.space": Layer(
-        "keywords and the tuple space ([tuplespace.md](tuplespace.md))",
+        "keywords and the tuple space ([tuplespace.md](../reference/tuple-space.md))",
         (*BASE, *_entangled("data", "kademlia.distance", "quorum", "replication")),
     ),
     "middleware.entangled.control": Layer(
@@ -100,7 +100,7 @@ LAYERS: dict[str, Layer] = {
         (*LIBRARY, *_middleware("consensus", "directory", "node", "tasks")),
     ),
     "middleware.faults": Layer(
-        "fault injection into a running node ([faults.md](faults.md))",
+        "fault injection into a running node ([faults.md](../how-to/inject-faults.md))",
         (*LIBRARY, "formats", *_middleware("directory", "node", "tasks")),
     ),
     "drivers": Layer("one contract for every robot, one package a kind; no kind knows another", ("formats",)),
@@ -130,11 +130,13 @@ LAYERS: dict[str, Layer] = {
     ),
     "sim.demo": Layer("the demonstration", ("drivers", "sim.robots")),
     "sim.team": Layer(
-        "the simulator of teams in virtual time: nodes, faults, schedules, invariants ([sim.md](sim.md))",
+        "the simulator of teams in virtual time: nodes, faults, schedules, invariants "
+        "([simulate-teams.md](../how-to/simulate-teams.md))",
         ("formats", "middleware", *(f"drivers.{name}" for name in ("driver", "errors", "gate", "link"))),
     ),
     "sim.namespaces": Layer(
-        "an internet of network namespaces, and the demonstration across it ([nat.md](nat.md))", ("sim.demo",)
+        "an internet of network namespaces, and the demonstration across it ([nat.md](../internals/nat.md))",
+        ("sim.demo",),
     ),
     "swarmnode": Layer("settings in, a running node out; the `swarm` command", TOP),
 }

@@ -1,4 +1,4 @@
-"""The role table in docs/security.md, written from ``middleware.admission.roles``: ``python -m tests.role_table``."""
+"""Write the role table of docs/explanation/trust-model.md: ``python -m tests.role_table``."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 from middleware.admission.roles import METHODS, NAMESPACES, OTHER_METHODS, ROLES
 
-PAGE = Path(__file__).parents[1] / "docs" / "security.md"
+PAGE = Path(__file__).parents[1] / "docs" / "explanation" / "trust-model.md"
 BEGIN, END = "<!-- role table: python -m tests.role_table -->\n", "<!-- end of the role table -->\n"
 
 

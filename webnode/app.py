@@ -119,7 +119,7 @@ def _explain(app: Flask) -> None:
     @app.errorhandler(HTTPException)
     def unlawful(error: HTTPException) -> tuple[Response, int]:
         code = error.code or 500
-        remedy = "send less" if code == 413 else "look at docs/web.md for what can be asked"
+        remedy = "send less" if code == 413 else "look at docs/reference/http-api.md for what can be asked"
         response = jsonify(Refusal(request.path, error.name.lower(), remedy).fields)
         allowed = getattr(error, "valid_methods", None)
         if allowed:

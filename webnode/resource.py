@@ -18,13 +18,17 @@ class JsonResource(Resource):
 
     def getChild(self, path: bytes, request: Request) -> Resource:
         """There is nothing below."""
-        return Refused(Refusal(path_of(request), "not found", "look at docs/web.md for what can be asked", 404))
+        return Refused(
+            Refusal(path_of(request), "not found", "look at docs/reference/http-api.md for what can be asked", 404)
+        )
 
     def render(self, request: Request) -> int | bytes:
         """Answer with one of ``methods``."""
         is_there = self.isLeaf or hasattr(self, "render_GET") or request.method not in (b"GET", b"HEAD")
         if not is_there or (self.isLeaf and getattr(request, "postpath", None)):
-            refusal = Refusal(path_of(request), "not found", "look at docs/web.md for what can be asked", 404)
+            refusal = Refusal(
+                path_of(request), "not found", "look at docs/reference/http-api.md for what can be asked", 404
+            )
             return answer(request, refusal)
         if request.method not in self.methods:
             request.setHeader("Allow", b", ".join(self.methods).decode())

@@ -24,7 +24,7 @@ from sim.demo.trials import whole
 from sim.namespaces.internet import Internet
 from sim.namespaces.room import refusal
 
-DOCUMENT = Path("docs/nat.md")
+DOCUMENT = Path("docs/internals/nat.md")
 PICTURE = "images/nat.svg"
 
 

@@ -200,7 +200,7 @@ class DeploymentSettings:
     allow: bool = False
     """**The author of a behaviour decides where this robot goes.**  The signature says from whom a module comes, not
     that it is harmless.  It runs in a process of its own without rights, as far as the system allows
-    (``docs/deployment.md``).  False: nothing is ever fetched, loaded or run."""
+    (``docs/how-to/push-code-to-a-team.md``).  False: nothing is ever fetched, loaded or run."""
 
     operators: setting.PublicKeys = ()
     """Public keys of the nodes that may push, each 64 hexadecimal digits; in a closed team they need the role operator

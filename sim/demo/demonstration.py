@@ -268,7 +268,7 @@ async def _run(reactor: Any, wishes: argparse.Namespace) -> None:
 def _invite(demonstration: Demonstration, plan: Plan) -> None:
     say(f"The page: {demonstration.address}   (logs: {plan.run_dir}; end with Ctrl-C)")
     if demonstration.secure:
-        say(f"Over TLS: {demonstration.secure}   (a browser warns until it trusts the team: docs/https.md)")
+        say(f"Over TLS: {demonstration.secure}   (a browser warns until it trusts the team: docs/how-to/https.md)")
     say("If the node that serves it is lost, the page goes on at another: end the process of vaio, and see.")
     if plan.web_host == LOOPBACK:
         say("For a phone or tablet in the same network, then over TLS as well: make demo WEB_HOST=0.0.0.0")

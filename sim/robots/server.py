@@ -45,7 +45,7 @@ def main(arguments: list[str] | None = None, output: TextIO = sys.stdout, errors
         type=Path,
         metavar="FILE",
         help="a TOML file: a table for each dog that is reached as a robot of another kind, as its driver has it "
-        "(docs/simulator.md)",
+        "(docs/how-to/simulate-robots.md)",
     )
     chosen = parser.parse_args(arguments)
     if not 0 <= chosen.port <= 65535:

@@ -1,4 +1,7 @@
-"""The states of an agent in docs/agents.md, written from ``agents.state``: ``python -m tests.agents.state_table``."""
+"""Write the states of an agent into docs/how-to/write-tasks-behaviours-strategies.md.
+
+Usage: ``python -m tests.agents.state_table``.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,7 @@ from pathlib import Path
 
 from agents.state import ROWS, TABLE, State
 
-PAGE = Path(__file__).parents[2] / "docs" / "agents.md"
+PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "write-tasks-behaviours-strategies.md"
 BEGIN, END = "<!-- states: python -m tests.agents.state_table -->\n", "<!-- end of the states -->\n"
 PRESENT = "PRESENT"
 PRESENT_STATES = State.OBSERVING, State.REPORTED, State.WAITING, State.CLAIMING, State.FENCED

@@ -17,7 +17,7 @@ from tests.live.namespaces import NamespaceCase
 from tests.live.until import until
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGE = ROOT / "docs" / "deploy.md"
+PAGE = ROOT / "docs" / "how-to" / "set-up-a-team.md"
 BLOCK = re.compile(r"^```sh (\w+)( again)?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 CODE = re.compile(r"\b[0-9A-Z]{5}(?:-[0-9A-Z]{5}){3}\b")
 AT_HOME, RENTED = "192.168.1.10", "203.0.113.7"

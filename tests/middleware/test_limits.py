@@ -1,4 +1,4 @@
-"""Tests of ``docs/limits.md``: its figures are those of the code, and a crowd of made-up members stays within them."""
+"""Test that docs/reference/limits.md has the figures of the code, and that invented members stay within them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from middleware.entangled.wire import answerer, door, method, peer
 from middleware.entangled.wire.endpoint import Endpoint
 from tests.fleet import TEAM, FleetCase
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "limits.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "reference" / "limits.md"
 ROW = re.compile(r"([\d]+)[^`\d]*`([\w/]+\.py)::([A-Z_]+)`")
 SMALL = 24
 CROWD = 60

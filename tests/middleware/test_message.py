@@ -23,7 +23,7 @@ _VALUES = st.recursive(
 
 
 def by_the_table(kind: object, fields: list[Any]) -> Message | None:
-    """What ``docs/protocol.md`` calls the message of these fields, by patterns, without any haste."""
+    """What ``docs/reference/wire-protocol.md`` calls the message of these fields, by patterns, without any haste."""
     if type(kind) is not int or any(deep(field) > 15 for field in fields):
         return None
     match [kind, *fields]:
@@ -76,7 +76,7 @@ class MessageTests(SynchronousTestCase):
         ),
     )
     def test_decoded_reads_as_the_table_says(self, kind: Any, fields: list[Any]) -> None:
-        """Whatever the fields, the message is the one that the table of ``docs/protocol.md`` says, or none."""
+        """Each message has the fields that the table of ``docs/reference/wire-protocol.md`` gives."""
         try:
             found: Message | None = decoded(msgpack.packb([kind, *fields]))
         except Malformed:

@@ -1,4 +1,4 @@
-"""Tests of ``docs/protocol.md`` by a whole exchange with fixed keys: every datagram byte for byte."""
+"""Tests of ``docs/reference/wire-protocol.md`` by a whole exchange with fixed keys: every datagram byte for byte."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Dissemination: a node's parties in auctions, on its endpoint: what is sent, asked again, believed and refused.
 
 Every bid is checked against its agent's signature and every announcement against that of a member of the pinned
-council, before a party hears of it.  What a peer may do with that stands in ``docs/consensus.md``.
+council, before a party hears of it.  What a peer may do with that stands in ``docs/explanation/choosing-a-robot.md``.
 """
 
 from __future__ import annotations

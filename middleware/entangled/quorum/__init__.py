@@ -1,1 +1,1 @@
-"""Quorum: Paxos with leases, the one implementation; ``docs/quorum.md`` is its specification."""
+"""Quorum: Paxos with leases, the one implementation; ``docs/explanation/quorum.md`` is its specification."""

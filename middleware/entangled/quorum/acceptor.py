@@ -2,7 +2,7 @@
 
 A decision is Lamport's single-decree Paxos: prepare, then accept for ever.  A lease is PaxosLease: prepare, then
 lease for ``ttl`` seconds, extended by leasing again under the same ballot.  A change of the configuration is a
-decision that ends all leases (Vertical Paxos).  ``docs/quorum.md`` has the invariants that are named here.
+decision that ends all leases (Vertical Paxos).  ``docs/explanation/quorum.md`` has the invariants that are named here.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """TupleSpace: put, get, read and claim tuples by template; each is confirmed to at most one taker.
 
 A tuple is a record of its publisher, with the council that decides who takes it; ``decree`` has the agreement,
-``taker`` the conversation that leads to it.  What a call waits for is described in ``docs/tuplespace.md``.
+``taker`` the conversation that leads to it.  What a call waits for is described in ``docs/reference/tuple-space.md``.
 """
 
 from __future__ import annotations

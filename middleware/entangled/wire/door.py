@@ -155,7 +155,7 @@ class OpenDoor(Door):
 OPEN = OpenDoor()
 UNPROTECTED = (
     "whoever knows its team_key is a member and may do everything, nobody can be put out, and who records the wire"
-    " and learns the key later can pretend to be any newcomer; docs/security.md says more"
+    " and learns the key later can pretend to be any newcomer; docs/explanation/trust-model.md says more"
 )
 """What an open team does not protect."""
 

@@ -1,7 +1,7 @@
 """Endpoint: a node's end of the wire; asks, answers and tells in sealed datagrams.
 
 It sorts what arrives, keeps the table of sessions, and drops and counts what does not open.  How questions are repeated
-stands in ``asker``, how they are answered in ``answerer``; ``docs/protocol.md`` has every byte.
+stands in ``asker``, how they are answered in ``answerer``; ``docs/reference/wire-protocol.md`` has every byte.
 """
 
 from __future__ import annotations

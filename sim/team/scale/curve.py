@@ -73,7 +73,7 @@ CURVES = (
         "One task for all: seconds until 95 % of the agents agree, 10 % loss",
         "s",
         theory.agreement,
-        "rounds of the simulation in docs/consensus.md",
+        "rounds of the simulation in docs/explanation/choosing-a-robot.md",
         bound=Bound(1.0),
         at=((100, Bound(0.6)), (1000, Bound(0.8))),
     ),

@@ -26,7 +26,7 @@ from sim.team.team import Team
 from sim.team.workload import Workload
 
 DELAY, JITTER = 0.02, 0.01
-"""Seconds one way on the link of the figures in ``docs/consensus.md``, and the mean of what an exponential adds."""
+"""Seconds one way on the link of ``docs/explanation/choosing-a-robot.md``, and the mean of the exponential jitter."""
 STEP = 0.5
 SLICE = 0.25
 """Seconds of the team's time between two looks at whether a person wants an end."""

@@ -1,4 +1,4 @@
-"""Tests of the eighth section of ``docs/protocol.md`` by one of each thing with fixed keys: byte for byte."""
+"""Test section 8 of ``docs/reference/wire-protocol.md`` byte for byte, with fixed keys."""
 
 from __future__ import annotations
 

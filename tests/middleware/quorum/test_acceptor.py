@@ -157,7 +157,7 @@ class ReachableTests(SynchronousTestCase):
         now: float,
         reply: Reply,
     ) -> None:
-        """The invariants of one step, by their names in ``docs/quorum.md``."""
+        """The invariants of one step, by their names in ``docs/explanation/quorum.md``."""
         case = event, ballot, token, now, before
         lives = use.codec.lives
         is_held = before.until > now and not ballot.is_kin(before.holder, lives)

@@ -171,12 +171,12 @@ class ScenarioTests(SynchronousTestCase):
             self.assertTrue(loaded(name, {name: kind.settings for name, kind in KINDS.items()}).about, name)
 
     def test_example_of_the_document_is_lawful(self) -> None:
-        """The scenario that docs/sim.md shows can be played."""
-        document = (FOLDER.parent.parent / "docs" / "sim.md").read_text(encoding="utf-8")
+        """The scenario that docs/how-to/simulate-teams.md shows can be played."""
+        document = (FOLDER.parent.parent / "docs" / "how-to" / "simulate-teams.md").read_text(encoding="utf-8")
         found = re.findall(r"```toml\n(.*?)```", document, re.DOTALL)
         self.assertEqual(len(found), 1)
         sorts = {name: kind.settings for name, kind in KINDS.items()}
-        self.assertEqual(len(scenario_of(found[0], "docs/sim.md", "example", sorts).faults), 1)
+        self.assertEqual(len(scenario_of(found[0], "docs/how-to/simulate-teams.md", "example", sorts).faults), 1)
 
     def test_unknown_names_are_refused_with_the_nearest(self) -> None:
         """A scenario that is not there is refused, and so is a file that cannot be read."""

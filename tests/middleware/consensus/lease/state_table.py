@@ -1,4 +1,4 @@
-"""Write the states of a lease client into docs/consensus.md, between the markers that name this command."""
+"""Write the states of a lease client into docs/explanation/choosing-a-robot.md, between its markers."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 from middleware.consensus.lease.client_states import ACTIVE, TABLE, Event, State
 
-PAGE = Path(__file__).parents[4] / "docs" / "consensus.md"
+PAGE = Path(__file__).parents[4] / "docs" / "explanation" / "choosing-a-robot.md"
 BEGIN = "<!-- states: python -m tests.middleware.consensus.lease.state_table -->\n"
 END = "<!-- end of the states -->\n"
 UNDRAWN = (Event.RELEASE, Event.OUTRANK, Event.MOVE, Event.MOVED, Event.COMPLETED, Event.ENDED)

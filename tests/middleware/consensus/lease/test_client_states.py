@@ -112,6 +112,6 @@ class ClientStatesTests(SynchronousTestCase):
             self.assertIn(State.HOLDING, found, begin)
 
     def test_page_has_the_table(self) -> None:
-        """The states in docs/consensus.md are those of the code."""
-        page = Path(__file__).parents[4] / "docs" / "consensus.md"
+        """The states in docs/explanation/choosing-a-robot.md are those of the code."""
+        page = Path(__file__).parents[4] / "docs" / "explanation" / "choosing-a-robot.md"
         self.assertIn(write_states(), page.read_text(encoding="utf-8"))
