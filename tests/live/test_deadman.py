@@ -41,8 +41,8 @@ HAS_SERIAL = find_spec("serial") is not None
 
 ROOT = Path(__file__).resolve().parents[2]
 REACTOR: Any = reactor
-LATE_S = 0.15
-"""So long after its deadline, or after its node was killed, a robot stands."""
+LATE_S = 0.4
+"""Seconds after the deadline, or after its node is killed, within which the robot stands on a loaded machine."""
 
 
 @dataclass
