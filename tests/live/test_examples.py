@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 import threading
@@ -54,6 +55,14 @@ class ExamplesTests(TestCase):
         assert process.stdin is not None
         process.stdin.write(text + "\n")
         process.stdin.flush()
+
+    def test_readme(self) -> None:
+        """The program of the README prints the value that its second node reads."""
+        (program,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
+        command = [sys.executable, "-c", program]
+        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+        ran = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=PATIENCE, check=False)
+        self.assertEqual((ran.stdout, ran.returncode), ("[b'red']\n", 0), ran.stderr)
 
     def test_keyvalue(self) -> None:
         """What one process stores another one reads."""
