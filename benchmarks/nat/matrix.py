@@ -75,7 +75,7 @@ def roaming_pairs() -> list[Pair]:
     return [Pair(MOVED, "port", to, roamer, f"{to}b1", NOTE_MOVED) for roamer, to in ROAMERS.items()]
 
 
-NOTE_MOVED = "the first is carried from Wi-Fi (port) to a phone (sym)"
+NOTE_MOVED = "the first moves from Wi-Fi (port) to a phone network (sym)"
 ROAMERS = {"wifi1": "none", "wifi2": "port", "wifi3": "full"}
 """Hosts that are carried away, and the kind of whom they have met."""
 IDLE_PAIR = Pair(IDLE, "port", "port", "short1", "portb1", "mappings of the first live for 20 s")

@@ -101,35 +101,39 @@ def promises(outcomes: Iterable[Outcome]) -> list[Promise]:
             seen = f"{len(held)} of {len(some)}; p50 {_s(percentile(times, 0.5))}, worst {_s(max(times))}"
             wanted.append(Promise(what, seen, len(held) >= share * len(some)))
 
-    want("what can be punched is direct", open_ones, lambda one: one.path == "direct" and one.seconds < math.inf)
+    want(
+        "pairs that hole punching can connect are direct",
+        open_ones,
+        lambda one: one.path == "direct" and one.seconds < math.inf,
+    )
     if open_ones:
         p95 = percentile([one.seconds for one in open_ones], 0.95)
-        wanted.append(Promise(f"its 95th percentile is at most {DIRECT_S:g} s", _s(p95), p95 <= DIRECT_S))
-    want(f"all others reach each other within {RELAYED_S:g} s", closed, partial(_is_within, RELAYED_S))
+        wanted.append(Promise(f"their 95th percentile is at most {DIRECT_S:g} s", _s(p95), p95 <= DIRECT_S))
+    want(f"all other pairs connect within {RELAYED_S:g} s", closed, partial(_is_within, RELAYED_S))
     tunnelled = [one for one in closed if Kind.NOUDP.value in one.pair]
     if tunnelled:
         times = [max(one.joined_s, default=math.inf) if len(one.joined_s) == 2 else math.inf for one in tunnelled]
         seen = f"{sum(took <= JOIN_S for took in times)} of {len(times)}; worst {_s(max(times))}"
-        wanted.append(Promise(f"whose UDP is blocked joins within {JOIN_S:g} s", seen, max(times) <= JOIN_S))
+        wanted.append(Promise(f"nodes without UDP join within {JOIN_S:g} s", seen, max(times) <= JOIN_S))
     for part, (limit, words) in _WANTED.items():
         some = [one for one in every if one.part == part]
         want(f"{words} within {limit:g} s", some, partial(_is_within, limit))
     lossy = [one for one in every if one.part == LOSS]
     with_udp = [one for one in lossy if Kind.NOUDP.value not in one.pair]
     without = [one for one in lossy if Kind.NOUDP.value in one.pair]
-    for some, of in ((lossy, "of all pairs"), (with_udp, "of those with UDP"), (without, "of those without")):
+    for some, of in ((lossy, "of all pairs"), (with_udp, "of pairs with UDP"), (without, "of pairs without UDP")):
         want(f"30 % lost on both lines: within {LOSS_S:g} s 95 % {of}", some, partial(_is_within, LOSS_S), 0.95)
     return wanted
 
 
 _WANTED = {
-    ALONE: (DIRECT_S, "who reaches each other directly goes on without the bootstrap: an answer"),
-    HOME: (DIRECT_S, "two behind one router"),
+    ALONE: (DIRECT_S, "direct pairs continue without the bootstrap node: an answer"),
+    HOME: (DIRECT_S, "two hosts behind one router"),
     LEAKY: (LEAKY_S, "a router without a firewall, and one side late:"),
-    FORGOTTEN: (BACK_S, "all mappings forgotten: reached again"),
-    RENUMBERED: (BACK_S, "another outside address: reached again"),
-    MOVED: (BACK_S, "carried to another network: reached again, and reaching,"),
-    IDLE: (DIRECT_S, "mappings that live for 20 s, nothing said for a minute: an answer"),
+    FORGOTTEN: (BACK_S, "all mappings lost: reconnected"),
+    RENUMBERED: (BACK_S, "new external address: reconnected"),
+    MOVED: (BACK_S, "host moved to another network: reconnected in both directions"),
+    IDLE: (DIRECT_S, "mappings expire after 20 s, no traffic for a minute: an answer"),
 }
 
 

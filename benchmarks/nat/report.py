@@ -45,12 +45,12 @@ def table(outcomes: Sequence[Outcome]) -> str:
     """The whole report for a terminal."""
     parts = [_aligned(rows(outcomes, part)) for part in _tried(outcomes)]
     parts += [_aligned(others(outcomes))]
-    parts += ["\n".join(f"{'held  ' if p.is_kept else 'BROKEN'}  {p.what}: {p.seen}" for p in promises(outcomes))]
+    parts += ["\n".join(f"{'met    ' if p.is_kept else 'NOT MET'}  {p.what}: {p.seen}" for p in promises(outcomes))]
     troubles = dict.fromkeys(f"{one.part} {one.a} x {one.b}: {one.trouble}" for one in outcomes if one.trouble)
     parts += ["\n".join(list(troubles)[:12])]
     later = [one for one in outcomes if one.later and one.later != one.path and one.seconds < math.inf]
     if later:
-        parts.append(f"{len(later)} pairs had changed their way by the end: {later[0].path} to {later[0].later}")
+        parts.append(f"{len(later)} pairs used another path at the end: {later[0].path} to {later[0].later}")
     return "\n\n".join(part for part in parts if part)
 
 
@@ -64,9 +64,9 @@ def written(document: str, outcomes: Sequence[Outcome]) -> str:
     for part in _tried(outcomes):
         head, *body = rows(outcomes, part)
         lines += [*_markdown(head, body), ""]
-    kept = [[p.what, p.seen, "held" if p.is_kept else "**broken**"] for p in promises(outcomes)]
-    lines += _markdown(["promise", "seen", ""], kept)
-    lines += ["", *_markdown(["case", "pair", "seen"], others(outcomes)), "", END]
+    kept = [[p.what, p.seen, "met" if p.is_kept else "**not met**"] for p in promises(outcomes)]
+    lines += _markdown(["requirement", "result", ""], kept)
+    lines += ["", *_markdown(["case", "pair", "result"], others(outcomes)), "", END]
     return before + "\n".join(lines) + after
 
 
