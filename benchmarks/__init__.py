@@ -1,1 +1,1 @@
-"""What things cost: commands that print tables; each can be run by anyone."""
+"""Benchmarks: commands that measure resources and print tables."""

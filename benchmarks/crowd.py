@@ -1,7 +1,7 @@
-"""What a yard for many costs: rays, moves and controllers of 3 to 10,000 robots, a hundred agents attached, and a task.
+"""Measure a large simulated world: rays, motion and controllers of 3 to 10,000 robots, attached agents, and a task.
 
-``make bench-crowd``.  Milliseconds are of processor, so that other work on the machine matters little; each size is a
-process of its own, so that its memory is its own.
+Started by ``make bench-crowd``. Times are milliseconds of processor time, so other work on the machine has little
+effect. Each size runs in a separate process, so that its memory can be measured.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from benchmarks.measure import MIB, memory_bytes
 
 TICK_MS = 32.0
 LOOK_S = 2.0
-"""Virtual seconds for which attached agents are measured, once they have settled."""
+"""Virtual seconds for which attached agents are measured, after they have settled."""
 SETTLING_S = 4.0
 TASK_S = 3.0
-"""Virtual seconds from the assignment of a task for which its datagrams are counted."""
+"""Virtual seconds after the assignment of a task for which its datagrams are counted."""
 ARGOS = "ARGoS is quoted with 10,000 e-pucks at 1.7 x real time, by many threads on a machine of 2012"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure and print; 1 where the yard is slower than real time."""
+    """Measure and print; return 1 if the simulation is slower than real time."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.crowd", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--bodies", default="3,100,1000,10000", help="sizes, with commas (default %(default)s)")
     parser.add_argument(
@@ -76,7 +76,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _alone(bodies: int, controller: str, seconds: float) -> dict[str, float]:
-    """The crowd alone: the mean of a step and of its parts, searches for neighbours and all."""
+    """Measure the simulation without agents: the mean time of a step and of its parts, including neighbour search."""
     from sim.robots.crowd.controller import CONTROLLERS, Senses
     from sim.robots.crowd.crowd import Crowd
     from sim.robots.crowd.ground import roomy
@@ -111,7 +111,7 @@ def _alone(bodies: int, controller: str, seconds: float) -> dict[str, float]:
 
 
 def _attached(agents: int) -> dict[str, float]:
-    """Agents with nodes and drivers, attached to a crowd of 1,000 and without a task, with cameras and without."""
+    """Measure agents with nodes and drivers on 1,000 robots without a task, with and without cameras."""
     from sim.robots.crowd.ground import roomy
     from swarmnode.crowd import CAMERA_FPS, CrowdTeam
 
@@ -142,7 +142,7 @@ def _attached(agents: int) -> dict[str, float]:
 
 
 def _tasked(sizes: Sequence[int]) -> list[dict[str, float]]:
-    """What so many agents send from the assignment of one task on, beside what they send without."""
+    """Count the datagrams of the agents after the assignment of one task, and in the same time without a task."""
     from sim.robots.crowd.ground import roomy
     from swarmnode.crowd import CrowdTeam
 

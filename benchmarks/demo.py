@@ -1,7 +1,7 @@
-"""What the demonstration costs: memory and processor of every process, datagrams, the weight of the page.
+"""Measure the demonstration: memory and processor time of every process, datagrams, and the size of the page.
 
-``make bench-demo`` starts the real demonstration, looks at its page as a browser would (three cameras and the stream of
-events), runs the task, and prints a table.  Linux only: the figures come from ``/proc``.
+``make bench-demo`` starts the real demonstration, opens its page as a browser does (three cameras and the event
+stream), runs the task, and prints a table. Linux only: the figures come from ``/proc``.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ from middleware.admission.membership import MembershipFile, made
 START_S = 60.0
 TASK_S = 120.0
 TARGETS = {"pss": 300.0, "cores": 1.0, "page": 60_000, "plain": 40.0}
-"""MiB of all processes, cores of all processes, bytes of the page, MiB of a dog's node without vision."""
+"""MiB of all processes, cores of all processes, bytes of the page, MiB of a robot's node without vision."""
 
 
 class Page:
-    """The demonstration's page at ``url``, asked over HTTP."""
+    """An HTTP client for the demonstration's page at ``url``."""
 
     def __init__(self, url: str) -> None:
         self._host = urlsplit(url).netloc
@@ -47,7 +47,7 @@ class Page:
     def ask(
         self, path: str, method: str = "GET", limit_s: float = 10.0, body: str | None = None
     ) -> tuple[http.client.HTTPResponse, bytes]:
-        """One request on a connection of its own."""
+        """Send one request on a new connection."""
         connection = http.client.HTTPConnection(self._host, timeout=limit_s)
         try:
             connection.request(method, path, body, self.headers)
@@ -57,12 +57,12 @@ class Page:
             connection.close()
 
     def state(self) -> dict[str, Any]:
-        """What the page shows."""
+        """Return the state that the page shows."""
         state: dict[str, Any] = json.loads(self.ask("/api/v1/state")[1])
         return state
 
     def weight(self) -> dict[str, int]:
-        """The bytes of the page and of everything that it loads from the node, uncompressed."""
+        """Return the uncompressed bytes of the page and of everything that it loads from the node."""
         sizes: dict[str, int] = {}
         waiting = ["/"]
         while waiting:
@@ -79,7 +79,7 @@ class Page:
 
 
 class Viewer:
-    """One open page: the stream of events, and each camera's pictures as fast as they come."""
+    """An open page: the event stream, and the pictures of each camera at full rate."""
 
     def __init__(self, page: Page, host: str) -> None:
         self._page = page
@@ -90,7 +90,7 @@ class Viewer:
         self.bytes = 0
 
     def open(self) -> None:
-        """Begin to look."""
+        """Open the streams."""
         cameras = [device["uuid"] for device in self._page.state()["devices"] if "camera" in device["capabilities"]]
         works: list[Callable[[], None]] = [self._events, *(self._camera_of(uuid) for uuid in cameras)]
         self._threads = [threading.Thread(target=work, daemon=True) for work in works]
@@ -98,7 +98,7 @@ class Viewer:
             thread.start()
 
     def close(self) -> None:
-        """Look away."""
+        """Close the streams."""
         self._ends = True
         for thread in self._threads:
             thread.join(6.0)
@@ -130,7 +130,7 @@ class Viewer:
 
 
 def family(root: int) -> dict[int, str]:
-    """The processes that descend from ``root``, itself included, each with what it is."""
+    """Return ``root`` and its descendant processes by id, each with its name."""
     parents: dict[int, int] = {}
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit():
@@ -155,7 +155,7 @@ def _name_of(pid: int) -> str:
 
 @contextmanager
 def demonstration(run_dir: Path, seed: int) -> Iterator[tuple[subprocess.Popen[str], str, float]]:
-    """The demonstration with its page up: its process, the page's address, the seconds until then."""
+    """Start the demonstration; yield its process, the page's address, and the seconds until it was ready."""
     began = time.monotonic()
     command = [sys.executable, "-m", "sim.demo", "--seed", str(seed), "--run-dir", str(run_dir)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
@@ -175,7 +175,7 @@ def demonstration(run_dir: Path, seed: int) -> Iterator[tuple[subprocess.Popen[s
 
 @contextmanager
 def plain_node(run_dir: Path) -> Iterator[int]:
-    """A dog's node without agent and camera in the team of ``run_dir``: its process id."""
+    """Start a robot's node without agent and camera in the team of ``run_dir``; yield its process id."""
     dog = tomllib.loads((run_dir / "dog1.toml").read_text())["node"]
     known = json.dumps(dog["known_nodes"])
     file, path = run_dir / "plain.toml", run_dir / "plain.membership"
@@ -197,7 +197,7 @@ def plain_node(run_dir: Path) -> Iterator[int]:
 
 
 def task_run(page: Page, least_s: float) -> float:
-    """Press Run Demo; the seconds until the task is completed, and no fewer than ``least_s`` are waited for."""
+    """Press Run Demo and return the seconds until the task is completed; wait at least ``least_s``."""
     task = json.loads(page.ask("/api/v1/demo", "POST")[1])["id"]
     began, took = time.monotonic(), 0.0
     while not took or time.monotonic() - began < least_s:
@@ -217,7 +217,7 @@ def _line(what: str, value: float, unit: str, target: str, note: str = "") -> st
 
 
 def measured(seed: int, seconds: float, run_dir: Path) -> list[str]:
-    """The lines of the table."""
+    """Measure and return the lines of the table."""
     with demonstration(run_dir, seed) as (process, url, ready_s):
         page = Page(url)
         host = urlsplit(url).netloc

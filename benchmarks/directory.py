@@ -1,8 +1,9 @@
-"""The directory in a large team: what each node holds of it, and what it costs to list, up to 10,000 devices.
+"""Measure the directory of up to 10,000 devices: the records of each node, and the cost of a listing.
 
-The model has ids only: each device knows its nearest ones, as it would, and stands where
-``middleware.directory.prefix`` says; each place is held by the k nodes closest to it, and lists are made by
-``middleware.directory.listing``.  The team is of the very nodes that ship, on a turned clock and one switchboard.
+The model has only ids: each device knows its nearest nodes, and is listed at the positions that
+``middleware.directory.prefix`` computes; the k nodes closest to a position store it, and
+``middleware.directory.listing`` reads the lists. The team has complete nodes in virtual time, connected by one
+switchboard.
 """
 
 from __future__ import annotations
@@ -26,17 +27,17 @@ from middleware.entangled.record import Record
 from sim.team.world import SwarmFleet
 
 SHARE = 0.01
-"""Of the directory, the most that one node is to hold where there are 10,000 devices."""
+"""The maximum share of the directory at one node, for 10,000 devices."""
 LINK = Weather(delay_s=0.02, jitter_s=0.01)
 SMALL = 40
 PAUSE = 0.05
-"""Seconds between two that join."""
+"""Seconds between two joins."""
 ALIVE_BYTES = 57
-"""A sign of life in its datagram, sealed; measured."""
+"""The encrypted datagram of a keep-alive; measured."""
 
 
 class Model:
-    """``n`` devices with random ids that have settled; ``wrong`` moves each by one depth up or down by chance."""
+    """``n`` devices of a settled team with random ids; the share ``wrong`` has a depth that is wrong by one."""
 
     def __init__(self, n: int, seed: int, wrong: float = 0.0) -> None:
         dice = random.Random(f"{seed}/model")
@@ -59,7 +60,7 @@ class Model:
             self.held.update({holder.node_id: len(records) for holder in self.nearest(key, K)})
 
     def nearest(self, target: bytes, count: int) -> list[Contact]:
-        """The ``count`` nodes closest to ``target``: those of the narrowest range around it that has so many."""
+        """Return the ``count`` nodes closest to ``target``, from the narrowest id range with that many nodes."""
         number = int.from_bytes(target)
         for bit in range(BITS + 1):
             low = number >> bit << bit
@@ -69,7 +70,7 @@ class Model:
         return []
 
     def listed(self, reader: int) -> Listing:
-        """What the device at that place gets when it lists all."""
+        """Return the listing that the device with that index obtains."""
         listing = Listing(floor=max(0, self.depths[reader] - 1))
         while (place := listing.next()) is not None:
             listing.read(place, self.places.get(place.key, []))
@@ -77,7 +78,7 @@ class Model:
 
 
 def modelled(n: int, seed: int, wrong: float) -> list[str]:
-    """A row of the table: what ``n`` devices come to."""
+    """Return a row of the table for ``n`` devices."""
     model = Model(n, seed, wrong)
     loads = sorted(model.held.get(contact.node_id, 0) for contact in model.contacts)
     listing = model.listed(0)
@@ -128,11 +129,11 @@ class Team(SwarmFleet):
         super().__init__(n, seed, LINK, PAUSE)
 
     def held(self) -> list[int]:
-        """How many devices each live node holds."""
+        """Return the number of device records at each live node."""
         return [sum(device_of(r) is not None for r in node.store.records()) for node in self.nodes if node.running]
 
     def listed(self, place: int) -> Listing:
-        """What one node lists, within ten seconds."""
+        """Return the listing of one node, obtained within ten seconds."""
         work = self.nodes[place].list_devices()
         found: list[Listing] = []
         work.addCallback(found.append)
@@ -140,7 +141,7 @@ class Team(SwarmFleet):
         return found[0] if found else Listing()
 
     def row(self, what: str) -> list[str]:
-        """A row of the table: how the team is now."""
+        """Return a row of the table for the present state of the team."""
         began, sent, at = time.process_time(), self.board.counters["sent"], self.clock.seconds()
         self.clock.advance(20.0)
         running = [node for node in self.nodes if node.running]
@@ -169,7 +170,7 @@ TEAM_HEAD = [
 
 
 def lived(n: int, seed: int) -> Iterator[list[str]]:
-    """Rows of a team of real nodes that settles, loses a quarter at once, and shrinks in order to 40."""
+    """Yield rows of a team of real nodes that settles, loses a quarter at once, and shrinks gracefully to 40."""
     team = Team(n, seed)
     team.clock.advance(40.0)
     yield team.row("settled")
@@ -194,13 +195,13 @@ MOST, UNSEEN = HEAD.index("most"), HEAD.index("unseen")
 
 
 def table(rows: Sequence[Sequence[str]]) -> str:
-    """Rows in columns, each as wide as its widest entry."""
+    """Format rows in columns, each as wide as its widest entry."""
     widths = [max(len(row[n]) for row in rows) for n in range(len(rows[0]))]
     return "\n".join("  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows)
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Print the tables; 1 where a node holds more than its share, or a list lacks somebody."""
+    """Print the tables; return 1 if a node stores more than its share, or a listing is incomplete."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.directory", description=__doc__)
     parser.add_argument("--devices", type=int, nargs="+", default=[1000, 10_000], help="devices of the model")
     parser.add_argument("--team", type=int, default=0, help="real nodes, in a second table")
@@ -209,9 +210,9 @@ def main(arguments: Sequence[str]) -> int:
     rows = [modelled(n, chosen.seed, wrong) for n in chosen.devices for wrong in (0.0, 0.2)]
     print(table([HEAD, *rows]), flush=True)
     if chosen.team:
-        for row in lived(chosen.team, chosen.seed):  # each takes minutes of a core where there are many
+        for row in lived(chosen.team, chosen.seed):  # each row takes minutes of processor time for large teams
             print(", ".join(f"{name} {cell}" for name, cell in zip(TEAM_HEAD, row, strict=True)), flush=True)
-    # Where estimates are as they are; of those that err by a depth on purpose one in some thousands may be missed.
+    # Only rows with unmodified estimates count: with deliberate errors a listing may miss one device in some thousands.
     right = [row for row in rows if row[1] == "0%"]
     is_good = all(row[UNSEEN] == "0" for row in right)
     return 0 if is_good and all(int(row[MOST]) <= max(100, SHARE * int(row[0])) for row in right) else 1

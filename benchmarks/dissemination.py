@@ -1,8 +1,8 @@
-"""How bids reach the council and the announcement returns: messages, time and agreement, up to 10,000 agents.
+"""Measure bidding for up to 10,000 agents: messages, time and agreement.
 
-The parties are the product's own; links are light (a heap of events, one way 20 ms + Exp(10 ms), independent loss), and
-an errand is repeated as the endpoint repeats it.  The next hops come out of real routing tables.  Signatures are left
-out: they cost time of a core and no message.
+The bidding code is the real one. The links are simulated by a heap of events, with a one-way delay of 20 ms + Exp(10
+ms) and independent loss; messages are retransmitted as the endpoint does it. The next hops come from real routing
+tables. Signatures are omitted, because they affect only processor time.
 """
 
 from __future__ import annotations
@@ -38,7 +38,8 @@ BITS = 160
 K = 8
 TRIES = (0.0, 0.1, 0.25)
 PATIENCE = 0.4
-"""When an errand is sent again, and when it has failed: as the endpoint does it within the shell's time."""
+"""Times of the retransmissions of a message, and of its failure, in seconds: as at the endpoint with its default
+time."""
 SMALL_COUNCIL, LARGE_COUNCIL, LARGE_FROM = 3, 5, 50
 AT_LEAST = 0.99
 MESSAGES = {3: 10.0, 30: 10.0, 100: 6.0, 1_000: 6.0, 10_000: 6.0}
@@ -47,7 +48,7 @@ AGREEMENT = {0.0: {100: 0.2, 1_000: 0.3, 10_000: 0.4}, 0.1: {100: 0.6, 1_000: 0.
 
 
 class Ring:
-    """``n`` contacts with random ids, and what each would have in its routing table."""
+    """``n`` contacts with random ids, and their routing tables."""
 
     def __init__(self, n: int, rng: random.Random) -> None:
         self.contacts = [Contact(rng.randbytes(32), Address("10.0.0.1", 1 + i % 65_000)) for i in range(n)]
@@ -56,7 +57,7 @@ class Ring:
         self._rng = rng
 
     def table(self, place: int) -> RoutingTable:
-        """The routing table of the node at ``place``: up to k contacts out of each range of distances."""
+        """Return the routing table of the node at index ``place``: up to k contacts of each range of distances."""
         own = self._ids_of(place)
         table = RoutingTable(self.contacts[place].node_id, K)
         for bit in reversed(range(BITS)):
@@ -75,7 +76,7 @@ class Ring:
 
 @dataclass
 class Weather:
-    """What befalls datagrams: ``loss`` and ``dead`` are shares, ``twice`` is how many come a second time."""
+    """Faults of the links: the shares ``loss``, ``dead`` (failed agents) and ``twice`` (duplicates)."""
 
     loss: float = 0.0
     dead: float = 0.0
@@ -85,7 +86,7 @@ class Weather:
 
 @dataclass
 class Outcome:
-    """What one auction came to; ``took`` has, of each agent that is right, seconds since the waiting period ended."""
+    """The result of an auction; ``took``: seconds after the waiting period, for each agent with the right winner."""
 
     messages: float
     busiest: int
@@ -96,7 +97,7 @@ class Outcome:
 
 
 class Crowd:
-    """``n`` agents that all bid for one task within ``spread`` seconds; replayed by ``seed``."""
+    """``n`` agents that all bid for one task within ``spread`` seconds; equal seeds give equal runs."""
 
     def __init__(
         self,
@@ -142,35 +143,35 @@ class Crowd:
         self.best = self.right_one()
 
     def right_one(self) -> str:
-        """Who should win: the cheapest of those that live."""
+        """Return the right winner: the cheapest live agent."""
         alive = [(self.costs[i], self.agent(i)) for i in range(len(self.costs)) if i not in self.dead]
         return min(alive)[1]
 
     def agent(self, place: int) -> str:
-        """The uuid of the agent at ``place``."""
+        """Return the uuid of the agent at index ``place``."""
         return self.ring.contacts[place].node_id.hex()
 
     def at(self, moment: float, call: Callable[..., None], *arguments: object) -> None:
-        """Make ``call`` at ``moment``."""
+        """Schedule ``call`` at ``moment``."""
         self._order += 1
         heapq.heappush(self._heap, (moment, self._order, call, arguments))
 
     def bid(self, place: int, cost: float | None, revision: int = 0) -> None:
-        """Let the agent at ``place`` bid, or take its bid back."""
+        """Let the agent at index ``place`` bid, or withdraw its bid."""
         public = self.ring.contacts[place].public
         report = None if cost is None else Report(self.agent(place), cost)
         self.parties[place].bid(Bid(public, report, revision), self.way, self.now)
         self.pump(place)
 
     def run(self, until: float) -> None:
-        """Let everything happen up to the moment ``until``."""
+        """Process all events up to the time ``until``."""
         while self._heap and self._heap[0][0] <= until:
             self.now, _, call, arguments = heapq.heappop(self._heap)
             call(*arguments)
         self.now = until
 
     def outcome(self) -> Outcome:
-        """What it has come to by now."""
+        """Return the result so far."""
         alive = [i for i in range(len(self.costs)) if i not in self.dead]
         right = [i for i in alive if self.assigned(i) == self.best]
         over = self.auction.waiting
@@ -182,13 +183,13 @@ class Crowd:
         )
 
     def assigned(self, place: int) -> str | None:
-        """Whom the agent at ``place`` takes for the winner."""
+        """Return the winner in the view of the agent at index ``place``."""
         return self._rule.decided(self.views[place])[0]
 
     # -- links ------------------------------------------------------------------------------------------------------
 
     def pump(self, place: int) -> None:
-        """Send what a party has to send, and come back when it is due."""
+        """Send the pending messages of a node, and schedule its next call."""
         party = self.parties[place]
         for errand in party.errands(self.now):
             self._carry(place, errand)
@@ -233,7 +234,7 @@ class Crowd:
         self.pump(to)
 
     def _arrived(self, place: int, to: int, errand: Errand, state: dict[str, object]) -> None:
-        if "reply" not in state or self.weather.twice:  # with copies, also the method runs again (it is idempotent)
+        if "reply" not in state or self.weather.twice:  # with duplicates the method runs twice, too (it is idempotent)
             state["reply"] = self._taken(place, to, errand)
         self._send(to, place, self._confirmed, place, errand, state)
         self.pump(to)
@@ -272,7 +273,7 @@ class Crowd:
         def contacts() -> list[Contact]:
             if not known:
                 table = self.ring.table(place)
-                # Ten thousand whole tables would not fit; only the way to the key is asked for, but by a flood.
+                # Ten thousand full tables do not fit into memory; only flooding uses more than the path to the key.
                 everybody = table.contacts()
                 known.extend(closest(everybody, self.auction.key, K) if self.auction.exclusive else everybody)
             return known
@@ -296,7 +297,7 @@ class Crowd:
 
 
 def measured(n: int, loss: float, dead: float, runs: int, seed: int, **options: object) -> dict[str, object]:
-    """The figures of ``runs`` auctions."""
+    """Return the figures of ``runs`` auctions."""
     outcomes = []
     for run in range(runs):
         crowd = Crowd(n, seed + run, Weather(loss, dead), **options)  # type: ignore[arg-type]
@@ -321,7 +322,7 @@ def measured(n: int, loss: float, dead: float, runs: int, seed: int, **options: 
 
 
 def targets(row: dict[str, object]) -> list[tuple[str, bool]]:
-    """What the row should have reached, and whether it did."""
+    """Return the targets of the row, and whether it met them."""
     n, loss, dead = row["n"], row["loss"], row["dead"]
     assert isinstance(n, int) and isinstance(loss, float)
     goals = []
@@ -336,7 +337,7 @@ def targets(row: dict[str, object]) -> list[tuple[str, bool]]:
 
 
 def main(arguments: list[str]) -> int:
-    """Print the table; 1 where a target was missed."""
+    """Print the table; return 1 if a target was missed."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.dissemination", description=__doc__)
     parser.add_argument("--n", type=int, nargs="+", default=[3, 30, 100, 1_000, 10_000], help="numbers of agents")
     parser.add_argument("--loss", type=float, nargs="+", default=[0.0, 0.1, 0.3], help="shares of datagrams lost")

@@ -1,10 +1,11 @@
-"""Forged datagrams against a node: ``python -m benchmarks.flood``.
+"""Send forged datagrams to a node: ``python -m benchmarks.flood``.
 
-Two nodes of a closed team, each a process of its own, call each other over loopback, while a third process fires 20,000
-datagrams a second at one of them from a thousand addresses: rubbish, handshakes of a good form, datagrams for a true
-session, recordings, greetings, hails, knocks, and all of it mixed.  Says which calls came back, how late heartbeats
-were, what the node sent to who attacked it, its memory, and what a forged datagram costs; exits with 1 where a target
-is missed.  Linux only: addresses of 127.0.0.0/8 and the figures come from the system.
+Two nodes of a closed team, each a process, call each other over loopback, while a third process sends 20,000 datagrams
+a second to one of them from a thousand addresses: random bytes, well-formed handshakes without a valid mac, datagrams
+for a real session, recordings, WHO, HAIL and KNOCK messages, and a mix of all. The program prints the share of answered
+calls, the delay of heartbeats, the bytes that the node sent to the attacker, its memory, and the processor time per
+forged datagram; it exits with 1 if a target is missed. Linux only, because it uses addresses of 127.0.0.0/8 and
+``/proc``.
 """
 
 from __future__ import annotations
@@ -34,16 +35,16 @@ SECONDS = 20.0
 SOURCES = 1000
 PAUSE_S = 0.002
 FIRST_S = 4.0
-"""Seconds without a flood, by which the rest is judged."""
+"""Seconds without a flood, for the reference values."""
 KINDS = ("random", "init", "data", "replay", "who", "hail", "knock", "mixed")
 TARGETS = {"good": 0.99, "late_ms": 100.0, "amplification": 1.0, "growth_mib": 16.0, "cost_us": 25.0, "rate": 0.9}
-"""Share of good calls at least; how late 99 of 100 heartbeats are at most; bytes out per byte in; memory; processor
-time of the node for each forged datagram, the system's share included; share of the wanted rate that was reached."""
+"""Minimum share of good calls; maximum delay of heartbeats (p99); maximum bytes out per byte in; maximum memory growth;
+maximum processor time of the node per forged datagram, including the kernel; minimum share of the requested rate."""
 CAPS = {"responses": 512, "unconfirmed": 512, "peers": 4096, "sessions": 4096, "led": 1024, "seen": 1024}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure and print; 1 where a target is missed."""
+    """Measure and print; return 1 if a target is missed."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.flood", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--seconds", type=float, default=SECONDS, help="of the flood (default %(default)s)")
     parser.add_argument("--rate", type=int, default=RATE, help="datagrams a second (default %(default)s)")
@@ -62,11 +63,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 1 if missed else 0
 
 
-# -- the one who attacks -------------------------------------------------------------------------------------------
+# -- the attacker --------------------------------------------------------------------------------------------------
 
 
 def makers(order: dict[str, Any]) -> dict[str, Callable[[], bytes]]:
-    """What makes a datagram of each kind, of what any eavesdropper on the way knows."""
+    """Return a generator of datagrams for each kind, from the knowledge of an eavesdropper."""
     dice = random.Random(7)
     rubbish = dice.randbytes(1 << 20)
     recorded = [bytes.fromhex(each) for each in order["recorded"]]
@@ -85,7 +86,7 @@ def makers(order: dict[str, Any]) -> dict[str, Callable[[], bytes]]:
 
     single: dict[str, Callable[[], bytes]] = {
         "random": lambda: some(dice.randrange(1, 1400)),
-        # As long and as padded as a true one, without the mac that takes the team's secret, and with no payment.
+        # Length and padding of a real one, without the mac that needs the team's secret, and without a payment.
         "init": lambda: bytes([session.INIT]) + some(1283) + bytes(16),
         "data": data,
         "replay": lambda: dice.choice(recorded),
@@ -97,7 +98,7 @@ def makers(order: dict[str, Any]) -> dict[str, Callable[[], bytes]]:
 
 
 def _fire(order: dict[str, Any]) -> int:
-    """Fire what is ordered; says at the end how much it was."""
+    """Send the requested datagrams, and print their number at the end."""
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(4096, resource.getrlimit(resource.RLIMIT_NOFILE)[1]),) * 2)
     guns = []
     for number in range(SOURCES):
@@ -121,11 +122,11 @@ def _fire(order: dict[str, Any]) -> int:
         fired[kind] = count
         sys.stdout.write(json.dumps({"kind": kind, "fired": count}) + "\n")
         sys.stdout.flush()
-        sys.stdin.readline()  # until the one who measures is ready for the next kind
+        sys.stdin.readline()  # until the measuring process is ready for the next kind
     return 0
 
 
-# -- the one who measures ------------------------------------------------------------------------------------------
+# -- the measuring process -----------------------------------------------------------------------------------------
 
 
 def _measured(seconds: float, rate: int) -> dict[str, Any]:
@@ -167,7 +168,7 @@ def _flooded(children: list[Child], port: int, seconds: float, rate: int) -> dic
     peak = quiet[0]["rss"]
     for kind in KINDS:
         fired = gun.read()
-        time.sleep(0.05)  # what is in the buffer of the port
+        time.sleep(0.05)  # datagrams in the socket buffer
         now, other = target.asked(), friend.asked()
         calls = _counted((calls, now["calls"], other["calls"]))
         gaps += now["gaps"] + other["gaps"]
@@ -204,7 +205,7 @@ def _counted(several: Sequence[dict[str, int]]) -> dict[str, int]:
 
 
 def _share(one: dict[str, Any], other: dict[str, Any]) -> float:
-    """The share of a core between two reports."""
+    """Return the share of a core between two reports."""
     return float((other["cpu"] - one["cpu"]) / (other["at"] - one["at"]))
 
 
@@ -225,12 +226,12 @@ def _between(before: dict[str, Any], now: dict[str, Any], idle: float) -> dict[s
 
 
 def _high(seconds: Sequence[float]) -> float:
-    """What 99 of 100 stay below, in milliseconds."""
+    """Return the 99th percentile in milliseconds."""
     return 1000.0 * percentile(seconds, 0.99)
 
 
 def _printed(found: dict[str, Any]) -> list[str]:
-    """Print the table; gives what missed its target."""
+    """Print the table; return the names of the missed targets."""
     head = f"{'kind':8}{'fired':>9}{'received':>10}{'us each':>9}{'core':>7}{'bytes in':>12}{'out':>9}{'late ms':>9}"
     lines = [head + f"{'good':>8}"]
     for each in found["kinds"]:

@@ -1,7 +1,7 @@
-"""One node of ``benchmarks.flood``, in a process of its own: lives, calls the other one, and says how it fares.
+"""Run one node of ``benchmarks.flood``: it calls the other node and reports its state.
 
-It talks with who started it in lines of JSON: ``ready`` with its port first, then on a line at its standard input a
-report of what it has measured since the one before.
+It communicates with its parent process in lines of JSON: first ``ready`` with its port, then, for each line on standard
+input, a report of the measurements since the previous one.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ CALL = 0.02
 TICK = 0.02
 KEPT = 64
 FOES = "127.66."
-"""Where the flood comes from."""
+"""Source addresses of the flood."""
 reactor: Any = running
 
 
 class Node(Protocol):
-    """A node of a closed team that calls another one fifty times a second, and tells it ten heartbeats a second."""
+    """A node of a closed team that calls another node fifty times a second and sends it ten heartbeats a second."""
 
     def __init__(self, path: Path, known: list[Address], others: list[str]) -> None:
         kept, store = MembershipFile(path), MemoryStore()
@@ -82,16 +82,16 @@ class Node(Protocol):
         self.trips: list[float] = []
 
     def connectionMade(self) -> None:
-        """Say where this node is."""
+        """Report the address of this node."""
         self._say({"ready": self.network.address.port, "public": self.team.identity.public.hex()})
 
     def dataReceived(self, data: bytes) -> None:
-        """Report, once for each line."""
+        """Send a report for each line."""
         for _ in range(data.count(b"\n")):
             self._say(self._report())
 
     def connectionLost(self, reason: object = None) -> None:
-        """Leave when the one who asked is gone."""
+        """Exit when the parent has exited."""
         if reactor.running:
             reactor.stop()
 
@@ -193,7 +193,7 @@ class Node(Protocol):
 
 
 def main(path: str, known: str, *others: str) -> None:
-    """Live until standard input ends."""
+    """Run until standard input ends."""
     host, _, port = known.partition(":")
     StandardIO(Node(Path(path), [Address(host, int(port))] if port else [], list(others)))
     reactor.run()

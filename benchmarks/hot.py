@@ -1,7 +1,7 @@
-"""What a put, a get and a join cost, in time of a core and in datagrams, summed over all nodes of a team.
+"""Measure a put, a get and a join in processor time and datagrams, summed over all nodes of a team.
 
-All nodes are in one process on a switchboard and a clock that is turned, so the datagrams are the same on every machine
-and a run can be compared with the run before a change.  The time includes what the simulation itself takes.
+All nodes are in one process, connected by a switchboard in virtual time, so the datagrams are the same on every machine
+and runs before and after a change can be compared. The time includes the simulation.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ class Hot:
         self.failed = 0
 
     def wait(self, work: Deferred[Any]) -> None:
-        """Turn the clock until ``work`` is done."""
+        """Advance the clock until ``work`` is done."""
         ended: list[Any] = []
         work.addErrback(self._count).addCallback(ended.append)
         while not ended:
             self.team.clock.advance(STEP)
 
     def each(self, work: Callable[[int], Deferred[Any]], times: int, wide: int = 1) -> str:
-        """The cost of one of ``times`` operations, ``wide`` of them at a time; the time is that of the best quarter."""
+        """Return the cost of one of ``times`` operations, ``wide`` of them in parallel; the best quarter counts."""
         self.failed = 0
         gc.collect()
         sent, moment = self.team.total_traffic.sent, self.team.clock.seconds()
@@ -63,7 +63,7 @@ class Hot:
         self.failed += 1
 
     def join(self, place: int) -> str:
-        """What a newcomer costs until it has joined, until it has read an old key, and in the five seconds after."""
+        """Return the cost of a new node: its join, its first read of an existing key, and the five seconds after."""
         clock = self.team.clock
         newcomer = self.team.made(place)
         lines = []
@@ -101,7 +101,7 @@ def main() -> int:
         profile.enable()
 
     def remote(number: int) -> EntangledNode:
-        """A node that does not hold the key, where there is one."""
+        """Return a node that does not store the key, if there is one."""
         at = key[number % 50]
         others = [node for node in nodes if not node.replica.held(at)] or nodes
         return others[number % len(others)]

@@ -1,7 +1,7 @@
-"""What a team costs that does nothing, and what a read and a write cost, in datagrams, bytes and time of a core.
+"""Measure an idle team, and a read and a write, in datagrams, bytes and processor time.
 
-Everything runs in virtual time over a switchboard in one process, so the figures are the same on every machine; only
-the share of a core is measured, and that includes what the simulation itself takes.
+Everything runs in virtual time on a switchboard in one process, so the figures are the same on every machine, except
+for the share of a core, which includes the simulation.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ from sim.team.world import Fleet
 MAX_BYTES_S = 1000.0
 MAX_CORE = 0.001
 HEADER = 28
-"""Bytes of IP and UDP around a datagram."""
+"""Bytes of the IP and UDP headers of a datagram."""
 
 
 class Team(Fleet):
-    """``n`` nodes that have found each other, 0.2 ms apart."""
+    """``n`` nodes in one network with a one-way delay of 0.2 ms."""
 
     def __init__(self, n: int, seed: int) -> None:
         super().__init__(n, seed, Weather(delay_s=0.0002))
         self.dice = random.Random(seed)
 
     def sent(self) -> tuple[int, int]:
-        """Datagrams and bytes that all nodes have sent."""
+        """Return the datagrams and bytes that all nodes have sent."""
         return self.total_traffic.sent, self.total_traffic.sent_bytes + HEADER * self.total_traffic.sent
 
     def spent(self, seconds: float) -> tuple[float, float, float]:
-        """Datagrams and bytes that a node sends in a second of rest, and its share of a core."""
+        """Return the datagrams and bytes that an idle node sends per second, and its share of a core."""
         before, began = self.sent(), time.process_time()
         self.clock.advance(seconds)
         took = time.process_time() - began
@@ -48,7 +48,8 @@ class Team(Fleet):
         return (datagrams - before[0]) / each, (octets - before[1]) / each, took / each
 
     def cost(self, work: Callable[[EntangledNode], Deferred[Any]], times: int) -> tuple[float, list[float], int]:
-        """Datagrams for one of ``times`` operations at random nodes, how long each took, and how many failed."""
+        """Return the datagrams per operation of ``times`` at random nodes, the durations, and the number of
+        failures."""
         before, failed = self.total_traffic.sent, 0
         took: list[float] = []
         for _ in range(times):
@@ -65,7 +66,7 @@ class Team(Fleet):
 
 
 def main() -> int:
-    """Print the table; 1 where the idle team is over its limits."""
+    """Print the table; return 1 if the idle team exceeds its limits."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.idle", description=__doc__)
     parser.add_argument("--nodes", type=int, default=30)
     parser.add_argument("--seconds", type=float, default=120.0, help="of virtual time (default 120)")
@@ -89,7 +90,7 @@ def main() -> int:
 
 
 def some(rng: random.Random) -> bytes:
-    """One of the keys that were put."""
+    """Return one of the stored keys."""
     return hashed_key(f"k{rng.randrange(200)}")
 
 
@@ -99,7 +100,7 @@ def say(line: str) -> None:
 
 
 def report(what: str, figures: tuple[float, list[float], int]) -> None:
-    """Print one line."""
+    """Print one row."""
     datagrams, took, failed = figures
     p50, p95 = took[len(took) // 2], took[len(took) * 95 // 100]
     say(

@@ -1,4 +1,4 @@
-"""What benchmarks share: percentiles, processes that report in JSON, and the figures of ``/proc`` (Linux)."""
+"""Common tools: percentiles, child processes that report in JSON, and figures of ``/proc`` (Linux)."""
 
 from __future__ import annotations
 
@@ -16,47 +16,47 @@ TICKS = os.sysconf("SC_CLK_TCK")
 
 
 def percentile(values: Sequence[float], share: float) -> float:
-    """The value below which that share of ``values`` lies; infinite where there are none."""
+    """Return the value below which that share of ``values`` lies; infinity for no values."""
     ordered = sorted(values)
     return ordered[min(len(ordered) - 1, int(share * len(ordered)))] if ordered else math.inf
 
 
 def processor_s(pid: int) -> float:
-    """The processor seconds that a process has used."""
+    """Return the processor seconds of a process."""
     fields = Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / TICKS
 
 
 def memory_bytes(field: str = "VmRSS", pid: int | str = "self") -> int:
-    """The memory of a process: resident now (``VmRSS``), or at its highest (``VmHWM``)."""
+    """Return the memory of a process in bytes: resident now (``VmRSS``), or the maximum (``VmHWM``)."""
     lines = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text(encoding="ascii").splitlines())
     return int(lines[field].split()[0]) * 1024
 
 
 def maps_mib(pid: int) -> dict[str, float]:
-    """The memory of a process in MiB by kind: ``Rss``, ``Pss``, ``Private_Clean``, ``Private_Dirty`` and others."""
+    """Return the memory of a process in MiB by kind: ``Rss``, ``Pss``, ``Private_Clean`` and others."""
     lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()[1:]
     return {line.split(":")[0]: float(line.split()[1]) / 1024 for line in lines if line.endswith("kB")}
 
 
 def udp_count(name: str) -> int:
-    """A counter of this machine's UDP, such as ``InDatagrams``, whosever datagrams they are.
+    """Return a UDP counter of this machine, such as ``InDatagrams``, which counts the datagrams of all processes.
 
-    In a network namespace of its own (``benchmarks/README.md``) the figures are of the nodes alone.
+    In a separate network namespace (``benchmarks/README.md``) it counts only the nodes.
     """
     rows = [line.split() for line in Path("/proc/net/snmp").read_text().splitlines() if line.startswith("Udp:")]
     return int(rows[1][rows[0].index(name)])
 
 
 class Child:
-    """A process that is asked and answers in lines of JSON."""
+    """A child process that answers requests in lines of JSON."""
 
     def __init__(self, module: str, *arguments: object) -> None:
         command = [sys.executable, "-m", module, *map(str, arguments)]
         self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
     def read(self) -> dict[str, Any]:
-        """The next line."""
+        """Return the next line."""
         assert self.process.stdout is not None
         line = self.process.stdout.readline()
         if not line:
@@ -71,12 +71,12 @@ class Child:
         self.process.stdin.flush()
 
     def asked(self) -> dict[str, Any]:
-        """A report."""
+        """Request and return a report."""
         self.say()
         return self.read()
 
     def end(self) -> None:
-        """Close its input, and wait until it is gone."""
+        """Close its input, and wait until it has exited."""
         assert self.process.stdin is not None
         self.process.stdin.close()
         try:

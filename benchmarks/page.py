@@ -1,9 +1,10 @@
-"""The page under load: ``python -m benchmarks.page``.
+"""Load the page: ``python -m benchmarks.page``.
 
-200 event streams, 12 camera viewers of three robots at 30 pictures a second, 500 clients that send a byte a second, and
-100 requests a second, each kind from 64 addresses of this machine; beside them one viewer on a slow line.  Says whether
-all were fed, how old pictures were, how late the web node's own timers, what it weighs, and exits with 1 where a target
-is missed.  Ages are from the robot's process, over UDP and the web node, to a viewer's: neither lens nor screen.
+The load is 200 event streams, 12 camera viewers of three robots at 30 pictures a second, 500 clients that send a byte a
+second, and 100 requests a second, each kind from 64 addresses of this machine, and one viewer on a slow link. The
+program prints the starved streams, the age of pictures, the delay of the web node's timers and its memory, and exits
+with 1 if a target is missed. The age counts from the robot's process, over UDP and the web node, to the viewer's
+process, without lens and screen.
 """
 
 from __future__ import annotations
@@ -26,14 +27,14 @@ from sim.demo import port
 ADDRESSES = 64
 DRIBBLE_S = 1.0
 ARRIVAL_S = 5.0
-"""All clients come within so long; what is timed counts from then."""
+"""Seconds within which all clients connect; measurements start after that."""
 SLOW_BYTES = 32_000
-"""Bytes a second of the slow line, of which a picture takes 6,000."""
+"""Bytes a second of the slow link; a picture has 6,000 bytes."""
 TARGETS = {"api": 100.0, "closed": 15.0, "late": 50.0, "memory": 30.0, "lag": 0.5, "glass": 300.0, "unfed": 0.0}
 
 
 class Connection:
-    """One connection to the page from an address of its own."""
+    """One connection to the page from a separate source address."""
 
     def __init__(self, where: int, number: int, window: int = 0) -> None:
         self._where = where
@@ -55,7 +56,7 @@ class Connection:
         self.writer.close()
 
     async def ask(self, path: str, method: str = "GET", body: str = "") -> tuple[int, dict[str, str]]:
-        """Send one request; the status and the headers of the answer."""
+        """Send one request; return the status and the headers of the answer."""
         head = f"{method} {path} HTTP/1.1\r\nHost: 127.0.0.1\r\nX-Swarm: 1\r\nContent-Length: {len(body)}\r\n\r\n"
         self.writer.write(head.encode() + body.encode())
         lines = (await self.reader.readuntil(b"\r\n\r\n")).decode().split("\r\n")
@@ -63,13 +64,13 @@ class Connection:
         return int(lines[0].split()[1]), headers
 
     async def whole(self, path: str, method: str = "GET", body: str = "") -> tuple[int, dict[str, str], bytes]:
-        """Send one request; status, headers and body."""
+        """Send one request; return status, headers and body."""
         status, headers = await self.ask(path, method, body)
         return status, headers, await self.reader.readexactly(int(headers.get("content-length", 0)))
 
 
 class Load:
-    """All clients of one web node, and what they saw."""
+    """All clients of one web node, and their measurements."""
 
     def __init__(self, where: int, ticket: str, uuids: Sequence[str]) -> None:
         self.beats: dict[int, float] = {}
@@ -84,13 +85,13 @@ class Load:
         self._uuids = uuids
 
     def forget(self) -> None:
-        """Count anew what is timed: all clients have come."""
+        """Restart the measurements, after all clients have connected."""
         self.longest = 0.0
         for each in (self.ages, self.slow, self.answers):
             each.clear()
 
     async def events(self, number: int) -> None:
-        """One open page."""
+        """Run one open page."""
         async with Connection(self._where, number) as line:
             await line.ask(f"/events?ticket={self._ticket}")
             self.beats[number] = time.monotonic()
@@ -101,7 +102,7 @@ class Load:
                     self.beats[number] = now
 
     async def camera(self, number: int) -> None:
-        """One viewer of a camera, as fast as there are pictures."""
+        """Run one viewer of a camera at full rate."""
         async with Connection(self._where, number) as line:
             after = ""
             while True:
@@ -111,7 +112,7 @@ class Load:
                     self.ages.append(_age(body))
 
     async def slowly(self, number: int) -> None:
-        """One viewer on a slow line: how old a picture is when it is there as a whole."""
+        """Run one viewer on a slow link, and measure the age of each picture when it is complete."""
         async with Connection(self._where, number, 4096) as line:
             after = ""
             while True:
@@ -125,7 +126,7 @@ class Load:
                     self.slow.append(_age(body))
 
     async def dribble(self, number: int) -> None:
-        """One client that sends a byte a second, as long as it may."""
+        """Run one client that sends a byte a second, until it is disconnected."""
         async with Connection(self._where, number) as line:
             began = time.monotonic()
             over = asyncio.ensure_future(line.reader.read())
@@ -136,7 +137,7 @@ class Load:
             self.closed.append(time.monotonic() - began)
 
     async def requests(self, rate: float) -> None:
-        """``rate`` requests a second in all, each timed from when it was due."""
+        """Send ``rate`` requests a second in total, each timed from its scheduled time."""
         await asyncio.gather(*(self._requests(number, rate / 20, number / rate) for number in range(20)))
 
     async def _requests(self, number: int, rate: float, first: float) -> None:
@@ -159,7 +160,7 @@ def _age(picture: bytes) -> float:
 
 
 async def signed_in(where: int) -> tuple[str, list[str]]:
-    """A ticket, and the robots' uuids as soon as all are there."""
+    """Return a ticket, and the robots' uuids as soon as all robots are present."""
     async with Connection(where, 0) as line:
         _, _, body = await line.whole("/api/v1/session", "POST", json.dumps({"code": CODE}))
         ticket = json.loads(body)["ticket"]
@@ -173,7 +174,7 @@ async def signed_in(where: int) -> tuple[str, list[str]]:
 
 
 async def measured(given: Any, web: Child, where: int) -> list[str]:
-    """The lines of the table."""
+    """Measure and return the lines of the table."""
     ticket, uuids = await signed_in(where)
     load = Load(where, ticket, uuids)
     await asyncio.sleep(2)
@@ -233,7 +234,7 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--rate", type=float, default=100.0, help="requests a second")
     given = parser.parse_args(arguments)
     most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
-    # Both ends of each connection are files; the children inherit this.
+    # Both ends of each connection are files; the child processes inherit this limit.
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(4096, most), most))
     udp, where = port.free("udp", "127.0.0.1", 1)[0], port.free("tcp", "127.0.0.1", 1)[0]
     web = Child("benchmarks.page_team", "web", udp, where)

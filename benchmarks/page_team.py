@@ -1,7 +1,7 @@
-"""The team that ``benchmarks.page`` loads: a real web node, or three robots whose pictures say when they were taken.
+"""Run the team that ``benchmarks.page`` loads: a real web node, or three robots with timestamps in their pictures.
 
-``python -m benchmarks.page_team web`` says its port, and at each line on its input how late its timers were and what it
-weighs; ``robots UDP_PORT`` joins three robots.  Each is a process of its own, and ends when its input does.
+``python -m benchmarks.page_team web`` prints its port, and for each line on its input the delay of its timers and its
+memory; ``robots UDP_PORT`` joins three robots. Each is a separate process, and ends with its input.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ ROBOTS = ("dog1", "dog2", "dog3")
 CODE = "page-bench"
 KEY = "5b" * 32
 FPS, PICTURE = 30.0, 6000
-"""Pictures a second of each robot, and their bytes, as of the dogs of the yard."""
+"""Pictures a second of each robot, and their bytes, as in the demonstration."""
 WORDS_S = 0.5
-"""How often each robot says something, so that the state changes."""
+"""Seconds between two messages of each robot, which change the state."""
 TICK_S = 0.002
 MARK = b"\xff\xd8"
 
 
 def settings(name: str, port: int, **tables: Any) -> Settings:
-    """A node on this machine that forgets all when it ends; ``port`` is the web node's."""
+    """Return the settings of a node on this machine without stored data; ``port`` is the web node's."""
     known = [] if "web" in tables else [f"127.0.0.1:{port}"]
     node = {"name": name, "host": "127.0.0.1", "port": port if "web" in tables else 0, "known_nodes": known}
     roles = ["edge", "web"] if "web" in tables else ["edge"]
@@ -45,7 +45,7 @@ def settings(name: str, port: int, **tables: Any) -> Settings:
 
 
 class Orders(LineReceiver):
-    """Answers each line with figures; the end of the input ends the process."""
+    """Answer each line with measurements; exit at the end of the input."""
 
     delimiter = b"\n"
 
@@ -55,11 +55,11 @@ class Orders(LineReceiver):
         self._late = late
 
     def connectionMade(self) -> None:
-        """Say that the team is there."""
+        """Report that the team is ready."""
         self.sendLine(json.dumps(self._first).encode())
 
     def lineReceived(self, line: bytes) -> None:
-        """Say how late the timers were since the last line, in ms, the memory in MiB, and the processor's seconds."""
+        """Report the timer delays since the previous line (ms), the memory (MiB) and the processor time (s)."""
         late = sorted(self._late) or [0.0]
         self._late.clear()
         told = {
@@ -71,13 +71,13 @@ class Orders(LineReceiver):
         self.sendLine(json.dumps(told).encode())
 
     def connectionLost(self, reason: Any = None) -> None:
-        """End."""
+        """Exit."""
         if self._reactor.running:
             self._reactor.stop()
 
 
 def main(arguments: list[str]) -> None:
-    """Be the web node, or the robots."""
+    """Run the web node, or the robots."""
     use_monotonic_time()
     drop_tls()
     from twisted.internet import reactor as made
@@ -108,7 +108,7 @@ def main(arguments: list[str]) -> None:
 
 
 def robot(name: str, port: int, reactor: Any) -> NodeService:
-    """A robot with a camera, which shows the moment, and a word now and then."""
+    """Run a robot with a camera that encodes the time in its pictures, and that sends a message from time to time."""
     wanted = settings(name, port)
     camera = {CAMERA: {"width": 208, "height": 160, "fps": FPS}}
     wanted = Settings.from_mapping(

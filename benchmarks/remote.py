@@ -1,4 +1,4 @@
-"""Remote: a process that is given orders in JSON lines and answers them by id."""
+"""Control a child process that receives orders in JSON lines and answers them by id."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from typing import Any
 
 
 class Lost(Exception):
-    """A process ended, did not answer an order in time, or could not do it."""
+    """A process exited, did not answer an order in time, or could not execute it."""
 
 
 class Unable(Lost):
-    """What a process says of an order that it cannot do."""
+    """The error that a process reports for an order that it cannot execute."""
 
 
 class Remote:
-    """One process, as ``name`` in what goes wrong; the file ``errors`` has what it writes to its standard error.
+    """A child process, called ``name`` in errors; the file ``errors`` has its standard error.
 
-    It answers the order 0, which nobody gives, when it takes orders.
+    It sends an answer with the id 0 when it is ready for orders.
     """
 
     def __init__(self, name: str, process: asyncio.subprocess.Process, errors: Path) -> None:
@@ -34,11 +34,11 @@ class Remote:
         self._reading = asyncio.ensure_future(self._read())
 
     async def up(self, limit_s: float) -> None:
-        """Wait until it takes orders."""
+        """Wait until it is ready for orders."""
         await self._answered(0, "come up", limit_s)
 
     async def order(self, do: str, patience_s: float, /, **fields: Any) -> dict[str, Any]:
-        """Have something done; raises ``Lost``."""
+        """Execute an order and return its answer; raises ``Lost``."""
         self._number += 1
         self._waiting[self._number] = asyncio.get_running_loop().create_future()
         assert self._process.stdin is not None
@@ -49,13 +49,13 @@ class Remote:
         return answer
 
     def send(self, number: signal.Signals) -> None:
-        """Kill or stop it; either way it takes no more orders."""
+        """Kill or stop the process; either way it accepts no more orders."""
         self.is_alive = False
         if self._process.returncode is None:
             self._process.send_signal(number)
 
     async def ended(self) -> None:
-        """Kill it and wait until it is gone; also one that was stopped."""
+        """Kill it, also if it is stopped, and wait until it has exited."""
         self.send(signal.SIGKILL)
         await self._process.wait()
         self._reading.cancel()

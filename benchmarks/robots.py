@@ -1,8 +1,8 @@
-"""What driving real robots costs: three AIBOs at once, over their own wire.
+"""Measure the driving of three AIBOs at once, over their own protocol.
 
-``make bench-robots`` starts a yard that plays three dogs, and a process for each dog that does nothing but drive it.
-It prints how evenly world states and pictures come, how long a command takes from the driver's ``act`` to the legs, and
-the processor and the memory of each driver.  Linux only: the figures come from ``/proc``.
+``make bench-robots`` starts a simulator that emulates three robots, and for each robot a process that only drives it.
+It prints the regularity of world states and pictures, the time of a command from the driver's ``act`` to the legs, and
+the processor time and memory of each driver. Linux only: the figures come from ``/proc``.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ SERVICES = ("main", "estop", "state", "walk", "head", "camera")
 START_S = 30.0
 COMMAND_S = 0.1
 TARGETS = {"frame_s": 0.032, "late_s": 0.020, "fps": 30.0, "wheel_ms": 20.0, "core": 0.05, "rss_mib": 45.0}
-"""Seconds between world states and how late 95 of 100 may be, pictures a second, and what a driver may take."""
+"""Seconds between world states and the delay of 95 of 100, pictures a second, and the limits of a driver."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure and print; 1 where a target is missed."""
+    """Measure and print; return 1 if a target is missed."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.robots", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--seconds", type=float, default=20.0, help="of each of both parts (default %(default)s)")
     parser.add_argument("--yard", help=argparse.SUPPRESS)
@@ -47,7 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _play(ports: list[dict[str, int]]) -> int:
-    """Be three dogs; each motion that reached the legs is told at the end: dog, forward velocity, moment."""
+    """Emulate three robots; at the end print each motion that reached the legs: robot, forward velocity, time."""
     from random import Random
 
     from twisted.internet import reactor as running
@@ -60,7 +60,7 @@ def _play(ports: list[dict[str, int]]) -> int:
 
     reactor: Any = running
     yard = Yard(reactor, Random(1), loaded("three-dogs"))
-    # Nobody reads until the end, and a pipe that is full would stop the yard.
+    # The output is read at the end only, and a full pipe would block the simulator.
     legs: list[tuple[int, float, float]] = []
     for number, served in enumerate(ports):
         body: Any = yard.lend(f"dog{number + 1}", LIMITS)
@@ -68,7 +68,7 @@ def _play(ports: list[dict[str, int]]) -> int:
 
         def stamped(vx: float, vy: float, wz: float, number: int = number, drive: Any = drive) -> None:
             legs.append((number, vx, time.monotonic()))
-            # The legs are told, and do not go anywhere: nobody looks where they walk.
+            # The legs receive the command, but the robot does not move: its position is not used.
             drive(0.0, 0.0, 0.0)
 
         body.drive = stamped
@@ -85,7 +85,7 @@ def _play(ports: list[dict[str, int]]) -> int:
 
 
 class Driven:
-    """One process' worth of driving: a command each ``COMMAND_S``, and the moments of all that came."""
+    """One driver process: it sends a command each ``COMMAND_S``, and records the times of all received data."""
 
     def __init__(self, reactor: Any, options: dict[str, Any], seconds: float) -> None:
         from drivers.registry import driver_for
@@ -101,7 +101,7 @@ class Driven:
         self._before = (0.0, 0.0)
 
     def start(self) -> None:
-        """Connect, enable, and measure once everything flows."""
+        """Connect, enable, and start the measurement when data arrives."""
         self._driver.connect().addCallback(lambda _: self._driver.enable()).addCallback(
             lambda _: self._reactor.callLater(2.0, self._begin)
         )
@@ -124,7 +124,7 @@ class Driven:
         if now >= self._ends_at:
             return self._tell()
         self._count += 1
-        # Each command is known again by its velocity.
+        # Each command has a unique velocity, by which it is recognised.
         vx = 0.05 + (self._count % 1000) * 1e-5
         self._commands.append((vx, time.monotonic()))
         self._driver.act({"base.vx": vx}, Permit(1, now + 0.5))
@@ -146,7 +146,7 @@ class Driven:
 
 
 def _drive(options: dict[str, Any], seconds: float) -> int:
-    # Twisted would load pyOpenSSL where it is installed (13 MiB), and nothing in this process speaks TLS.
+    # Twisted would load pyOpenSSL if it is installed (13 MiB), but this process uses no TLS.
     sys.modules.setdefault("OpenSSL", None)  # type: ignore[arg-type]
     from twisted.internet import reactor
 
@@ -155,7 +155,7 @@ def _drive(options: dict[str, Any], seconds: float) -> int:
     return 0
 
 
-# -- the whole ----------------------------------------------------------------------------------------------------
+# -- all processes ------------------------------------------------------------------------------------------------
 
 
 def _measure(seconds: float) -> int:
@@ -223,7 +223,7 @@ def _report(parts: dict[str, list[dict[str, Any]]], legs: list[list[str]], share
 
 
 def _waits(commands: list[list[float]], legs: list[list[str]]) -> list[float]:
-    """Seconds from each command to the first motion of the legs with its velocity."""
+    """Return the seconds from each command to the first motion of the legs with its velocity."""
     found = []
     place = 0
     for vx, at in commands:

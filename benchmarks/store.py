@@ -1,9 +1,4 @@
-"""What the data store promises, tried: rows that survive ``kill -9``, a quick restart, commits that stall nobody.
-
-``--kills N`` kills a writer N times and looks whether a row that it had acknowledged is lost or the file is damaged;
-``--restart ROWS`` takes the time from the start of a node's process until it serves; ``--rate`` writes and reads as
-fast as it goes.  Exit code 1 where a promise is broken.
-"""
+"""Check the guarantees of the data store: rows survive ``kill -9``, restarts are fast, commits block no reactor."""
 
 from __future__ import annotations
 
@@ -35,11 +30,11 @@ SLOTS = 3000
 TTL = 1e6
 RESTART_S = 2.0
 STALL_S = 0.05
-"""What the reactor may be later by than an idle one, at the 99th percentile, while the store writes all it can."""
+"""Maximum additional delay of the reactor at the 99th percentile, compared with an idle one, while the store writes."""
 
 
 def written_as(number: int) -> Record:
-    """The record that is written in the place ``number`` of the series; all of it follows from the number."""
+    """Return the record with the index ``number``; all of it follows from the number."""
     dice = random.Random(number)
     size = min(MAX_VALUE, 200_000) if number % 97 == 0 else dice.randrange(300)
     value = None if number % 7 == 0 else dice.randbytes(size)
@@ -56,7 +51,7 @@ def _say(*words: object) -> None:
 
 
 def write_until_killed(path: str, first: int) -> None:
-    """Write the series from ``first`` on, in groups; print the number of the last that is safe after each."""
+    """Write records from ``first`` on, in groups; after each group print the number of the last safe record."""
     _say("opening")
     store = SqliteStore.open(path, 0.0)
     number = first
@@ -70,7 +65,7 @@ def write_until_killed(path: str, first: int) -> None:
 
 @dataclass
 class Kills:
-    """What was seen over a number of kills."""
+    """The results of a number of kills."""
 
     kills: int = 0
     acknowledged: int = 0
@@ -79,12 +74,12 @@ class Kills:
     damaged: list[str] = field(default_factory=list)
 
     def is_clean(self) -> bool:
-        """Whether nothing was lost and nothing damaged."""
+        """Return whether nothing was lost or damaged."""
         return not self.lost and not self.damaged
 
 
 def killed(path: str, count: int, seed: int) -> Kills:
-    """Kill a process that writes to the store ``path``, ``count`` times, and look at what it left each time."""
+    """Kill a process that writes to the store ``path``, ``count`` times, and check the file after each kill."""
     rng = random.Random(seed)
     seen = Kills()
     safe = 0
@@ -95,7 +90,7 @@ def killed(path: str, count: int, seed: int) -> Kills:
         assert child.stdout is not None
         with closing(child.stdout):
             child.stdout.readline()
-            # Now and then it dies while it opens the file.
+            # Some kills happen while the process opens the file.
             time.sleep(rng.choice((rng.uniform(0.0, 0.03), rng.uniform(0.0, 0.3))))
             child.send_signal(signal.SIGKILL)
             lines = [line for line in child.stdout.read().splitlines(keepends=True) if line.endswith("\n")]
@@ -138,7 +133,7 @@ def _look(path: str, safe: int, kill: int, seen: Kills) -> None:
 
 
 def serve(path: str) -> None:
-    """Start a whole node on the store ``path``; print when it serves, how many rows it holds, and its memory."""
+    """Run a complete node on the store ``path``; print when it serves, its number of rows, and its memory."""
     from swarmnode.ballast import drop_tls
 
     drop_tls()
@@ -162,7 +157,7 @@ def serve(path: str) -> None:
 
 
 def restarted(folder: str, rows: int, times: int = 5) -> bool:
-    """Print how long a node with ``rows`` rows takes to serve; False if too long."""
+    """Print the time until a node with ``rows`` rows serves; return False if it is too long."""
     _say(f"{'rows':>8} {'file MiB':>9} {'serving after s':>16} {'worst s':>8} {'RSS MiB':>8} {'peak MiB':>9}")
     held = True
     for count in (0, rows):
@@ -198,7 +193,7 @@ def restarted(folder: str, rows: int, times: int = 5) -> bool:
 
 
 class Rate:
-    """Puts that wait for their commit, ``in_flight`` at a time, while the reactor's lateness is watched."""
+    """Run puts that wait for their commit, ``in_flight`` at a time, and measure the delay of the reactor."""
 
     TICK = 0.002
 
@@ -213,7 +208,7 @@ class Rate:
         self._left = 0
 
     async def run(self) -> float:
-        """The seconds that it took; where there is nothing to put, a second."""
+        """Return the duration in seconds; without puts, one second."""
         from twisted.internet import reactor, task
         from twisted.internet.defer import Deferred, gatherResults
 
@@ -297,7 +292,7 @@ def _sync_s(folder: str) -> float:
 
 
 def rated(folder: str) -> bool:
-    """Print what the store does in a second; False if the reactor was kept waiting."""
+    """Print the operations per second of the store; return False if the reactor was delayed too much."""
     from twisted.internet import task
 
     outcome: list[bool] = []
@@ -316,7 +311,7 @@ def rated(folder: str) -> bool:
 
 
 def main() -> int:
-    """The command."""
+    """Run the command."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.store", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--kills", type=int, default=0, metavar="N", help="kill a writer N times")
     parser.add_argument("--restart", type=int, default=0, metavar="ROWS", help="start a node with that many rows")

@@ -1,7 +1,7 @@
-"""Many takers at once: is any tuple confirmed twice, is any lost, whatever dies?  In simulated time, from a seed.
+"""Check that many takers confirm each tuple at most once and lose none, under faults, in virtual time and from a seed.
 
-``python -m benchmarks.takers --tuples 10000 --takers 8 --loss 0.0-0.5`` runs whole nodes over a switchboard that loses
-datagrams, while nodes are killed and come back and links are cut; prints a table and ends with 1 on a violation.
+``python -m benchmarks.takers --tuples 10000 --takers 8 --loss 0.0-0.5`` runs complete nodes on a switchboard that loses
+datagrams, while nodes are killed and return and links are cut; it prints a table and exits with 1 on a violation.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from sim.team.takers.trial import Trial
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run trials and print what came of them."""
+    """Run trials and print their results."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.takers", description=__doc__.partition("\n")[0])
     parser.add_argument("--tuples", type=int, default=1000, help="tuples over all trials")
     parser.add_argument("--takers", type=int, default=8, help="takers of each trial")
