@@ -40,16 +40,16 @@ class Model:
     """``n`` devices of a settled team with random ids; the share ``wrong`` has a depth that is wrong by one."""
 
     def __init__(self, n: int, seed: int, wrong: float = 0.0) -> None:
-        dice = random.Random(f"{seed}/model")
-        self.contacts = sorted(Ring(n, dice).contacts, key=lambda contact: contact.node_id)
+        rng = random.Random(f"{seed}/model")
+        self.contacts = sorted(Ring(n, rng).contacts, key=lambda contact: contact.node_id)
         self._ids = [int.from_bytes(contact.node_id) for contact in self.contacts]
         self.depths: list[int] = []
         self.places: dict[bytes, list[Record]] = {}
         for contact in self.contacts:
             near = self.nearest(contact.node_id, K + 1)[1:]
             depth = depth_for(n if n <= WHOLE else size_of(contact.node_id, near))
-            if dice.random() < wrong:
-                depth = min(MAX_DEPTH, max(0, depth + dice.choice((-1, 1))))
+            if rng.random() < wrong:
+                depth = min(MAX_DEPTH, max(0, depth + rng.choice((-1, 1))))
             self.depths.append(depth)
             device = Device(contact.node_id.hex(), "d", depth=depth)
             for key in places_of(contact.node_id, depth):
@@ -174,14 +174,14 @@ def lived(n: int, seed: int) -> Iterator[list[str]]:
     team = Team(n, seed)
     team.clock.advance(40.0)
     yield team.row("settled")
-    dice = random.Random(f"{seed}/death")
-    for node in dice.sample(team.nodes[1:], n // 4):
+    rng = random.Random(f"{seed}/death")
+    for node in rng.sample(team.nodes[1:], n // 4):
         node.vanish()
     yield team.row("quarter gone, 20 s")
     team.clock.advance(60.0)
     yield team.row("120 s and more")
     running = [node for node in team.nodes if node.running]
-    for node in dice.sample(running[1:], max(0, len(running) - SMALL)):
+    for node in rng.sample(running[1:], max(0, len(running) - SMALL)):
         node.stopService()
         team.clock.advance(PAUSE)
     team.clock.advance(80.0)

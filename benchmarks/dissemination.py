@@ -131,8 +131,8 @@ class Crowd:
         self._due = [math.inf] * n
         self._rule = Rule(strategy_for("nearest"))
         members = {self._places[c.node_id] for c in council}
-        dice = random.Random(f"{seed}/dead")
-        self.dead = {i for i in range(n) if i not in members and dice.random() < weather.dead}
+        rng = random.Random(f"{seed}/dead")
+        self.dead = {i for i in range(n) if i not in members and rng.random() < weather.dead}
         if council_is_dead:
             self.dead |= members
         self.parties = [self._party(i) for i in range(n)]
@@ -278,13 +278,13 @@ class Crowd:
                 known.extend(closest(everybody, self.auction.key, K) if self.auction.exclusive else everybody)
             return known
 
-        dice = random.Random(f"{self.auction.task_id}/{place}")
+        rng = random.Random(f"{self.auction.task_id}/{place}")
         return Party(
             self.auction,
             self.ring.contacts[place],
             self._rule,
             contacts,
-            dice,
+            rng,
             lambda message: b"",
             lambda reports: self._told(place, reports),
         )

@@ -68,33 +68,33 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def makers(order: dict[str, Any]) -> dict[str, Callable[[], bytes]]:
     """Return a generator of datagrams for each kind, from the knowledge of an eavesdropper."""
-    dice = random.Random(7)
-    rubbish = dice.randbytes(1 << 20)
+    rng = random.Random(7)
+    rubbish = rng.randbytes(1 << 20)
     recorded = [bytes.fromhex(each) for each in order["recorded"]]
     indexes = [index.to_bytes(4, "little") for index in order["index"]] or [bytes(4)]
     number = 0
 
     def some(size: int) -> bytes:
-        start = dice.randrange(len(rubbish) - size)
+        start = rng.randrange(len(rubbish) - size)
         return rubbish[start : start + size]
 
     def data() -> bytes:
         nonlocal number
         number += 1
-        head = bytes([session.DATA]) + dice.choice(indexes)
+        head = bytes([session.DATA]) + rng.choice(indexes)
         return bytes(head) + (1_000_000 + number).to_bytes(8, "little") + some(60)
 
     single: dict[str, Callable[[], bytes]] = {
-        "random": lambda: some(dice.randrange(1, 1400)),
+        "random": lambda: some(rng.randrange(1, 1400)),
         # Length and padding of a real one, without the mac that needs the team's secret, and without a payment.
         "init": lambda: bytes([session.INIT]) + some(1283) + bytes(16),
         "data": data,
-        "replay": lambda: dice.choice(recorded),
+        "replay": lambda: rng.choice(recorded),
         "who": lambda: bytes([greeting.WHO]) + some(greeting.GREETING_BYTES - 1),
         "hail": lambda: hail.hail(some(hail.TOKEN)),
         "knock": lambda: bytes([knock.KNOCK]) + some(knock.KNOCK_BYTES - 1),
     }
-    return {**single, "mixed": lambda: dice.choice(list(single.values()))()}
+    return {**single, "mixed": lambda: rng.choice(list(single.values()))()}
 
 
 def _fire(order: dict[str, Any]) -> int:
@@ -130,10 +130,10 @@ def _fire(order: dict[str, Any]) -> int:
 
 
 def _measured(seconds: float, rate: int) -> dict[str, Any]:
-    dice = random.SystemRandom()
-    operator = drawn("flooded", dice)
-    first = operator.founded("target", ("device", "bootstrap", "gateway"), time.time(), dice)
-    second = operator.founded("friend", ("device", "gateway"), time.time(), dice, first.secrets[0][1])
+    rng = random.SystemRandom()
+    operator = drawn("flooded", rng)
+    first = operator.founded("target", ("device", "bootstrap", "gateway"), time.time(), rng)
+    second = operator.founded("friend", ("device", "gateway"), time.time(), rng, first.secrets[0][1])
     children: list[Child] = []
     with tempfile.TemporaryDirectory(prefix="flood") as folder:
         paths = [Path(folder) / name for name in ("target", "friend")]

@@ -45,8 +45,8 @@ class Node(Protocol):
 
     def __init__(self, path: Path, known: list[Address], others: list[str]) -> None:
         kept, store = MembershipFile(path), MemoryStore()
-        dice = random.SystemRandom()
-        self.team = Team(kept, store, time.time, dice)
+        rng = random.SystemRandom()
+        self.team = Team(kept, store, time.time, rng)
         self.network = UdpNetwork(reactor, "127.0.0.1", 0)
         self.node = EntangledNode(
             self.team.identity,
@@ -54,7 +54,7 @@ class Node(Protocol):
             self.network,
             store,
             reactor,
-            dice,
+            rng,
             wall=time.time,
             door=self.team.door,
         )

@@ -35,9 +35,9 @@ STALL_S = 0.05
 
 def written_as(number: int) -> Record:
     """Return the record with the index ``number``; all of it follows from the number."""
-    dice = random.Random(number)
-    size = min(MAX_VALUE, 200_000) if number % 97 == 0 else dice.randrange(300)
-    value = None if number % 7 == 0 else dice.randbytes(size)
+    rng = random.Random(number)
+    size = min(MAX_VALUE, 200_000) if number % 97 == 0 else rng.randrange(300)
+    value = None if number % 7 == 0 else rng.randbytes(size)
     signature = hashlib.blake2b(str(number).encode()).digest()
     return Record(KEY, str(number % SLOTS), OWNER, number, "team", TTL, value, signature)
 
@@ -163,11 +163,11 @@ def restarted(folder: str, rows: int, times: int = 5) -> bool:
     for count in (0, rows):
         path = os.path.join(folder, f"{count}.sqlite")
         with closing(SqliteStore.open(path, 0.0, max_rows=max(1, 4 * count))) as store:
-            dice = random.Random(count)
+            rng = random.Random(count)
             for number in range(count):
-                value, signature = dice.randbytes(200), dice.randbytes(64)
-                name, owner = str(number), dice.choice((OWNER, OWNER[::-1]))
-                store.put(Record(dice.randbytes(20), name, owner, 1, "team", TTL, value, signature), TTL)
+                value, signature = rng.randbytes(200), rng.randbytes(64)
+                name, owner = str(number), rng.choice((OWNER, OWNER[::-1]))
+                store.put(Record(rng.randbytes(20), name, owner, 1, "team", TTL, value, signature), TTL)
         took, said = [], [0, 0, 0]
         for _ in range(times):
             started = time.monotonic()
@@ -233,10 +233,8 @@ class Rate:
         while self._left:
             self._left -= 1
             number = self._base + self._left
-            dice = random.Random(number)
-            record = Record(
-                dice.randbytes(20), str(number), OWNER, 1, "team", TTL, dice.randbytes(self._size), bytes(64)
-            )
+            rng = random.Random(number)
+            record = Record(rng.randbytes(20), str(number), OWNER, 1, "team", TTL, rng.randbytes(self._size), bytes(64))
             started = time.monotonic()
             self._store.put(record, TTL)
             await self._store.written()

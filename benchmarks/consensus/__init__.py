@@ -1,1 +1,1 @@
-"""The strategies side by side: the same seeded missions, with failures, from 3 to 1,000 agents."""
+"""Compare the strategies on the same seeded missions, with failures, from 3 to 1,000 agents."""

@@ -1,8 +1,7 @@
-"""Runs the strategies over the missions from the command line; see the package.
+"""Run the strategies on the missions from the command line.
 
-Cost is compared with the exact optimum of the same mission.  Messages, rounds and time are those of CBBA among the
-agents themselves, and of bids that are gathered at one place and answered otherwise.  Exit code 1 where a target is
-missed.
+The cost is compared with the exact optimum of the same mission. Messages, rounds and time are those of CBBA between the
+agents, or of bids that are collected at one node. The exit code is 1 if a target is missed.
 """
 
 from __future__ import annotations
@@ -30,15 +29,15 @@ SIZES = (3, 10, 30, 100, 300, 1000)
 QUICK = (3, 10, 30, 100)
 SEEDS, QUICK_SEEDS = 10, 2
 DEAREST = 3000
-"""Agents of all missions of one size together at most, since what a mission costs grows with the square of them."""
+"""Maximum number of agents in all missions of one size together: the cost of a mission grows with their square."""
 FAILED = 10
 PATHS = ((3, 3), (3, 6), (10, 10), (10, 20), (50, 50), (50, 100))
 WAY_S, QUICK_WAY_S = 0.08, 0.01
-"""Seconds to look for the shortest ways, for each task."""
+"""Seconds of the search for the shortest routes, for each task."""
 
 
 def main() -> int:
-    """Measure what the arguments say, print it, and write it."""
+    """Run the measurements that the arguments select, print them, and write them."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.consensus", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="up to 100 agents and two missions; ends within 20 s")
     parser.add_argument(
@@ -53,7 +52,7 @@ def main() -> int:
     wanted = parser.parse_args()
     sizes = [int(n) for n in wanted.sizes.split(",")] if wanted.sizes else list(QUICK if wanted.quick else SIZES)
     seeds = wanted.seeds or (QUICK_SEEDS if wanted.quick else SEEDS)
-    gc.disable()  # else a thousand agents in one process look through each other's memory, and nothing is there to find
+    gc.disable()  # otherwise the garbage collector scans a thousand agents in one process, without finding garbage
     began = time.monotonic()
     print(f"{'agents':>6s} {'missions':>8s} {'strategy':24s} {'cost':>6s} {'failed':>7s} {'moved':>6s} {'messages':>8s}"
           f" {'kB':>6s} {'rounds':>6s} {'agree s':>7s} {'CPU ms':>8s}")  # fmt: skip
@@ -80,13 +79,13 @@ def main() -> int:
 
 
 def judged(size: int, seeds: range) -> list[dict[str, Any]]:
-    """Every strategy over the missions of one size, a row each."""
+    """Return a row for every strategy on the missions of one size."""
     found = [tried(size, seed) for seed in seeds]
     return [summed_up(size, name, [one[name] for one in found]) for name in DECIDERS]
 
 
 def tried(size: int, seed: int) -> dict[str, dict[str, Any]]:
-    """What each strategy makes of one mission."""
+    """Return the results of each strategy on one mission."""
     calm, after = Mission(size, size, seed), Mission(size, size, seed, FAILED)
     (least, by), (least_after, _) = least_star(calm), least_star(after)
     talk, alive = talked(calm), set(after.alive)
@@ -94,7 +93,7 @@ def tried(size: int, seed: int) -> dict[str, dict[str, Any]]:
     for name in DECIDERS:
         now, then = outcome(name, calm, talk), outcome(name, after)
         kept = [task for task, agent in now.owners.items() if agent in alive]
-        is_greedy = name == "cbba" and size <= ALL  # else it did not hear every bid that the talk is about
+        is_greedy = name == "cbba" and size <= ALL  # otherwise CBBA did not use every bid
         found[name] = {
             "ratio": cost(calm, now.owners) / least,
             "ratio_failed": cost(after, then.owners) / least_after,
@@ -111,25 +110,25 @@ def tried(size: int, seed: int) -> dict[str, dict[str, Any]]:
 
 
 def summed_up(size: int, name: str, found: list[dict[str, Any]]) -> dict[str, Any]:
-    """One strategy over the missions of one size: the means, and of the processor the middle."""
+    """Summarise one strategy on the missions of one size: means, and the median of the processor time."""
     means = ("ratio", "ratio_failed", "moved", "messages", "kB", "rounds")
     row: dict[str, Any] = {"agents": size, "missions": len(found), "strategy": name, "by": found[0]["by"]}
     row |= {key: fmean(one[key] for one in found) for key in means}
     row |= {key: sum(one[key] for one in found) for key in ("two_owners", "unlike_greedy")}
     row["cpu_ms"] = median(one["cpu_ms"] for one in found)
-    # Who talk reckon at the same time as all others, and while messages are on their way.
+    # The agents of CBBA compute in parallel, also while messages are in transit.
     row["agree_s"] = row["rounds"] * ROUND_S + (0.0 if name in TALKED else row["cpu_ms"] / 1000.0)
     return row
 
 
 def cost(mission: Mission, owners: Owners) -> float:
-    """The sum of all ways; a task that nobody has costs as much as the longest."""
+    """Return the sum of all routes; a task without an agent costs as much as the longest route."""
     longest = max(max(row.values()) for row in mission.costs.values())
     return float(sum(mission.costs[owners[t]][t] if t in owners else longest for t in mission.places))
 
 
 def paths(seeds: int, seconds: float) -> dict[str, Any]:
-    """The ways of the sequential auction against the shortest known after so many ``seconds`` for each task."""
+    """Compare the routes of the sequential auction with the shortest known after ``seconds`` per task."""
     ratios, worst, by = {}, {}, ""
     for agents, tasks in PATHS:
         found = []
@@ -144,7 +143,7 @@ def paths(seeds: int, seconds: float) -> dict[str, Any]:
 
 
 def targets(rows: list[dict[str, Any]], ways: dict[str, Any], seeds: range) -> list[dict[str, Any]]:
-    """What the project has promised, and whether it holds."""
+    """Return the targets, and whether they are met."""
     hundred = {row["strategy"]: row for row in rows if row["agents"] == 100}
     found = []
 
@@ -168,7 +167,7 @@ def targets(rows: list[dict[str, Any]], ways: dict[str, Any], seeds: range) -> l
 
 
 def solving(size: int, seeds: range) -> float:
-    """The milliseconds of processor of one exact assignment, the middle of several."""
+    """Return the milliseconds of processor time of one exact assignment, the median of several."""
     took = []
     for seed in seeds:
         mission = Mission(size, size, seed)
@@ -181,7 +180,7 @@ def solving(size: int, seeds: range) -> float:
 
 
 def line(row: dict[str, Any]) -> str:
-    """One row of the table."""
+    """Return one row of the table."""
     assert math.isfinite(row["ratio"])
     return (
         f"{row['agents']:6d} {row['missions']:8d} {row['strategy']:24s} {row['ratio']:6.3f} {row['ratio_failed']:7.3f}"

@@ -1,8 +1,9 @@
-"""Bidder: one agent's side of CBBA over a network that delays, repeats and reorders, but delivers in the end.
+"""One agent's side of CBBA over a network that delays, repeats and reorders messages, but delivers them eventually.
 
-Each agent states its own bids, numbered; a newer statement of an agent about a task replaces its older ones, and the
-highest standing bid for a task wins.  Statements are values: what ``drain`` gives is sent to the neighbours, what comes
-in is given to ``hear``.  Only changes travel.  Nothing is concluded from silence: who may act is decided by the lease.
+Each agent states its own bids, with version numbers; a newer statement of an agent about a task replaces its older
+ones, and the highest valid bid for a task wins. Statements are values: the caller sends the result of ``drain`` to the
+neighbours and passes received statements to ``hear``. Only changes are sent. Silence proves nothing: the lease decides
+which agent may act.
 """
 
 from __future__ import annotations
@@ -13,11 +14,11 @@ from typing import NamedTuple
 from middleware.consensus.strategy import MAX_NUMBER
 
 Score = Callable[[tuple[str, ...], str], float]
-"""What a task is worth to an agent that has a bundle already; 0 or less: it does not want it."""
+"""The value of a task for an agent with a given bundle; with 0 or less it does not bid."""
 
 
 class Statement(NamedTuple):
-    """What an agent says of a task: its bid, or 0 where it bids no more; ``version`` numbers what it ever said."""
+    """An agent's bid for a task, or 0 after withdrawal; ``version`` numbers all its statements."""
 
     task: str
     agent: str
@@ -26,7 +27,7 @@ class Statement(NamedTuple):
 
 
 class Bidder:
-    """What one agent bids and knows of the bids of all others; ``score`` says what tasks are worth to it."""
+    """One agent's bids and its view of all other bids; ``score`` is its value of tasks."""
 
     def __init__(
         self, agent: str, tasks: Iterable[str], score: Score, capacity: int = 1, neighbours: Iterable[str] = ()
@@ -48,7 +49,7 @@ class Bidder:
         self._choose()
 
     def winner(self, task: str) -> Statement | None:
-        """The highest bid for a task that stands as far as is known here, or None."""
+        """Return the highest valid bid for a task in this agent's view, or None."""
         own = self._known[task].get(self.agent)
         rival = self._rival[task]
         if own is None or own.bid <= 0.0:
@@ -56,7 +57,7 @@ class Bidder:
         return own if rival is None or _beats(own.bid, self.agent, rival) else rival
 
     def hear(self, neighbour: str, statements: Sequence[Statement]) -> list[Statement]:
-        """Take in what a neighbour says; gives what that neighbour should know instead of what it said."""
+        """Process a neighbour's statements; return newer statements that the neighbour should have."""
         corrections = []
         is_moved = False
         heard = self._heard.setdefault(neighbour, {})
@@ -77,16 +78,16 @@ class Bidder:
                 continue
             bids[agent] = said
             if known is not None and known.bid > 0.0:
-                self._out[task, agent] = said  # it replaces what was passed on
+                self._out[task, agent] = said  # it replaces the forwarded statement
             is_moved |= self._looked_again(said)
         if is_moved:
             self._choose()
         return corrections
 
     def drain(self) -> dict[str, tuple[Statement, ...]]:
-        """What each neighbour does not know from here yet, nor said itself; it is then taken as told.
+        """Return the statements that each neighbour does not have yet, and mark them as sent.
 
-        Draining every few message times instead of at once makes fewer and fuller messages of the same news.
+        A call every few message times instead of every time gives fewer and larger messages with the same content.
         """
         for task in sorted(self._touched):
             best = self.winner(task)
@@ -105,11 +106,11 @@ class Bidder:
 
     @property
     def is_quiet(self) -> bool:
-        """Whether there is nothing to drain."""
+        """Whether there is nothing to send."""
         return not self._out and not self._touched
 
     def _remembered(self, said: Statement) -> bool:
-        """The others know what this agent said in a life before: what it says now must count for more."""
+        """Number new statements above the statements of a previous run of this agent, which others remember."""
         own = self._known[said.task].get(self.agent)
         if said.version <= (own.version if own is not None else 0):
             return False
@@ -119,27 +120,27 @@ class Bidder:
         return True
 
     def _looked_again(self, said: Statement) -> bool:
-        """Find the best of the others' bids for that task again; whether the own bundle may be another now."""
+        """Recompute the best bid of the others for that task; return whether the own bundle can change."""
         task, before = said.task, self._rival[said.task]
         self._touched.add(task)
         if said.bid > 0.0 and (before is None or _beats(said.bid, said.agent, before)):
             after: Statement | None = said
         elif before is None or before.agent != said.agent:
-            return False  # the best is who it was
+            return False  # the best bidder is unchanged
         else:
             others = [s for s in self._known[task].values() if s.agent != self.agent and s.bid > 0.0]
             after = min(others, key=lambda s: (-s.bid, s.agent), default=None)
         self._rival[task] = after
         if before is not None and (after is None or _beats(before.bid, before.agent, after)):
-            return True  # a bid was taken back: this task may be had now
+            return True  # a bid was withdrawn: this agent may get the task now
         own = self._known[task].get(self.agent)
         return task in self.bundle and own is not None and after is not None and not _beats(own.bid, self.agent, after)
 
     def _choose(self) -> None:
-        """Fill the bundle anew, best task first, with what the others do not hold by a higher bid.
+        """Rebuild the bundle, best task first, from tasks on which no other agent bids more.
 
-        A bid is never higher than the one before it in the bundle (bid warping: Johnson, Choi, How 2012), so that the
-        agents also come to rest where a task is worth more beside another.
+        A bid is never higher than the previous one in the bundle (bid warping: Johnson, Choi, How 2012), so the agents
+        converge also if a task is worth more together with another one.
         """
         bids: dict[str, float] = {}
         ceiling = float("inf")
@@ -168,10 +169,10 @@ class Bidder:
 
 
 def is_over(rounds: int, quiet: int, tasks: int, members: int) -> bool:
-    """Whether nothing can change any more after so many ``rounds`` in step, the last ``quiet`` of them without news.
+    """Return whether the result is final after ``rounds`` synchronous rounds, the last ``quiet`` without changes.
 
-    Silence proves nothing: far away others may still change their minds.  What does is that each task is settled
-    within as many rounds as the longest way has hops (Choi and others, theorem 1), if no message is lost.
+    Silence is no proof, because distant agents may still change their bids. The bound is the number of tasks times the
+    diameter of the graph (Choi and others, theorem 1), without message loss.
     """
     return rounds > tasks * max(1, members - 1)
 

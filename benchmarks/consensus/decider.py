@@ -1,4 +1,4 @@
-"""Decider: the strategies, each as a function from bids to who has each task, and what it takes to agree on that."""
+"""The strategies as functions from bids to the owner of each task, with their communication cost."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Decider = Callable[[Mission, list[Report]], Owners]
 
 
 def in_order(mission: Mission, reports: list[Report]) -> Owners:
-    """The rule of the thesis, one task after the other as they come; who has enough does not bid."""
+    """The rule of the thesis: one task after the other; an agent with a full bundle does not bid."""
     left = capacities(reports)
     owners: Owners = {}
     bids: dict[str, list[Report]] = {}
@@ -41,7 +41,7 @@ def bundled(mission: Mission, reports: list[Report]) -> Owners:
 
 
 def shared(strategy: Sharing) -> Decider:
-    """A strategy for several tasks."""
+    """Return the function of a strategy for several tasks."""
 
     def decide(mission: Mission, reports: list[Report]) -> Owners:
         points: tuple[Consensus, ...] = strategy.find_group(reports, mission.items)
@@ -51,7 +51,7 @@ def shared(strategy: Sharing) -> Decider:
 
 
 def with_all_bids() -> GroupOptimal:
-    """The optimum of every bid, instead of 20 of each."""
+    """The optimum over all bids, instead of 20 of each agent."""
     strategy = GroupOptimal()
     strategy.bids = 10**6
     return strategy
@@ -70,4 +70,4 @@ DECIDERS: dict[str, Decider] = {
     "group_optimal": shared(with_all_bids()),
 }
 NAMED = {FEWER: BIDS}
-"""How many bids each agent makes, where that does not depend on the team."""
+"""Bids of each agent, if the number does not depend on the team."""

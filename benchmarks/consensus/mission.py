@@ -1,4 +1,4 @@
-"""Mission: agents and tasks in a square of one kilometre, some of the agents failing; equal for equal seeds."""
+"""A mission: agents and tasks in a square of one kilometre, and failures of agents; equal seeds give equal missions."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Place = tuple[float, float]
 
 @dataclass(frozen=True)
 class Mission:
-    """``agents`` and ``tasks`` by seed; ``failed`` of 100 agents fall silent after they have bid."""
+    """``agents`` and ``tasks`` from a seed; ``failed`` percent of the agents fail after they have bid."""
 
     agents: int
     tasks: int
@@ -27,45 +27,45 @@ class Mission:
 
     @cached_property
     def capacity(self) -> int:
-        """How many tasks an agent takes, as few as suffice for those that are left, and ``spare`` more."""
+        """Tasks per agent: as few as suffice for the remaining agents, and ``spare`` more."""
         return math.ceil(self.tasks / max(1, len(self.alive))) + self.spare
 
     @cached_property
     def starts(self) -> dict[str, Place]:
-        """Where each agent stands."""
-        dice = random.Random(f"agents/{self.agents}/{self.tasks}/{self.seed}")
-        return {f"a{n:04d}": (dice.uniform(0, SIDE), dice.uniform(0, SIDE)) for n in range(self.agents)}
+        """The position of each agent."""
+        rng = random.Random(f"agents/{self.agents}/{self.tasks}/{self.seed}")
+        return {f"a{n:04d}": (rng.uniform(0, SIDE), rng.uniform(0, SIDE)) for n in range(self.agents)}
 
     @cached_property
     def places(self) -> dict[str, Place]:
-        """Where each task is."""
-        dice = random.Random(f"tasks/{self.agents}/{self.tasks}/{self.seed}")
-        return {f"t{n:04d}": (dice.uniform(0, SIDE), dice.uniform(0, SIDE)) for n in range(self.tasks)}
+        """The position of each task."""
+        rng = random.Random(f"tasks/{self.agents}/{self.tasks}/{self.seed}")
+        return {f"t{n:04d}": (rng.uniform(0, SIDE), rng.uniform(0, SIDE)) for n in range(self.tasks)}
 
     @cached_property
     def alive(self) -> list[str]:
-        """Who does not fail."""
-        dice = random.Random(f"failed/{self.agents}/{self.seed}")
-        gone = set(dice.sample(range(self.agents), self.agents * self.failed // 100))
+        """The agents that do not fail."""
+        rng = random.Random(f"failed/{self.agents}/{self.seed}")
+        gone = set(rng.sample(range(self.agents), self.agents * self.failed // 100))
         return [agent for number, agent in enumerate(sorted(self.starts)) if number not in gone]
 
     @cached_property
     def items(self) -> list[Item]:
-        """The tasks as strategies see them."""
+        """The tasks as input of the strategies."""
         return [Item(task, place) for task, place in self.places.items()]
 
     @cached_property
     def costs(self) -> dict[str, dict[str, int]]:
-        """The way from each agent to each task, in whole millionths of a metre."""
+        """The distance from each agent to each task, in whole micrometres."""
         return {a: {t: exact(math.dist(s, p)) for t, p in self.places.items()} for a, s in self.starts.items()}
 
     @cached_property
     def near(self) -> dict[str, list[tuple[float, str]]]:
-        """The way from each agent to each task in metres, and the task, the nearest first."""
+        """For each agent the distance to each task in metres, and the task, the nearest first."""
         return {a: sorted((math.dist(s, p), t) for t, p in self.places.items()) for a, s in self.starts.items()}
 
     def reports(self, agents: list[str], bids: int, also: Collection[str] = ()) -> list[Report]:
-        """The bids of some agents, each for as many tasks as there may be ``bids``, the nearest first, and ``also``."""
+        """Return the bids of some agents, each for its ``bids`` nearest tasks and for the tasks ``also``."""
         found = []
         for agent in agents:
             start, ways = self.starts[agent], self.near[agent]

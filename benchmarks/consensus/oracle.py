@@ -1,4 +1,4 @@
-"""Oracle: what a mission costs at least, by SciPy and OR-Tools where they are installed, else by our own means."""
+"""Lower bounds for the cost of a mission, by SciPy and OR-Tools if they are installed, otherwise by own algorithms."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from middleware.consensus.strategies import hungarian
 from middleware.consensus.strategies.sequential import insertion, length
 
 STEPS_S = 60_000
-"""Steps of our own search for short ways in place of each second that OR-Tools would get."""
+"""Steps of the own search for short routes per second that OR-Tools would get."""
 
 
 def least_star(mission: Mission) -> tuple[float, str]:
-    """The least sum of ways there, if each task is a way of its own, and who says so; exact in either case."""
+    """Return the exact least sum of distances if each task is a separate trip, and the solver's name."""
     columns = [agent for agent in mission.alive for _ in range(mission.capacity)]
     costs = [[mission.costs[agent][task] for agent in columns] for task in mission.places]
     try:
@@ -30,7 +30,7 @@ def least_star(mission: Mission) -> tuple[float, str]:
 
 
 def least_way(mission: Mission, ways: dict[str, list[str]], seconds: float) -> tuple[float, str]:
-    """The shortest sum of ways through all tasks that is known; ``ways`` is one to begin with."""
+    """Return the shortest known sum of routes through all tasks, and the solver's name, starting from ``ways``."""
     try:
         return min(travelled(mission, ways), _by_ortools(mission, seconds)), "OR-Tools"
     except ImportError:
@@ -38,13 +38,13 @@ def least_way(mission: Mission, ways: dict[str, list[str]], seconds: float) -> t
 
 
 def travelled(mission: Mission, ways: dict[str, list[str]]) -> float:
-    """The sum of the ways through all tasks, in metres."""
+    """Return the sum of the routes through all tasks, in metres."""
     return sum(length(mission.starts[a], [mission.places[t] for t in way]) for a, way in ways.items())
 
 
 def _annealed(mission: Mission, ways: dict[str, list[str]], steps: int) -> float:
-    """Move single tasks about, at first also for the worse, and less and less so."""
-    dice = random.Random(mission.seed)
+    """Improve the routes by simulated annealing: move single tasks, and sometimes accept a longer route."""
+    rng = random.Random(mission.seed)
     now = {agent: list(ways.get(agent, ())) for agent in mission.alive}
     agents = list(now)
     best = cost = travelled(mission, now)
@@ -57,19 +57,17 @@ def _annealed(mission: Mission, ways: dict[str, list[str]], steps: int) -> float
     tasks = sorted(owner)
     for step in range(steps):
         warmth = heat * (1.0 - step / steps) ** 2 + 1e-9
-        task = dice.choice(tasks)
+        task = rng.choice(tasks)
         here = owner[task]
-        # Somebody near it, or anybody.
-        there = (
-            here if dice.random() < 0.3 else owner[dice.choice(tasks)] if dice.random() < 0.7 else dice.choice(agents)
-        )
+        # Choose the same agent, an agent of a random task, or a random agent.
+        there = here if rng.random() < 0.3 else owner[rng.choice(tasks)] if rng.random() < 0.7 else rng.choice(agents)
         rest = [t for t in now[here] if t != task]
         target = rest if there == here else now[there]
         if len(target) >= mission.capacity:
             continue
         spared = long(here, now[here]) - long(here, rest)
         more, where = insertion(mission.starts[there], [mission.places[t] for t in target], mission.places[task])
-        if more - spared <= 0.0 or dice.random() < math.exp((spared - more) / warmth):
+        if more - spared <= 0.0 or rng.random() < math.exp((spared - more) / warmth):
             now[here] = rest
             now[there] = [*target[:where], task, *target[where:]]
             owner[task] = there
@@ -83,11 +81,11 @@ def _by_ortools(mission: Mission, seconds: float) -> float:
 
     agents, tasks = mission.alive, list(mission.places)
     points = [mission.starts[a] for a in agents] + [mission.places[t] for t in tasks]
-    end = len(points)  # a place that costs nothing to reach: ways are open
+    end = len(points)  # a place without cost: routes are open at their end
     far = [[round(1000.0 * math.dist(p, q)) for q in points] + [0] for p in points] + [[0] * (end + 1)]
     index = pywrapcp.RoutingIndexManager(end + 1, len(agents), list(range(len(agents))), [end] * len(agents))
     model = pywrapcp.RoutingModel(index)
-    # As tables: asked by calls back into Python it finds ways 1 % longer in the same time.
+    # With callbacks into Python instead of tables the routes are 1 % longer in the same time.
     model.SetArcCostEvaluatorOfAllVehicles(model.RegisterTransitMatrix(far))
     load = model.RegisterUnaryTransitVector([int(len(agents) <= place < end) for place in range(end + 1)])
     model.AddDimensionWithVehicleCapacity(load, 0, [mission.capacity] * len(agents), True, "load")

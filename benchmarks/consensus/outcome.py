@@ -1,4 +1,4 @@
-"""Outcome: who has each task of a mission by one strategy, and what it took to agree on that."""
+"""The result of one strategy on a mission: the owner of each task, and the cost of the agreement."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from benchmarks.consensus.talk import Talked, after_meetings
 
 ALL = 100
 FEW = 40
-"""Bids of each agent beyond ``ALL`` agents, where all would be a million."""
+"""Bids of each agent in missions of more than ``ALL`` agents, because all bids would be a million."""
 BID_KB = 0.012
-"""A bid on its way: its task, its cost, and its share of what is around it."""
+"""An encoded bid: its task, its cost, and its share of the message overhead."""
 MEETING_KB = 0.03
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Who has each task; messages and kB are those of an agent, ``cpu_ms`` is of all that reckon."""
+    """The owner of each task; messages and kB are per agent, ``cpu_ms`` is of all computing agents."""
 
     owners: Owners
     messages: float
@@ -29,7 +29,7 @@ class Outcome:
 
 
 def outcome(name: str, mission: Mission, talk: Talked | None = None) -> Outcome:
-    """What a strategy makes of a mission; those that need no gathering by what the agents told each other, if given."""
+    """Return the result of a strategy; strategies without collection use ``talk``, if given."""
     found = gathered(name, mission) if talk is None or name not in TALKED else among_themselves(talk)
     if name != MEETINGS:
         return found
@@ -44,15 +44,15 @@ def outcome(name: str, mission: Mission, talk: Talked | None = None) -> Outcome:
 
 
 def among_themselves(talk: Talked) -> Outcome:
-    """Where the agents agree without a place to gather at; of two that both believe to have a task, the first."""
+    """Return the agreement between the agents; if two agents claim a task, the first one owns it."""
     owners = {task: agents[0] for task, agents in talk.owners.items()}
     return Outcome(owners, talk.messages, talk.octets / 1000.0, talk.rounds, talk.cpu_s * 1000.0)
 
 
 def gathered(name: str, mission: Mission) -> Outcome:
-    """Where bids are gathered at one place and answered: each agent sends one message a time, and gets one.
+    """Return the result with bids collected at one node: each agent sends one message per round, and gets one.
 
-    What nobody bid for is bid for by all who have not, and everything is decided again.
+    Agents bid for tasks without a bid in another round, and everything is decided again.
     """
     most = NAMED.get(name, mission.tasks if mission.agents <= ALL else FEW)
     took, times, holes = 0.0, 0, set[str]()

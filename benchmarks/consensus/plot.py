@@ -1,4 +1,4 @@
-"""Plot: the cost of each strategy against the optimum, a block of bars for each size, in one SVG without a library."""
+"""Draw the cost of each strategy relative to the optimum, a block of bars for each size, as SVG without a library."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ END, BOLD = ' text-anchor="end"', ' font-weight="bold"'
 
 
 def drawn(rows: Sequence[dict[str, Any]]) -> str:
-    """The picture: how much more than the optimum each costs, before and after some agents failed."""
+    """Return the picture: the excess of each strategy over the optimum, before and after failures of agents."""
     parts: list[str] = []
     y = 16
     steps = max(1, math.ceil(max(max(row["ratio"], row["ratio_failed"]) - 1.0 for row in rows) / STEP - 1e-9))

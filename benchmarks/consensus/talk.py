@@ -1,4 +1,4 @@
-"""Talk: the bidders of CBBA among themselves, in rounds, over a graph in which each has four neighbours."""
+"""Run CBBA between the agents in rounds, over a graph in which each agent has four neighbours."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from benchmarks.consensus.mission import SIDE, Mission
 from middleware.consensus.strategies.cbba import exchanged
 
 PAUSE = 5
-"""Rounds between two messages of an agent: what it learns meanwhile goes in one."""
+"""Rounds between two messages of an agent, which combine all its news."""
 FAR = 3.0 * SIDE
 ROUND_S = 0.030
-"""A round is one way through the network: 20 ms and 10 ms more on average."""
+"""A round is one network delay: 20 ms and 10 ms more on average."""
 
 
 @dataclass(frozen=True)
 class Talked:
-    """What came of it: who has each task (or two), and what it took, per agent, in rounds, and of the processor."""
+    """The owners of each task (possibly two), rounds, messages and bytes per agent, and processor time."""
 
     owners: dict[str, list[str]]
     rounds: int
@@ -32,7 +32,7 @@ class Talked:
 
 
 def partners(agent: str, owners: Mapping[str, str], near: Iterable[str], most: int = 16) -> list[str]:
-    """Whom an agent should meet, to swap with: who has the tasks that it would have liked best, ``near`` in order."""
+    """Return candidates for an exchange: the owners of the tasks that the agent prefers, in the order of ``near``."""
     found: dict[str, None] = {}
     for task in near:
         owner = owners.get(task, agent)
@@ -50,16 +50,16 @@ def met(
     costs: Mapping[str, Mapping[str, int]],
     capacities: Mapping[str, int],
 ) -> dict[str, str]:
-    """Who of two agents has each of their tasks after they met: each told the other what those tasks cost it."""
+    """Return the owners of the tasks of two agents after an exchange in which each knows the other's costs."""
     both = {task: agent for task, agent in owners.items() if agent in (one, other)}
     rows = {agent: {task: costs[agent][task] for task in both if task in costs[agent]} for agent in (one, other)}
     return exchanged(both, rows, capacities)
 
 
 def after_meetings(mission: Mission, owners: dict[str, str]) -> tuple[dict[str, str], float]:
-    """Who has each task after agents have met two by two until no meeting helps, and the messages of each agent.
+    """Return the owners after pairwise exchanges until none improves the cost, and the messages of each agent.
 
-    A meeting is a message there and one back; who has met without success meets the same again only after a change.
+    An exchange is one message in each direction; a pair without success repeats it only after a change.
     """
     room = dict.fromkeys(mission.alive, mission.capacity)
     near = {agent: [task for _, task in ways] for agent, ways in mission.near.items()}
@@ -90,11 +90,11 @@ def after_meetings(mission: Mission, owners: dict[str, str]) -> tuple[dict[str, 
 
 
 def neighbours(names: list[str], seed: int) -> dict[str, list[str]]:
-    """Four of each, or all where there are fewer: two rings through all in random order, so all are connected."""
-    dice = random.Random(f"graph/{seed}")
+    """Return the neighbours of each agent: two random rings through all agents, so the graph is connected."""
+    rng = random.Random(f"graph/{seed}")
     found: dict[str, set[str]] = {name: set() for name in names}
     for _ in range(2):
-        ring = dice.sample(names, len(names))
+        ring = rng.sample(names, len(names))
         for one, other in zip(ring, ring[1:] + ring[:1], strict=True):
             if one != other:
                 found[one].add(other)
@@ -103,18 +103,18 @@ def neighbours(names: list[str], seed: int) -> dict[str, list[str]]:
 
 
 def score_of(costs: dict[str, int]) -> Score:
-    """Nearer is worth more, and what is in the bundle already makes no difference."""
+    """Return a score that decreases with the distance and does not depend on the bundle."""
     worth = {task: FAR - cost * 1e-6 for task, cost in costs.items()}
     return lambda bundle, task: worth[task]
 
 
 def talked(mission: Mission, pause: int = PAUSE, loss: float = 0.0, quiet: int | None = None) -> Talked:
-    """Let the bidders of a mission talk until nobody has anything to say, or has had nothing for ``quiet`` rounds.
+    """Run the bidders of a mission until no messages are left, or none were sent for ``quiet`` rounds.
 
-    A message that is lost is sent again in the next round, since it is not acknowledged.
+    A lost message is sent again in the next round, because it is not acknowledged.
     """
     graph = neighbours(mission.alive, mission.seed)
-    dice = random.Random(f"loss/{mission.seed}")
+    rng = random.Random(f"loss/{mission.seed}")
     began = time.process_time()
     bidders = {
         name: Bidder(name, mission.places, score_of(mission.costs[name]), mission.capacity, graph[name])
@@ -128,7 +128,7 @@ def talked(mission: Mission, pause: int = PAUSE, loss: float = 0.0, quiet: int |
         rounds += 1
         arriving, on_the_way = on_the_way, []
         for sender, taker, said in arriving:
-            if loss and dice.random() < loss:
+            if loss and rng.random() < loss:
                 on_the_way.append((sender, taker, said))
             elif corrections := bidders[taker].hear(sender, said):
                 on_the_way.append((taker, sender, tuple(corrections)))
@@ -152,5 +152,5 @@ def talked(mission: Mission, pause: int = PAUSE, loss: float = 0.0, quiet: int |
 
 
 def packed(said: tuple[Statement, ...]) -> bytes:
-    """A message as it would travel: tasks and agents by their number in the epoch."""
+    """Encode a message: tasks and agents by their number in the epoch."""
     return bytes(msgpack.packb([(int(s.task[1:]), int(s.agent[1:]), s.version, s.bid) for s in said]))

@@ -1,1 +1,1 @@
-"""The peer-to-peer library beside others of its kind, measured in one run: ``python -m benchmarks.dht``."""
+"""Compare the peer-to-peer library with other DHT libraries in one run: ``python -m benchmarks.dht``."""

@@ -1,4 +1,4 @@
-"""The door: ``python -m benchmarks.dht [--nodes 8,32] [--seconds 5] [--peers ...] [--out FILE] [--plot FILE]``."""
+"""Run ``python -m benchmarks.dht [--nodes 8,32] [--seconds 5] [--peers ...] [--out FILE] [--plot FILE]``."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ ENDED = 130
 
 
 async def run(course: Course, part: str) -> None:
-    """One part of the comparison, with a team of its own."""
+    """Run one part of the comparison with a separate team."""
     if part != "steady":
         await lost(course, is_silent=part == "silent")
     elif await course.steady():
@@ -37,7 +37,7 @@ async def run(course: Course, part: str) -> None:
 
 
 async def measured(entry: Entry, size: int, plan: Plan, parts: Sequence[str], result: Result) -> None:
-    """Everything of one library at one size; ``result`` has what was reached, however it ends."""
+    """Measure one library at one size; ``result`` has the figures obtained, also after an error."""
     task = asyncio.current_task()
     assert task is not None
     asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, task.cancel)

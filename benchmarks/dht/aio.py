@@ -1,4 +1,4 @@
-"""AsyncioPeer: what the contestants share whose loop is asyncio's, or whose own threads call back into it."""
+"""Base class of the contestants with an asyncio loop, or with threads that call back into it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from benchmarks.dht.contestant import Done, Got, Prevent
 
 
 class AsyncioPeer:
-    """The loop of a contestant; a library with threads of its own comes in through ``soon``."""
+    """The loop of a contestant; a library's own threads use ``soon``."""
 
     def __init__(self, folder: str) -> None:
         self._tasks: set[asyncio.Task[Any]] = set()
@@ -26,15 +26,15 @@ class AsyncioPeer:
         asyncio.run(forever())
 
     def soon(self, call: Callable[..., object], *arguments: object) -> None:
-        """Call from any thread into the loop."""
+        """Schedule a call in the loop from any thread."""
         self._loop.call_soon_threadsafe(call, *arguments)
 
     def later(self, seconds: float, call: Callable[..., object], *arguments: object) -> Prevent:
-        """Call after ``seconds``."""
+        """Schedule a call after ``seconds``."""
         return self._loop.call_later(seconds, call, *arguments).cancel
 
     def fork(self, work: Coroutine[Any, Any, Any], done: Callable[[Any], object]) -> None:
-        """Run ``work`` and call ``done`` with its result, None where it failed."""
+        """Run ``work`` and call ``done`` with its result, or None after an error."""
         task = self._loop.create_task(work)
         self._tasks.add(task)
 
@@ -45,17 +45,17 @@ class AsyncioPeer:
         task.add_done_callback(ended)
 
     def holds(self, keys: list[str]) -> list[bool | None]:
-        """Say that it is not known, unless the library tells."""
+        """Return None for unknown, unless the library can tell."""
         return [None] * len(keys)
 
     def watch(self, key: str, heard: Got, done: Callable[[], None]) -> None:
-        """Raise, unless the library has it."""
+        """Raise ``NotImplementedError``, unless the library has watches."""
         raise NotImplementedError("this library has no watch")
 
     def space(self, verb: str, fields: list[object], limit_s: float, done: Done) -> None:
-        """Raise: none of these libraries has it."""
+        """Raise ``NotImplementedError``: none of these libraries has a tuple space."""
         raise NotImplementedError("this library has no tuple space")
 
     def lose(self, share: float) -> None:
-        """Raise: their sockets are out of reach."""
+        """Raise ``NotImplementedError``: their sockets are not accessible."""
         raise NotImplementedError("the datagrams of this library are out of reach")

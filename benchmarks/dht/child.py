@@ -1,7 +1,7 @@
-"""Child: one node in one process; it does what it is told in JSON lines, and measures its own operations.
+"""Run one node in one process; it executes orders in JSON lines, and measures its own operations.
 
-``python -m benchmarks.dht.child NAME FOLDER``.  The same code gives orders, takes times and keeps the load up for every
-library, so that a difference between two of them is theirs.
+Started as ``python -m benchmarks.dht.child NAME FOLDER``. The same code executes orders, measures times and generates
+the load for every library, so differences between results come from the libraries.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ TRY_S = 2.0
 
 
 class Child:
-    """Carries out orders on ``node`` and answers each on ``out`` by its id."""
+    """Execute orders on ``node``, and answer each on ``out`` by its id."""
 
     def __init__(self, node: Contestant, out: TextIO) -> None:
         self._node = node
@@ -35,14 +35,14 @@ class Child:
         self._profile: Any = None
 
     def begin(self) -> None:
-        """Read orders from now on."""
+        """Start to read orders."""
         threading.Thread(target=self._read, daemon=True).start()
         self._answer({"id": 0})
 
     def _read(self) -> None:
         for line in sys.stdin:
             self._node.soon(self._obey, json.loads(line))
-        # Whoever gave the orders is gone, perhaps without a word.
+        # The parent has exited, perhaps without a message.
         os._exit(0)
 
     def _obey(self, order: Order) -> None:
@@ -59,7 +59,7 @@ class Child:
     # -- orders -----------------------------------------------------------------------------------------------------
 
     def _do_start(self, order: Order) -> None:
-        """Join; with ``wanted``, a key that is there already, take the time until it has been read."""
+        """Join; with an existing key ``wanted``, measure the time until it has been read."""
         began = time.monotonic()
         wanted = order.get("wanted")
 
@@ -81,23 +81,23 @@ class Child:
         self._node.start(order["port"], order["known"], joined)
 
     def _do_once(self, order: Order) -> None:
-        """One operation; ``moment`` is its beginning, on the clock that all processes of a machine share."""
+        """Execute one operation; ``moment`` is its start, on the clock that all processes of a machine share."""
         moment = time.monotonic()
 
         def done(is_good: bool, ms: float) -> None:
             self._answer(order, good=is_good, ms=ms, moment=moment)
 
         key, value = order["key"], order["value"]
-        # A long value is named by its length: reader and writer make the same one out of the key.
+        # A long value is represented by its length: reader and writer generate it from the key.
         data = random.Random(key).randbytes(value) if isinstance(value, int) else bytes.fromhex(value)
         self._timed(order["kind"], key, data, order["limit_s"], done)
 
     def _do_load(self, order: Order) -> None:
-        """Keep operations in flight: each item ``once``, or all of them again and again for ``seconds``."""
+        """Keep operations in flight: each item ``once``, or all of them repeatedly for ``seconds``."""
         Load(self._timed, self._node.later, order, lambda **fields: self._answer(order, **fields)).fill()
 
     def _do_space(self, order: Order) -> None:
-        """One operation on the tuple space; ``moments`` are its beginning and its end."""
+        """Execute one operation on the tuple space; ``moments`` are its start and end."""
         began = time.monotonic()
 
         def done(is_good: bool) -> None:
@@ -107,7 +107,7 @@ class Child:
         self._node.space(order["verb"], order["fields"], order["limit_s"], done)
 
     def _do_watch(self, order: Order) -> None:
-        """Note the moment at which each value of a key comes."""
+        """Record the time at which each value of a key arrives."""
         value = bytes.fromhex(order["value"])
         moments = self._heard.setdefault(order["key"], [])
 
@@ -128,7 +128,7 @@ class Child:
         self._answer(order)
 
     def _do_profile(self, order: Order) -> None:
-        """Begin a profile of the loop's thread, or end it and write it to ``file``."""
+        """Start a profile of the loop's thread, or stop it and write it to ``file``."""
         import cProfile
 
         if order["file"]:
@@ -155,9 +155,9 @@ class Child:
 
 
 def main(name: str, folder: str) -> None:
-    """Be a node until the orders end."""
+    """Run a node until the orders end."""
     logging.disable(logging.CRITICAL)
-    # The orders own the real stdout; what a library prints goes the way of errors.
+    # Only orders use the real stdout; output of libraries goes to stderr.
     out = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
     node = ENTRIES[name].made(folder)

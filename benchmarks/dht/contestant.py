@@ -1,4 +1,4 @@
-"""Contestant: who is measured, what it promises, and what a node of it must be able to do."""
+"""The contestants: their guarantees, and the interface of a node."""
 
 from __future__ import annotations
 
@@ -17,49 +17,49 @@ Prevent = Callable[[], None]
 
 
 class Contestant(Protocol):
-    """One node of one library, in a process of its own; every callback runs in the library's own loop.
+    """One node of one library, in a separate process; every callback runs in the library's loop.
 
-    What a library cannot do raises ``NotImplementedError``.
+    Unsupported operations raise ``NotImplementedError``.
     """
 
     def run(self, begin: Callable[[], None]) -> None:
-        """Run the loop for good, with ``begin`` called inside it once."""
+        """Run the loop forever, and call ``begin`` inside it once."""
 
     def soon(self, call: Callable[..., object], *arguments: object) -> None:
-        """Call from any thread into the loop."""
+        """Schedule a call in the loop from any thread."""
 
     def later(self, seconds: float, call: Callable[..., object], *arguments: object) -> Prevent:
-        """Call after ``seconds``; returns what prevents it."""
+        """Schedule a call after ``seconds``; return a function that cancels it."""
 
     def start(self, port: int, known: int, done: Callable[[], None]) -> None:
-        """Build the node on ``port`` and join through the port ``known`` (0: be the first); ``done`` when joined."""
+        """Build the node on ``port`` and join through the port ``known`` (0: first node); call ``done`` when joined."""
 
     def put(self, key: str, value: bytes, done: Done) -> None:
-        """Store, and say whether the library calls it stored."""
+        """Store; call back with whether the library reports the value as stored."""
 
     def get(self, key: str, value: bytes, done: Got) -> None:
-        """Read; ``value`` is only for libraries whose key is the hash of the value."""
+        """Read; only libraries whose key is the hash of the value use ``value``."""
 
     def holds(self, keys: list[str]) -> list[bool | None]:
-        """Whether this node itself holds each of ``keys``; None where the library does not tell.  Asked while idle."""
+        """Return whether this node stores each of ``keys``, None if the library cannot tell. Called while idle."""
 
     def watch(self, key: str, heard: Got, done: Callable[[], None]) -> None:
-        """Call ``heard`` with each new value of ``key``; ``done`` when the watch stands."""
+        """Call ``heard`` with each new value of ``key``; call ``done`` when the watch is active."""
 
     def space(self, verb: str, fields: list[object], limit_s: float, done: Done) -> None:
-        """Do ``verb`` in the tuple space, for ``limit_s`` at most; in a template None stands for any whole number."""
+        """Execute ``verb`` in the tuple space, within ``limit_s``; in a template None stands for any integer."""
 
     def lose(self, share: float) -> None:
-        """Lose this share of the datagrams that are sent from now on."""
+        """Drop this share of the datagrams sent from now on."""
 
 
 @dataclass(frozen=True)
 class Entry:
     """One column of the comparison.
 
-    ``package`` is what must be importable; ``promise`` is what a finished put means; ``largest`` is the longest value
-    that the library says it carries, in bytes; ``survives`` says of a store on disk if it is safe from less
-    than a loss of power; ``can`` names what it has beside put and get.
+    ``package`` is the module that must be importable; ``promise`` is the guarantee of a finished put; ``largest`` is
+    the documented maximum length of a value in bytes; ``survives`` names the failures that a store on disk survives, if
+    it does not survive a loss of power; ``can`` names its features in addition to put and get.
     """
 
     name: str
@@ -76,17 +76,17 @@ class Entry:
 
     @property
     def behind(self) -> str:
-        """What stands behind its figures: encryption, disk."""
+        """The encryption and storage of the library."""
         disk = f"SQLite{self.survives}" if self.is_on_disk else "memory"
         return f"{'sealed' if self.is_sealed else 'clear text'}, {disk}"
 
     @property
     def is_installed(self) -> bool:
-        """Whether its library can be imported."""
+        """Return whether its library can be imported."""
         return importlib.util.find_spec(self.package) is not None
 
     def made(self, folder: str) -> Contestant:
-        """A node; ``folder`` is for its files."""
+        """Create a node; ``folder`` is for its files."""
         maker = getattr(importlib.import_module(f"benchmarks.dht.{self.module}"), self.maker)
         contestant: Contestant = maker(folder, *self.options)
         return contestant
@@ -114,7 +114,7 @@ ENTRIES = {
 
 
 def chosen(words: str) -> list[Entry]:
-    """The entries that ``words`` (with commas) name: "opendht" with its variants; raises ``ValueError``."""
+    """Return the entries named by ``words`` (comma-separated): "opendht" with its variants; raises ``ValueError``."""
     found: dict[str, Entry] = {}
     for word in words.split(","):
         named = {n: e for n, e in ENTRIES.items() if word == n or word == n.partition("-")[0]}

@@ -1,7 +1,7 @@
-"""Course: what every library is put through while all its nodes are well, in phases that are bounded in time.
+"""The workload of every library while all its nodes are healthy, in phases with time limits.
 
-Each phase writes its figures into the result as it goes; what ends a phase early stands there under "trouble", and the
-next one begins.
+Each phase adds its figures to the result; the reason for an early end of a phase is stored under "trouble", and the
+next phase starts.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ READ_S = 3.0
 PHASE_S = 60.0
 VALUE_BYTES = 100
 LEAST_FAR = 0.1
-"""The share of keys that a node must not hold to be loaded with these alone."""
+"""Minimum share of keys that a node does not store, to use only such keys as its load."""
 
 Result = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class Plan:
-    """How much is done: ``seconds`` of each load, ``keys`` single operations; ``seed`` draws who does what.
+    """Size of the workload: ``seconds`` of each load, ``keys`` single operations; ``seed`` selects the nodes.
 
-    A short load makes the pauses before it short as well.
+    A short load also shortens the pauses before it.
     """
 
     keys: int = 200
@@ -47,16 +47,16 @@ class Plan:
     profile: str = ""
 
     def pause(self, seconds: float) -> float:
-        """``seconds`` of rest, fewer in a short run."""
+        """Return a pause of ``seconds``, shorter in a short run."""
         return min(seconds, self.seconds)
 
     def share(self, count: int) -> int:
-        """``count`` of something, fewer in a run with few keys."""
+        """Return ``count``, or less in a run with few keys."""
         return max(2, min(count, count * self.keys // 200))
 
 
 class Course:
-    """One run of one team; ``result`` is filled phase by phase."""
+    """One run of one team; each phase adds to ``result``."""
 
     def __init__(self, team: Team, plan: Plan, result: Result) -> None:
         self.team = team
@@ -68,7 +68,7 @@ class Course:
 
     @asynccontextmanager
     async def phase(self, name: str, limit_s: float = PHASE_S) -> AsyncIterator[None]:
-        """Bound a phase in time, and note what ended it early."""
+        """Limit the time of a phase, and record the reason of an early end."""
         try:
             async with asyncio.timeout(limit_s):
                 yield
@@ -77,12 +77,12 @@ class Course:
         except TimeoutError:
             self.result.setdefault("trouble", {})[name] = f"not through within {limit_s:g} s"
 
-    # -- what phases are made of ------------------------------------------------------------------------------------
+    # -- parts of phases ----------------------------------------------------------------------------------------------
 
     async def begin(self, nodes: list[Node]) -> None:
-        """Start these nodes one after the other, each known to the first one, and wait until all are of use.
+        """Start these nodes one after the other with the first one as contact, and wait until all work.
 
-        Some libraries say that they joined, and that a value is stored, while nobody else can find it yet.
+        Some libraries report a join or a stored value before other nodes can find it.
         """
         first = self.nodes[0]
         for node in nodes:
@@ -92,7 +92,7 @@ class Course:
             await self.stored(node, nodes[number - 1], f"ready {number}")
 
     async def stored(self, writer: Node, reader: Node, key: str) -> tuple[str, str]:
-        """Store a new value that another node finds, with patience: its key and value; raises ``Lost``."""
+        """Store a new value, with retries, until another node finds it; return its key and value; raises ``Lost``."""
         for number in range(TRIES):
             value = self.value()
             put = await self.once(writer, "put", f"{key} try {number}", value)
@@ -102,11 +102,11 @@ class Course:
         raise Lost(f"what the node on port {writer.port} puts is not found by others")
 
     async def once(self, node: Node, kind: str, key: str, value: str | int, limit_s: float = LIMIT_S) -> Result:
-        """One operation."""
+        """Execute one operation."""
         return await node.order("once", limit_s + 5.0, kind=kind, key=key, value=value, limit_s=limit_s)
 
     async def singles(self, kind: str, works: list[tuple[Node, str, str]]) -> Result:
-        """One operation after the other, each at its node."""
+        """Execute one operation after the other, each at its node."""
         took, failed = [], 0
         ends_at = time.monotonic() + SINGLE_S
         meter = Meter(self.team.pids)
@@ -123,18 +123,18 @@ class Course:
     async def loaded(
         self, node: Node, kind: str, items: list[tuple[str, str]], in_flight: int, seconds: float, once: bool
     ) -> Result:
-        """Many operations of one node at a time."""
+        """Execute many operations of one node concurrently."""
         order = {"kind": kind, "items": items, "in_flight": in_flight, "seconds": seconds, "once": once}
         return await node.order("load", seconds + LIMIT_S, **order, limit_s=LIMIT_S)
 
     def value(self) -> str:
-        """A new value."""
+        """Return a new value."""
         return self.rng.randbytes(VALUE_BYTES).hex()
 
     # -- phases -----------------------------------------------------------------------------------------------------
 
     async def steady(self) -> bool:
-        """Join, rest, single operations, operations in flight, memory; False where not even joining went well."""
+        """Join, rest, single operations, concurrent operations, memory; return False if the join failed."""
         joiners = min(JOINERS, len(self.nodes) - 2)
         async with self.phase("join", 3 * PHASE_S):
             await self.begin(self.nodes[: len(self.nodes) - joiners])
@@ -156,7 +156,7 @@ class Course:
         return True
 
     async def _joined(self, joiners: int) -> list[float | None]:
-        """Time for each of the last nodes until it has read a key that was there before it."""
+        """Measure for each of the last nodes the time until it has read an existing key."""
         old = self.nodes[: len(self.nodes) - joiners]
         took: list[float | None] = []
         for number, node in enumerate(self.nodes[len(old) :]):
@@ -178,7 +178,7 @@ class Course:
         }
 
     async def _single(self, items: list[tuple[str, str]]) -> list[list[bool | None]]:
-        """Put and get one at a time; returns who holds what."""
+        """Put and get one at a time; return the keys that each node stores."""
         nodes, count = self.nodes, range(len(self.nodes))
         writers = [self.rng.choice(count) for _ in items]
         works = [(nodes[w], *item) for w, item in zip(writers, items, strict=True)]
@@ -197,10 +197,10 @@ class Course:
         return held
 
     async def _load(self, items: list[tuple[str, str]], held: list[list[bool | None]]) -> None:
-        """As many operations as one node gets through, so many at a time."""
+        """Measure the operations that one node completes with that many in flight."""
         loaded = self.nodes[len(self.nodes) // 2]
         mine = held[len(self.nodes) // 2]
-        # In a small network a node holds everything, or all but a few: then its reads are local ones.
+        # In a small network a node stores all or nearly all keys: then its reads are local ones.
         far = [item for n, item in enumerate(items) if mine[n] is not True]
         if len(far) < len(items) * LEAST_FAR:
             far = items
@@ -223,12 +223,12 @@ class Course:
             }
 
     async def _profile(self, loaded: Node, kind: str = "") -> None:
-        """Begin to profile the loaded node and another one, or write what was seen."""
+        """Start to profile the loaded node and another one, or write the profiles."""
         prefix = f"{self.plan.profile}-{self.team.entry.name}-{len(self.nodes)}"
         for node, name in ((loaded, "loaded"), (self.nodes[0], "other")) if self.plan.profile else ():
             await node.order("profile", file=kind and f"{prefix}-{name}.{kind}")
 
 
 def times(took: list[float]) -> Result:
-    """What is said of a list of milliseconds."""
+    """Return statistics of a list of milliseconds."""
     return {"p50": percentile(took, 50), "p95": percentile(took, 95), "max": max(took, default=None)}

@@ -1,4 +1,4 @@
-"""Figure: the rows of the comparison, and how each is read out of a result."""
+"""The rows of the comparison, and the functions that read them from a result."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Read = Callable[[Result], float | None]
 
 
 def at(*path: str) -> Read:
-    """The reader of the number at the end of ``path``."""
+    """Return a function that reads the number at ``path``."""
 
     def read(result: Result) -> float | None:
         found: Any = result
@@ -24,7 +24,7 @@ def at(*path: str) -> Read:
 
 
 def percent(*path: str) -> Read:
-    """The reader of a share, in percent."""
+    """Return a function that reads a share, in percent."""
     share = at(*path)
 
     def read(result: Result) -> float | None:
@@ -35,12 +35,12 @@ def percent(*path: str) -> Read:
 
 
 def joined(result: Result) -> float | None:
-    """The median time to join, of those that did."""
+    """Return the median time to join, of the nodes that joined."""
     return percentile([ms for ms in result.get("join_ms", []) if ms is not None], 50)
 
 
 def slowest(result: Result) -> float | None:
-    """The longest operation that ended well, under load and losses included, in ms."""
+    """Return the longest successful operation, under load and losses included, in ms."""
     names = (("put",), ("get",), ("gets",), ("puts",), *((a, b) for a in LOSSES for b in PARTS))
     found = [ms for name in names if (ms := at(*name, "max")(result)) is not None]
     return max(found) if found else None

@@ -1,4 +1,4 @@
-"""KademliaPeer: a node of the ``kademlia`` package as it comes (k = 20, 5 s per request, store in memory)."""
+"""A node of the ``kademlia`` package with default settings (k = 20, 5 s per request, store in memory)."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class KademliaPeer(AsyncioPeer):
         self.fork(self._server.set(key, value), lambda ok: done(bool(ok)))
 
     def get(self, key: str, value: bytes, done: Got) -> None:
-        """Read; from the own store where that has it."""
+        """Read; from the own store if it has the key."""
         self.fork(self._server.get(key), done)
 
     def holds(self, keys: list[str]) -> list[bool | None]:

@@ -1,7 +1,7 @@
-"""LibtorrentPeer: a node of libtorrent's DHT with immutable items (BEP 44: the key is the hash of the value).
+"""A node of libtorrent's DHT with immutable items (BEP 44: the key is the hash of the value).
 
-All nodes share one address here, which the library forbids by default: those two bars and the flood blocker are always
-lifted, or there would be no network.
+All nodes share one address here, which the library forbids by default: these two restrictions and the flood blocker are
+always off, otherwise there would be no network.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from benchmarks.dht.contestant import HOST, Done, Got
 
 
 class LibtorrentPeer(AsyncioPeer):
-    """A contestant; "free" lifts the default of 8,000 bytes a second that the DHT may send."""
+    """A contestant; "free" removes the default limit of 8,000 bytes a second for the DHT."""
 
     def __init__(self, folder: str, limits: str = "") -> None:
         super().__init__(folder)
@@ -41,7 +41,7 @@ class LibtorrentPeer(AsyncioPeer):
         self._joined: Callable[[], None] | None = None
 
     def start(self, port: int, known: int, done: Callable[[], None]) -> None:
-        """Open a session and wait for its word that the DHT is there (the first node never gets one)."""
+        """Open a session and wait until it reports the DHT as started (the first node reports nothing)."""
         self._joined = done
         self._settings["listen_interfaces"] = f"{HOST}:{port}"
         if known:
@@ -63,7 +63,7 @@ class LibtorrentPeer(AsyncioPeer):
         self._session.dht_get_immutable_item(libtorrent.sha1_hash(target))
 
     def holds(self, keys: list[str]) -> list[bool | None]:
-        """Say no: its reads never come out of the own store."""
+        """Return False for all keys: reads never come from the own store."""
         return [False] * len(keys)
 
     def _is_up(self) -> None:

@@ -1,4 +1,4 @@
-"""Load: operations of one node kept in flight, and what became of each."""
+"""Keep operations of one node in flight, and count the results."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from collections.abc import Callable
 from typing import Any
 
 BREATH = 64
-"""Operations begun in one go; answers out of the own store come at once, and the loop must turn meanwhile."""
+"""Operations started in one turn; answers from the own store are immediate, and the loop must run in between."""
 
 
 class Load:
-    """Keeps ``order["in_flight"]`` operations open for ``order["seconds"]``, each item ``once`` or round and round.
+    """Keep ``order["in_flight"]`` operations open for ``order["seconds"]``, each item ``once`` or repeatedly.
 
-    Good is only what ended well and in time: what never began, or was still open at the end, is not ("done" names
-    those that were good where each item comes once).
+    An operation is good only if it ended successfully and in time; an operation that was not started, or was open at
+    the end, is not ("done" names the good ones if each item is used once).
     """
 
     def __init__(
@@ -42,7 +42,7 @@ class Load:
         later(order["seconds"] + 0.05, self._end)
 
     def fill(self) -> None:
-        """Begin as many operations as may be in flight."""
+        """Start as many operations as may be in flight."""
         if self._filling or self._ended:
             return
         self._filling = True

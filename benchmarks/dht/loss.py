@@ -1,7 +1,7 @@
-"""Loss: reads at once after a quarter of the nodes is gone, and again after half of them is.
+"""Read directly after the failure of a quarter of the nodes, and again after the failure of a half.
 
-Killed nodes leave a closed port behind, and loopback tells so, which no real outage does; silent ones (stopped) just
-answer no more, as a robot out of range or out of battery.
+A killed node leaves a closed port, which loopback reports at once, unlike a real outage; a silent (stopped) node does
+not answer, like a robot out of range or without power.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ IN_FLIGHT = 10
 LOSS_S = 30.0
 WRITERS = 4
 LEAST = 8
-"""With fewer nodes half of them is too few to speak of."""
+"""In a smaller network half of the nodes is too few for a meaningful result."""
 
 
 async def lost(course: Course, is_silent: bool) -> None:
-    """Store, lose, read; the figures stand under the number of nodes that are gone."""
+    """Store, fail nodes, read; the figures are stored under the number of failed nodes."""
     nodes, plan = course.nodes, course.plan
     async with course.phase("store", 180.0):
         await course.begin(nodes)
         items = [(f"loss {n}", course.value()) for n in range(plan.keys)]
         parts = [course.loaded(nodes[n], "put", items[n::WRITERS], 2, SINGLE_S, once=True) for n in range(WRITERS)]
         done = {key for outcome in await asyncio.gather(*parts) for key in outcome["done"]}
-        # Only what the library called stored may be missed afterwards, not what it never came to.
+        # Only values that the library reported as stored can count as missing.
         stored = [item for item in items if item[0] in done]
         course.result["stored"] = len(stored)
         await asyncio.sleep(plan.pause(1.0))

@@ -1,4 +1,4 @@
-"""Meter: what the kernel counts: processor time, memory, datagrams.  Linux only: the figures come from ``/proc``."""
+"""Kernel counters: processor time, memory, datagrams. Linux only: the figures come from ``/proc``."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from benchmarks.measure import TICKS, maps_mib, udp_count
 
 
 def percentile(values: list[float], percent: float) -> float | None:
-    """The value below which ``percent`` of ``values`` lie (nearest rank); None of nothing."""
+    """Return the value below which ``percent`` of ``values`` lie (nearest rank); None for no values."""
     ordered = sorted(values)
     return ordered[min(len(ordered) - 1, round(percent / 100 * (len(ordered) - 1)))] if ordered else None
 
 
 def cpu_s(pids: Iterable[int]) -> float:
-    """The seconds that the threads of these processes have run; one that has ended counts nothing."""
+    """Return the processor seconds of the threads of these processes; ended threads do not count."""
     total = 0
     for pid in pids:
         for file in Path(f"/proc/{pid}/task").glob("*/schedstat"):
@@ -30,20 +30,20 @@ def cpu_s(pids: Iterable[int]) -> float:
 
 
 def memory_mib(pid: int) -> tuple[float, float]:
-    """Resident memory of a process, and the part of it that is its own (RSS, USS)."""
+    """Return the resident memory of a process, and its private part (RSS, USS)."""
     mib = maps_mib(pid)
     return mib["Rss"], mib["Private_Clean"] + mib["Private_Dirty"]
 
 
 def busy_s() -> float:
-    """The seconds that all processors together were busy with anything."""
+    """Return the busy seconds of all processors together."""
     fields = [int(field) for field in Path("/proc/stat").read_text().splitlines()[0].split()[1:9]]
     return (sum(fields) - fields[3] - fields[4]) / TICKS
 
 
 @dataclass
 class Cost:
-    """What a phase has used; ``foreign`` is the share of the machine that others took, the noise of the figures."""
+    """The resources of a phase; ``foreign`` is the share of the machine that other processes used."""
 
     seconds: float = 1.0
     cpu_s: float = 0.0
@@ -52,7 +52,7 @@ class Cost:
     foreign: float = 0.0
 
     def per(self, operations: int, idle: Cost) -> dict[str, float]:
-        """The cost of one operation, without what an idle network spends in that time."""
+        """Return the cost of one operation, without the consumption of an idle network in that time."""
         noise = {"dropped": self.dropped, "foreign": self.foreign}
         if not operations:
             return noise
@@ -65,14 +65,14 @@ class Cost:
 
 
 class Meter:
-    """Counts from its making to ``read``."""
+    """Count from creation to ``read``."""
 
     def __init__(self, pids: list[int]) -> None:
         self._pids = pids
         self._start = self._now()
 
     def read(self) -> Cost:
-        """The cost since the beginning."""
+        """Return the cost since the creation."""
         seconds, cpu, own, sent, dropped, busy = (b - a for a, b in zip(self._start, self._now(), strict=True))
         foreign = (busy - cpu - own) / seconds / (os.cpu_count() or 1)
         return Cost(seconds, cpu, sent, dropped, max(0.0, foreign))

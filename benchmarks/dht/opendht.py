@@ -1,4 +1,4 @@
-"""OpenDhtPeer: a node of OpenDHT through its own Python binding, with its request limits or without."""
+"""A node of OpenDHT through its Python binding, with its request limits or without."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from benchmarks.dht.aio import AsyncioPeer
 from benchmarks.dht.contestant import HOST, Done, Got
 
 LISTENS_AFTER_S = 0.5
-"""The binding does not tell when a listen stands with its replicas."""
+"""The binding does not report when the replicas have registered a listen."""
 
 
 class OpenDhtPeer(AsyncioPeer):
-    """A contestant; "free" lifts the limits on requests a second, which all nodes of one address share."""
+    """A contestant; "free" removes the limits on requests per second, which all nodes of one address share."""
 
     def __init__(self, folder: str, limits: str = "") -> None:
         super().__init__(folder)
@@ -25,7 +25,7 @@ class OpenDhtPeer(AsyncioPeer):
         self._kept: list[Any] = []
 
     def start(self, port: int, known: int, done: Callable[[], None]) -> None:
-        """Run the node's threads; the library does not tell when it has joined."""
+        """Start the node's threads; the library does not report when it has joined."""
         self._node = opendht.DhtRunner()
         self._node.run(port=port, ipv4=HOST, ipv6="", config=self._config)
         if known:
@@ -37,7 +37,7 @@ class OpenDhtPeer(AsyncioPeer):
         self._node.put(opendht.InfoHash.get(key), opendht.Value(value), lambda ok, nodes: self.soon(done, ok))
 
     def get(self, key: str, value: bytes, done: Got) -> None:
-        """Read the first value that comes, and end the search with it."""
+        """Read the first value that arrives, and end the search."""
         is_open = True
 
         def finish(result: bytes | None) -> None:
@@ -64,6 +64,6 @@ class OpenDhtPeer(AsyncioPeer):
         self.later(LISTENS_AFTER_S, done)
 
     def holds(self, keys: list[str]) -> list[bool | None]:
-        """Look into the log of the store; the binding holds Python's lock meanwhile, so never under load."""
+        """Read the log of the store; the binding holds Python's lock meanwhile, so never under load."""
         log = self._node.getStorageLog()
         return [str(opendht.InfoHash.get(key)) in log for key in keys]

@@ -1,4 +1,4 @@
-"""Plot: the main figures as horizontal bars in one SVG, without a library."""
+"""Draw the main figures as horizontal bars in one SVG, without a library."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ OWN, OTHER = "#2563a8", "#9aa3ad"
 
 
 def drawn(results: Mapping[str, Mapping[str, Result]]) -> str:
-    """The picture: a block for each figure and size; each block has its own scale."""
+    """Return the picture: a block for each figure and size; each block has a separate scale."""
     reads = dict(ROWS)
     parts: list[str] = []
     y = 10

@@ -1,4 +1,4 @@
-"""Report: the figures as a table, with the ratio of our node to each peer, and the targets."""
+"""Format the figures as a table, with the ratio of this library to each other one, and the targets."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ WORDS = {True: "yes", False: "NO", None: "?"}
 
 
 def table(results: Results) -> str:
-    """Everything that is printed at the end; "x0.50" beside a peer's figure says that ours is half of it."""
+    """Return the printed report; "x0.50" next to a figure: this library's value is half of it."""
     blocks = [_size(size, row) for size, row in results.items()]
     blocks += [_targets(size, row) for size, row in list(results.items())[-1:] if OURS in row or OURS_IN_MEMORY in row]
     names = [name for name in ENTRIES if any(name in row for row in results.values())]

@@ -1,4 +1,4 @@
-"""Space: the tuple space, which only this library has: what its verbs cost, and whether they keep their word."""
+"""Measure and check the tuple space, which only this library has."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ RACES = 10
 TAKERS = 4
 SPACE_S = 5.0
 ASLEEP_S = 0.3
-"""How long a node waits for a tuple before it is put."""
+"""Seconds for which a node waits for a tuple before the put."""
 
 Fields = list[object]
 
 
 async def space(course: Course) -> None:
-    """Put, read and take one tuple at a time; tuples of many writers at once; wake-ups; contested takes."""
+    """Put, read and take one tuple at a time; concurrent tuples of many writers; wake-ups; contested takes."""
     if "space" not in course.team.entry.can:
         return
     count = course.plan.share(OUTS)
@@ -55,7 +55,7 @@ async def _singles(course: Course, verb: str, works: list[Fields]) -> Result:
 
 
 async def _crowd(course: Course) -> Result:
-    """Tuples that random nodes put back to back, and how many of them are found right after."""
+    """Put tuples at random nodes without pauses, and count the tuples that are found directly after."""
     count = course.plan.share(CROWD)
     await asyncio.gather(*(_do(course.rng.choice(course.nodes), "put", ["crowd", n, 7]) for n in range(count)))
     asked = [await _do(course.rng.choice(course.nodes), "read_if_exists", ["crowd", n, None]) for n in range(count)]
@@ -63,7 +63,7 @@ async def _crowd(course: Course) -> Result:
 
 
 async def _wakes(course: Course) -> Result:
-    """How long after the beginning of a put a taker that waits for the tuple has it."""
+    """Measure the time from the start of a put until a waiting taker has the tuple."""
     took: list[float] = []
     count = course.plan.share(WAKES)
     for number in range(count):
@@ -78,7 +78,7 @@ async def _wakes(course: Course) -> Result:
 
 
 async def _races(course: Course) -> Result:
-    """Several nodes take one tuple at once: how often exactly one of them gets it."""
+    """Let several nodes take one tuple at once; count the races with exactly one winner."""
     single = 0
     count = course.plan.share(RACES)
     for number in range(count):

@@ -1,4 +1,4 @@
-"""SwarmPeer: a node of this library on real UDP, sealed, with its store in memory or in a SQLite file."""
+"""A node of this library on real UDP, encrypted, with its store in memory or in a SQLite file."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ from middleware.entangled.space.tuplespace import TupleSpace
 TEAM_KEY = b"the key of a team that only runs"
 NAME = "bench"
 STANDS_AFTER_S = 0.2
-"""A watch does not tell when its replicas have taken note of it."""
+"""A watch does not report when its replicas have registered it."""
 reactor: Any = _reactor
 
 
 class LossyUdp(UdpNetwork):
-    """Real UDP that loses ``share`` of what it sends."""
+    """Real UDP that drops the share ``share`` of the sent datagrams."""
 
     share = 0.0
 
     def send(self, datagram: bytes, to: Address) -> None:
-        """Send, or not."""
+        """Send or drop a datagram."""
         if not self.share or random.random() >= self.share:
             super().send(datagram, to)
 
@@ -57,11 +57,11 @@ class SwarmPeer:
         reactor.run(installSignalHandlers=False)
 
     def soon(self, call: Callable[..., object], *arguments: object) -> None:
-        """Call from any thread into the reactor."""
+        """Schedule a call in the reactor from any thread."""
         reactor.callFromThread(call, *arguments)
 
     def later(self, seconds: float, call: Callable[..., object], *arguments: object) -> Prevent:
-        """Call after ``seconds``."""
+        """Schedule a call after ``seconds``."""
         timer = reactor.callLater(seconds, call, *arguments)
         return lambda: timer.cancel() if timer.active() else None
 
@@ -78,11 +78,11 @@ class SwarmPeer:
         self._node.join([Address(HOST, known)] if known else []).addCallback(lambda _: done())
 
     def put(self, key: str, value: bytes, done: Done) -> None:
-        """Store; done when a majority of the holders has it."""
+        """Store; call ``done`` when a majority of the replicas has it."""
         _tell(maybeDeferred(self._node.put, hashed_key(key), NAME, value), lambda held: done(held is not None))
 
     def get(self, key: str, value: bytes, done: Got) -> None:
-        """Read; the first answer counts, as the peers give it."""
+        """Read; the first answer counts, as with the other libraries."""
         _tell(self._node.get(hashed_key(key), "fast"), lambda found: done(found[0].value if found else None))
 
     def holds(self, keys: list[str]) -> list[bool | None]:
@@ -100,7 +100,7 @@ class SwarmPeer:
         self.later(STANDS_AFTER_S, done)
 
     def space(self, verb: str, fields: list[object], limit_s: float, done: Done) -> None:
-        """Do ``verb`` in the tuple space; "open" makes this node a part of it."""
+        """Execute ``verb`` in the tuple space; "open" makes this node a member of it."""
         if self._space is None:
             self._space = TupleSpace(self._node, reactor, self._rng, NAME)
         if verb == "open":
@@ -113,7 +113,7 @@ class SwarmPeer:
             _tell(getattr(self._space, verb)(template, **waiting), lambda found: done(found is not None))
 
     def lose(self, share: float) -> None:
-        """Lose datagrams."""
+        """Drop datagrams."""
         self._network.share = share
 
 

@@ -1,7 +1,7 @@
-"""Target: what is wanted of this library, in figures of its own and of its peers in the same run.
+"""Targets for this library, as absolute figures or relative to other libraries in the same run.
 
-Where the peer is not in the run (Entangled of 2011, libp2p) its figure on the machine of the first comparison stands
-in; ``None`` as a verdict says that something that is needed was not measured.
+If a library is not in the run (Entangled of 2011, libp2p), its figure from the first comparison is used; the verdict
+``None`` means that a required figure was not measured.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ TORRENT, OPENDHT = "libtorrent-free", "opendht-free"
 OPERATIONS = ("put", "get", "gets", "puts")
 
 Row = Mapping[str, Result]
-"""The results of one size of network, by library."""
+"""The results of one network size, by library."""
 Figure = Callable[[Row], float | None]
 
 
 class Limit(NamedTuple):
-    """One figure that must not be above (``most``), or else not below, ``bound``."""
+    """A figure that must not be above (``most``) or below ``bound``."""
 
     what: str
     value: float | None
@@ -36,7 +36,7 @@ class Limit(NamedTuple):
 
     @property
     def is_held(self) -> bool | None:
-        """Whether it is; None where it is not known."""
+        """Return whether it meets the limit; None if it is unknown."""
         if self.value is None or self.bound is None:
             return None
         return self.value <= self.bound if self.most else self.value >= self.bound
@@ -47,7 +47,7 @@ class Limit(NamedTuple):
 
 
 class Verdict(NamedTuple):
-    """What became of one target."""
+    """The result of one target."""
 
     number: int
     title: str
@@ -55,13 +55,13 @@ class Verdict(NamedTuple):
 
     @property
     def is_reached(self) -> bool | None:
-        """No where any limit is missed, None where none is but some are not known."""
+        """False if any limit is missed, None if none is missed but some are unknown."""
         held = [limit.is_held for limit in self.limits]
         return False if False in held else None if None in held else True
 
 
 class Wanted(NamedTuple):
-    """Which figure of a row must not be above (``most``), or else not below, which bound."""
+    """A figure of a row with the bound that it must not be above (``most``) or below."""
 
     what: str
     figure: Figure
@@ -69,33 +69,33 @@ class Wanted(NamedTuple):
     most: bool = True
 
     def limit(self, row: Row) -> Limit:
-        """The limit, with the figures of ``row``."""
+        """Return the limit with the figures of ``row``."""
         bound = self.bound if isinstance(self.bound, float) else self.bound(row)
         return Limit(self.what, self.figure(row), bound, self.most)
 
 
 class Target(NamedTuple):
-    """What is wanted, all of it, under one title."""
+    """A title, and all limits that belong to it."""
 
     title: str
     wanted: tuple[Wanted, ...]
 
 
-# -- what figures are read from -------------------------------------------------------------------------------------
+# -- sources of the figures ----------------------------------------------------------------------------------------
 
 
 def own(row: Row) -> Result:
-    """Our results in ``row``: with SQLite, else in memory."""
+    """Return the results of this library in ``row``: with SQLite, otherwise in memory."""
     return row.get(OURS) or row.get(OURS_IN_MEMORY) or {}
 
 
 def ours(read: Read) -> Figure:
-    """The figure that ``read`` finds in our results."""
+    """Return a reader of ``read`` in the results of this library."""
     return lambda row: read(own(row))
 
 
 def peer(read: Read, *names: str, factor: float) -> Figure:
-    """``factor`` times the least figure that ``read`` finds in the results of the libraries ``names``."""
+    """Return ``factor`` times the least figure that ``read`` finds in the results of the libraries ``names``."""
 
     def least(row: Row) -> float | None:
         found = [value for name in names if (value := read(row.get(name, {}))) is not None]
@@ -105,19 +105,19 @@ def peer(read: Read, *names: str, factor: float) -> Figure:
 
 
 def idle_phases(result: Result) -> float | None:
-    """How many phases came to nothing: every operation failed, or the losses could not be tried."""
+    """Return the number of phases without results: every operation failed, or the failures could not be tested."""
     idle = [name for name in OPERATIONS if name in result and result[name]["tried"] == result[name]["failed"]]
     stuck = [loss for loss in LOSSES if "trouble" in result.get(loss, {})]
     return float(len(idle) + len(stuck)) if result else None
 
 
 def failed(result: Result) -> float | None:
-    """How many operations failed while all nodes were well."""
+    """Return the number of failed operations while all nodes were healthy."""
     return float(sum(result[name]["failed"] for name in OPERATIONS if name in result)) if result else None
 
 
 def found_after_losses(result: Result) -> float | None:
-    """The least share of keys found after any of the losses, in percent; None where not all were tried."""
+    """Return the least share of keys found after any failure, in percent; None if not all were tested."""
     found = [at(loss, part, "found_percent")(result) for loss in LOSSES for part in PARTS]
     known = [value for value in found if value is not None]
     return min(known) if len(known) == len(found) else None
@@ -210,7 +210,7 @@ TARGETS = (
 
 
 def verdicts(row: Row) -> list[Verdict]:
-    """What became of all fourteen, for the results of one size of network."""
+    """Return the results of all fourteen targets for one network size."""
     return [
         Verdict(number, target.title, [wanted.limit(row) for wanted in target.wanted])
         for number, target in enumerate(TARGETS, 1)

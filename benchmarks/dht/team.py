@@ -1,4 +1,4 @@
-"""Team: the processes of one library's nodes, given orders and ended by their ids."""
+"""The processes of one library's nodes, which receive orders and are ended by their ids."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ class Node(Remote):
         self.port = port
 
     async def order(self, do: str, patience_s: float = ORDER_S, /, **fields: Any) -> dict[str, Any]:
-        """Have something done; raises ``Lost``."""
+        """Execute an order; raises ``Lost``."""
         return await super().order(do, patience_s, **fields)
 
 
 class Team:
-    """The nodes of one contestant, spawned by ``async with``; none is started, all are ended at the end."""
+    """The nodes of one contestant; ``async with`` spawns the processes and ends them, orders start the nodes."""
 
     def __init__(self, entry: Entry, size: int, folder: str) -> None:
         self.entry = entry
@@ -41,12 +41,12 @@ class Team:
 
     @property
     def pids(self) -> list[int]:
-        """The processes that are alive."""
+        """The ids of the live processes."""
         return [node.pid for node in self.nodes if node.is_alive]
 
     async def __aenter__(self) -> Team:
         try:
-            ports = free(BOTH, HOST, self._size)  # of those compared some use UDP, some TCP as well
+            ports = free(BOTH, HOST, self._size)  # some of the compared libraries use UDP, some also TCP
             for first in range(0, self._size, SPAWNED_AT_ONCE):
                 spawned = [await self._spawn(port) for port in ports[first : first + SPAWNED_AT_ONCE]]
                 for node in spawned:
@@ -63,7 +63,7 @@ class Team:
         command = [sys.executable, "-m", "benchmarks.dht.child", self.entry.name, str(self._folder)]
         pipe, said = asyncio.subprocess.PIPE, self._folder / f"{port}.errors"
         with said.open("wb") as errors:
-            # In a session of its own: what is typed at the terminal is for the one who ends the nodes.
+            # In a separate session, so that signals from the terminal reach only the parent.
             process = await asyncio.create_subprocess_exec(
                 *command, stdin=pipe, stdout=pipe, stderr=errors, cwd=ROOT, limit=MAX_LINE, start_new_session=True
             )

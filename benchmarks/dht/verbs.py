@@ -1,4 +1,4 @@
-"""Verbs: what only some libraries have beside put and get of small values: long values and watches."""
+"""Measure the operations that only some libraries have: long values and watches."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ HEARD_S = 2.0
 
 
 async def long_values(course: Course) -> None:
-    """Put and get 1 MiB, also while every node loses datagrams, where that can be arranged."""
+    """Put and get 1 MiB, also with datagram loss at every node, if the library supports it."""
     entry, nodes = course.team.entry, course.nodes
     if entry.largest < MIB:
         return
@@ -46,7 +46,7 @@ async def _long(course: Course, name: str) -> Result:
 
 
 async def watches(course: Course) -> None:
-    """How long after the beginning of a put a watcher elsewhere has the value."""
+    """Measure the time from the start of a put until a watcher at another node has the value."""
     if "watch" not in course.team.entry.can:
         return
     took: list[float] = []

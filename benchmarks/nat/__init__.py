@@ -1,1 +1,1 @@
-"""Real nodes behind every pair of routers, in network namespaces (``make live-nat``)."""
+"""Measure real nodes behind every pair of NATs, in network namespaces (``make live-nat``)."""

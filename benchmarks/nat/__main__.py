@@ -1,7 +1,8 @@
-"""``make live-nat``: real nodes behind every pair of routers: who reaches whom, how, and in how many seconds.
+"""``make live-nat``: measure the path and the time to connect for real nodes behind every pair of NATs.
 
-Needs Linux and either root or user namespaces; everything happens in network namespaces of its own.  Prints a table,
-writes every trial as JSON and the matrix as SVG; exit code 1 where a promise is broken, 2 where it cannot run.
+Needs Linux and either root or user namespaces; everything runs in separate network namespaces. Prints a table, and
+writes every trial as JSON and the matrix as SVG. The exit code is 1 if a requirement is not met, 2 if the benchmark
+cannot run.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ PICTURE = "images/nat.svg"
 
 
 async def run(count: int, lossy: int, seed: int) -> list[Outcome]:
-    """The whole matrix; ends well on SIGTERM, too."""
+    """Run the whole matrix; clean up on SIGTERM, too."""
     from benchmarks.nat.hosts import Hosts
     from benchmarks.nat.matrix import Matrix, sites
 
@@ -46,7 +47,7 @@ async def run(count: int, lossy: int, seed: int) -> list[Outcome]:
 
 
 def main(arguments: Sequence[str] = tuple(sys.argv[1:])) -> int:
-    """The command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.nat", description="Who reaches whom behind routers.")
     parser.add_argument("--count", type=whole, default=5, help="rounds of every pair (%(default)s)")
     parser.add_argument("--lossy", type=whole, default=4, help="rounds with 30 %% lost (%(default)s)")

@@ -1,8 +1,7 @@
-"""Real nodes on one host of the internet of network namespaces (``sim.namespaces``), ordered by JSON lines.
+"""Run real nodes on one host of the test network (``sim.namespaces``), controlled by JSON lines.
 
-``python -m benchmarks.nat.child``.  A trial is a team of its own, so many can run beside each other in one process.
-What is measured of a node is the node's own doing: the first moment at which it asks a peer anything, and the first
-answer that it gets.
+Started as ``python -m benchmarks.nat.child``. A trial is a separate team, so many trials can run in one process. The
+measurements are taken at the node: the time of its first request to a peer, and of the first answer.
 """
 
 from __future__ import annotations
@@ -35,20 +34,20 @@ IN_FLIGHT = 8
 
 
 class Sight:
-    """What one node has seen of one peer."""
+    """The observations of one node about one peer."""
 
     def __init__(self) -> None:
         self.contact: Contact | None = None
-        """As the node calls it."""
+        """The contact that the node calls."""
         self.proved: Contact | None = None
-        """As it answered, or came in."""
+        """The contact that answered, or connected."""
         self.known_at = self.answered_at = -1.0
         self.path = ""
         self.waiting: list[Callable[[], None]] = []
 
 
 class Member:
-    """A node of a trial, with an eye on what it does."""
+    """A node of a trial, with hooks that record its requests."""
 
     def __init__(self, settings: Settings, seed: bytes) -> None:
         seams = real_seams(settings, reactor)
@@ -56,26 +55,26 @@ class Member:
         self.node = EntangledNode(identity, settings.node.team_secret, network, seams.store, reactor, seams.rng)
         self.sights: dict[bytes, Sight] = {}
         self.sought: dict[bytes, float] = {}
-        """The peers that are called as soon as they are known, and for how many seconds at most."""
+        """Peers that are called as soon as they are known, with the maximum duration in seconds."""
         self._network = network
         endpoint = self.node.endpoint
         self._ask = endpoint.ask
-        # From outside nobody can tell when a node first hears of another: so its own questions are looked at.
+        # The time at which a node learns of a peer is visible only in its own requests, so they are intercepted.
         endpoint.ask = self._asked  # type: ignore[method-assign]
         endpoint.on_contact.add(self._met)
         self.node.rpc(CALL)(lambda peer: True)
 
     def sight(self, public: bytes) -> Sight:
-        """What is known of the peer with that key."""
+        """Return the observations about the peer with that key."""
         return self.sights.setdefault(public, Sight())
 
     def start(self) -> int:
-        """Open the port; returns it."""
+        """Open the port and return it."""
         self.node.start()
         return self._network.address.port
 
     def call(self, public: bytes, done: Callable[[float], None], limit_s: float) -> None:
-        """Call a peer again and again until it answers; ``done`` with the seconds that it took, -1 where none came."""
+        """Call a peer until it answers; call ``done`` with the duration in seconds, or -1 after ``limit_s``."""
         began = reactor.seconds()
         state = {"open": True, "in flight": 0}
 
@@ -109,7 +108,7 @@ class Member:
         again()
 
     def path(self, public: bytes) -> str:
-        """How a peer is reached now."""
+        """Return the present path to a peer."""
         proved = self.sight(public).proved
         return "" if proved is None else path(proved)
 
@@ -138,12 +137,12 @@ class Member:
         if sight.known_at < 0:
             sight.known_at = reactor.seconds()
             if contact.public in self.sought:
-                # An application that calls whom it hears of; on its way in the next turn, as the node's own question.
+                # Simulate an application that calls each discovered peer; its call follows the node's own request.
                 reactor.callLater(0.0, self.call, contact.public, lambda _: None, self.sought[contact.public])
 
 
 def path(contact: Contact) -> str:
-    """What the address of a contact says of the way to it."""
+    """Return the kind of path from the address of a contact."""
     host = contact.address.host
     if host.startswith("~wss"):
         return "tunnel"
@@ -151,17 +150,17 @@ def path(contact: Contact) -> str:
 
 
 class Computer:
-    """Carries out orders and answers each by its id."""
+    """Execute orders and answer each by its id."""
 
     def __init__(self) -> None:
         self._members: dict[str, Member] = {}
         self._lock = threading.Lock()
         self._out = os.fdopen(os.dup(1), "w")
-        # Orders own the real output; what a library prints goes the way of errors.
+        # Only orders use the real standard output; output of libraries goes to standard error.
         os.dup2(2, 1)
 
     def begin(self) -> None:
-        """Read orders from now on."""
+        """Start to read orders."""
         threading.Thread(target=self._read, daemon=True).start()
         self._answer({"id": 0})
 
@@ -184,7 +183,7 @@ class Computer:
     # -- orders -----------------------------------------------------------------------------------------------------
 
     def _do_start(self, order: Order) -> None:
-        """Start a node; answers when it has joined, which the first of a team has at once, or when it is too late."""
+        """Start a node; answer when it has joined (the first of a team at once), or at the time limit."""
         settings = Settings.from_mapping({"node": order["node"]}, "trial")
         member = self._members[order["trial"]] = Member(settings, bytes.fromhex(order["seed"]))
         member.sought = {bytes.fromhex(public): order["limit_s"] for public in order["sought"]}
@@ -199,7 +198,7 @@ class Computer:
         member.node.join(settings.node.known_nodes).addCallbacks(joined, lambda _: None)
 
     def _do_meet(self, order: Order) -> None:
-        """Wait until a peer has answered; says how long that took, counted from when the node heard of it."""
+        """Wait until a peer has answered; return the time since the node learnt of it."""
         member = self._members[order["trial"]]
         public = bytes.fromhex(order["peer"])
         sight = member.sight(public)
@@ -229,11 +228,11 @@ class Computer:
         member.call(public, done, order["limit_s"])
 
     def _do_path(self, order: Order) -> None:
-        """How a peer is reached now."""
+        """Return the present path to a peer."""
         self._answer(order, path=self._members[order["trial"]].path(bytes.fromhex(order["peer"])))
 
     def _do_stop(self, order: Order) -> None:
-        """End nodes without a word."""
+        """Stop nodes without notifying their peers."""
         for trial in order["trials"]:
             member = self._members.pop(trial, None)
             if member is not None:
@@ -242,7 +241,7 @@ class Computer:
 
 
 def main() -> None:
-    """Be a computer until the orders end."""
+    """Execute orders until the input ends."""
     logging.disable(logging.CRITICAL)
     use_monotonic_time()
     reactor.callWhenRunning(Computer().begin)

@@ -1,4 +1,4 @@
-"""Hosts: the computers of an internet of network namespaces, and the orders that they take."""
+"""Control the child processes on the hosts of the test network."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from sim.namespaces.room import environment
 
 SPAWN_S = 60.0
 MARGIN_S = 10.0
-"""Seconds beyond its own limit after which an order counts as lost."""
+"""Seconds after an order's time limit until it counts as lost."""
 MAX_LINE = 1 << 20
 
 
 class Computer(Remote):
-    """One computer, which does what may take it a while."""
+    """The child process of one host, with orders that may take some time."""
 
     async def order(self, do: str, limit_s: float = 0.0, /, **fields: Any) -> dict[str, Any]:
-        """Have something done that may take ``limit_s``; raises ``Lost``."""
+        """Execute an order that may take ``limit_s``; raises ``Lost``."""
         try:
             return await super().order(do, limit_s + MARGIN_S, limit_s=limit_s, **fields)
         except Unable as error:
@@ -30,7 +30,7 @@ class Computer(Remote):
 
 
 class Hosts:
-    """A computer on each of ``hosts``, between ``async with`` and its end."""
+    """A child process on each of ``hosts``, during an ``async with`` block."""
 
     def __init__(self, net: Internet, hosts: Iterable[str], folder: Path) -> None:
         self.net = net
@@ -58,7 +58,7 @@ class Hosts:
         said, pipe = self._folder / f"{host}.errors", asyncio.subprocess.PIPE
         command = self.net.command(host, [sys.executable, "-m", "benchmarks.nat.child"])
         with said.open("wb") as errors:
-            # In a session of its own: what is typed at the terminal is for the one who ends it.
+            # In a separate session, so that signals from the terminal reach only the parent.
             process = await asyncio.create_subprocess_exec(
                 *command, stdin=pipe, stdout=pipe, stderr=errors, cwd=ROOT, env=environment(), limit=MAX_LINE,
                 start_new_session=True,

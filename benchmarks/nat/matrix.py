@@ -1,4 +1,4 @@
-"""Matrix: every pair of kinds of routers, tried with real nodes, many at a time in one internet."""
+"""Run trials with real nodes for every pair of NAT kinds, many at a time in one test network."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ JOIN_S, LOSSY_JOIN_S = 6.0, 20.0
 MEET_S, LOSSY_MEET_S = 6.0, 10.0
 BACK_S = 12.0
 LATE_MS = 500.0
-"""How late a word of the bootstrap comes to the late side of a staggered pair."""
+"""Delay of the bootstrap node's messages to the late side of a staggered pair."""
 LOST_PERCENT = 30.0
 SHORT_S = 20
 HOMES = (Kind.FULL, Kind.PORT, Kind.SYM)
-"""Kinds of which a router has two hosts behind it."""
+"""Kinds with two hosts behind one router."""
 
 
 @dataclass(frozen=True)
 class Pair:
-    """Two hosts that are to meet; ``a`` and ``b`` are what the table calls them."""
+    """Two hosts to connect; ``a`` and ``b`` are their kinds in the table."""
 
     part: str
     a: str
@@ -41,7 +41,7 @@ class Pair:
 
 
 def sites() -> list[Site]:
-    """All sites of a run: two of each kind, and those of the special cases."""
+    """Return all sites of a run: two of each kind, and the sites of the special cases."""
     both = [
         Site(f"{kind.value}{side}", kind, 2 if side == "a" and kind in HOMES else 1)
         for kind in (*MATRIX, Kind.LEAKY)
@@ -52,13 +52,13 @@ def sites() -> list[Site]:
 
 
 def plain_pairs(part: str) -> list[Pair]:
-    """Every pair of the matrix once."""
+    """Return every pair of the matrix once."""
     pairs = itertools.combinations_with_replacement(MATRIX, 2)
     return [Pair(part, a.value, b.value, f"{a.value}a1", f"{b.value}b1") for a, b in pairs]
 
 
 def special_pairs() -> list[Pair]:
-    """Two behind one router, and routers without a firewall, also where one side hears late of the other."""
+    """Return pairs behind one router, and pairs with routers without a firewall, also with one late side."""
     homes = [Pair(HOME, k.value, k.value, f"{k.value}a1", f"{k.value}a2") for k in HOMES]
     leaky = [
         Pair(LEAKY, "leaky", "leaky", "leakya1", "leakyb1"),
@@ -71,18 +71,18 @@ def special_pairs() -> list[Pair]:
 
 
 def roaming_pairs() -> list[Pair]:
-    """Pairs of which the first will be carried to the other network."""
+    """Return pairs whose first host will move to another network."""
     return [Pair(MOVED, "port", to, roamer, f"{to}b1", NOTE_MOVED) for roamer, to in ROAMERS.items()]
 
 
 NOTE_MOVED = "the first moves from Wi-Fi (port) to a phone network (sym)"
 ROAMERS = {"wifi1": "none", "wifi2": "port", "wifi3": "full"}
-"""Hosts that are carried away, and the kind of whom they have met."""
+"""Hosts that move, and the kind of the peer that they are connected to."""
 IDLE_PAIR = Pair(IDLE, "port", "port", "short1", "portb1", "mappings of the first live for 20 s")
 
 
 class Trial:
-    """One team of three: a bootstrap node on the public host, and the two of a pair."""
+    """A team of three: a bootstrap node on the public host, and the two nodes of a pair."""
 
     def __init__(self, fleet: Hosts, pair: Pair, number: int, rng: Random) -> None:
         self.pair = pair
@@ -97,12 +97,12 @@ class Trial:
 
     @property
     def order(self) -> tuple[str, str]:
-        """The two hosts, who comes first first."""
+        """The two hosts, in the order of joining."""
         both = (self.pair.host_a, self.pair.host_b)
         return (both[1], both[0]) if self._is_swapped and not self.pair.note else both
 
     async def run(self, join_s: float, meet_s: float) -> None:
-        """Let the two join, one after the other, and see how long they need for each other."""
+        """Let the two nodes join, one after the other, and measure the time until they are connected."""
         try:
             port = (await self._start(PUB, [], join_s))["port"]
             for host in self.order:
@@ -117,7 +117,7 @@ class Trial:
             self.outcome.trouble = str(error)
 
     async def again(self, part: str, first: int) -> Outcome:
-        """See how long one side needs to reach the other again, of two that had met."""
+        """Measure the time until one side of a connected pair reaches the other again."""
         host = self.order[first]
         outcome = Outcome(part, self.pair.a, self.pair.b, [None], note=self.pair.note)
         try:
@@ -129,14 +129,14 @@ class Trial:
         return outcome
 
     async def look(self) -> None:
-        """Take note how they reach each other by now."""
+        """Record the present path between them."""
         try:
             self.outcome.later = await self._found([await self._path(host, self._other(host)) for host in self.order])
         except Lost as error:
             self.outcome.trouble = str(error)
 
     async def end(self) -> None:
-        """End its nodes."""
+        """Stop its nodes."""
         for host in self._seeds:
             await self._fleet[host].order("stop", trials=[self._name])
 
@@ -150,17 +150,17 @@ class Trial:
         return str((await self._fleet[host].order("path", trial=self._name, peer=peer))["path"])
 
     async def _found(self, between: Sequence[str]) -> str:
-        """The worse of the two directions; a relayed one whose first hop is a tunnel is one by tunnel."""
+        """Return the worse path of the two directions; a relayed path counts as a tunnel if its first hop is one."""
         to_bootstrap = [await self._path(host, self._publics[PUB]) for host in self.order]
         if "" in between:
-            return ""  # one of them never had an answer
+            return ""  # one of them never received an answer
         if any(path != "direct" for path in between):
             return "tunnel" if "tunnel" in (*between, *to_bootstrap) else "relayed"
         return "direct"
 
     async def _start(self, host: str, known: list[str], limit_s: float) -> dict[str, Any]:
         tunnel_port = 4430 + self._number
-        # Who will be elsewhere listens at whatever address it has.
+        # A node that will move listens at all addresses of its host.
         address = "*" if host in ROAMERS else self._fleet.net.address(host)
         node: dict[str, Any] = {"name": self._name, "host": address, "port": 0, "team_key": self._key}
         node |= {"known_nodes": known, "lan": False}
@@ -174,7 +174,7 @@ class Trial:
 
 
 class Matrix:
-    """One run: ``count`` rounds of every pair, ``lossy`` of them again with losses; ``say`` is told what happens."""
+    """A run: ``count`` rounds of every pair, ``lossy`` rounds with loss; ``say`` receives progress messages."""
 
     def __init__(self, net: Internet, fleet: Hosts, seed: int, say: Callable[[str], None]) -> None:
         self.outcomes: list[Outcome] = []
@@ -186,7 +186,7 @@ class Matrix:
         self._born = time.monotonic()
 
     async def run(self, count: int, lossy: int) -> None:
-        """Try everything."""
+        """Run all parts."""
         self._net.mapping_life("short", SHORT_S)
         for site in ("lateleaky", "lateport"):
             self._net.weather(PUB, to=f"{site}-gw", delay=LATE_MS)
@@ -215,7 +215,7 @@ class Matrix:
             self.outcomes.append(await idle.again(IDLE, 1))
 
     async def _wave(self, pairs: Sequence[Pair], join_s: float, meet_s: float) -> list[Trial]:
-        """Try all pairs at once."""
+        """Run trials for all pairs at once."""
         trials = [Trial(self._fleet, pair, next(self._numbers), self._rng) for pair in pairs]
         await asyncio.gather(*(trial.run(join_s, meet_s) for trial in trials))
         await asyncio.gather(*(trial.look() for trial in trials if not trial.outcome.trouble))
@@ -224,7 +224,7 @@ class Matrix:
         return trials
 
     async def _lost_mappings(self, trials: Sequence[Trial]) -> None:
-        """Cut the bootstrap off for a moment; let routers forget, then have other addresses; see who is back."""
+        """Cut the bootstrap node off; then reset the mappings, and change the external addresses; record recoveries."""
         met = [trial for trial in trials if None not in trial.outcome.took_s]
         self._net.cut(PUB)
         direct = [trial for trial in met if trial.outcome.later == "direct"]
@@ -241,7 +241,7 @@ class Matrix:
             self._tell(f"{part}: {_answered(found)} of {len(found)} pairs are back")
 
     async def _moved(self) -> None:
-        """Carry hosts to another network; see whether both sides reach each other again."""
+        """Move hosts to another network; record whether both sides reach each other again."""
         trials = await self._wave(roaming_pairs(), JOIN_S, MEET_S)
         for trial in trials:
             self._net.move(trial.pair.host_a, "phone")
@@ -259,5 +259,5 @@ class Matrix:
 
 
 def _answered(outcomes: Sequence[Outcome]) -> int:
-    """Of how many trials both sides got an answer."""
+    """Return the number of trials in which both sides got an answer."""
     return sum(None not in one.took_s for one in outcomes)

@@ -1,4 +1,4 @@
-"""Outcome: what came of each trial, and which promise that keeps; pure."""
+"""Results of trials, and the requirements that they meet; pure."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ DIRECT_S, RELAYED_S, LOSS_S, LEAKY_S, BACK_S, JOIN_S = 1.0, 2.5, 5.0, 5.0, 5.0, 
 
 @dataclass
 class Outcome:
-    """One trial of the pair ``a`` and ``b``; ``took_s`` is what each of the two needed, None where it got no answer.
+    """A trial of the pair ``a`` and ``b``; ``took_s`` has the seconds of each node, None without an answer.
 
-    ``path`` is how they reached each other at their first answers, and ``later`` at the end of the trial.
+    ``path`` is the path at the first answers, ``later`` the path at the end of the trial.
     """
 
     part: str
@@ -46,7 +46,7 @@ class Outcome:
 
     @property
     def seconds(self) -> float:
-        """What the slower of the two needed; infinite where one got no answer."""
+        """The seconds of the slower node; infinity if a node got no answer."""
         return max((math.inf if took is None else took for took in self.took_s), default=math.inf)
 
     @property
@@ -57,7 +57,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Promise:
-    """One line of what is wanted: whether it was kept, and what was seen."""
+    """A requirement, its measured result, and whether the result meets it."""
 
     what: str
     seen: str
@@ -65,16 +65,16 @@ class Promise:
 
 
 def is_punchable(a: Kind, b: Kind) -> bool:
-    """Whether datagrams sent at the same time from both sides can open a way.
+    """Return whether datagrams sent at the same time from both sides can open a path (hole punching).
 
-    They cannot where a filter of ports meets ports that are another one for each peer.
+    They cannot if a filter by port meets a NAT that uses another port for each peer.
     """
     closed = {Kind.PORT, Kind.SYM}
     return Kind.NOUDP not in (a, b) and not (Kind.SYM in (a, b) and {a, b} <= closed)
 
 
 def cell(outcomes: Sequence[Outcome]) -> str:
-    """What one pair comes to, as it stands in the table: the path, the median and the worst seconds."""
+    """Return the table cell of a pair: the path, the median and the maximum of the seconds."""
     if not outcomes:
         return ""
     there = [one for one in outcomes if one.seconds < math.inf]
@@ -87,7 +87,7 @@ def cell(outcomes: Sequence[Outcome]) -> str:
 
 
 def promises(outcomes: Iterable[Outcome]) -> list[Promise]:
-    """What is wanted of a run, in the order of the parts; what was not tried is not among it."""
+    """Return the requirements of a run in the order of the parts, without the parts that were not run."""
     every = list(outcomes)
     plain = [one for one in every if one.part == PLAIN]
     open_ones = [one for one in plain if is_punchable(Kind(one.a), Kind(one.b))]

@@ -1,4 +1,4 @@
-"""Report: the table of a run, for a terminal and for the documents, and its picture; pure."""
+"""Format the results of a run as tables for a terminal and for the documentation, and as a picture; pure."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from html import escape
 from benchmarks.nat.outcome import ALONE, FORGOTTEN, LOSS, MATRIX, PLAIN, RENUMBERED, Outcome, cell, promises
 
 WHOLE = (PLAIN, LOSS, FORGOTTEN, RENUMBERED)
-"""The parts in which every pair is tried."""
+"""The parts that run every pair."""
 BEGIN, END = "<!-- measured -->", "<!-- /measured -->"
 LEFT, TOP, WIDE, HIGH = 150, 46, 112, 52
 COLOURS = {"direct": "#cfe8d5", "relayed": "#fbe7b2", "tunnel": "#cfdcf2", "": "#f3c6c0"}
@@ -18,7 +18,7 @@ INK, FAINT = "#1d2733", "#5b6672"
 
 
 def rows(outcomes: Sequence[Outcome], part: str) -> list[list[str]]:
-    """The matrix of one part: a row for each kind, with a word for each pair; the lower half is empty."""
+    """Return the matrix of one part: a row for each kind, with a cell for each pair; the lower half is empty."""
     some = [one for one in outcomes if one.part == part]
     found = [[part, *(kind.value for kind in MATRIX)]]
     for number, a in enumerate(MATRIX):
@@ -31,7 +31,7 @@ def rows(outcomes: Sequence[Outcome], part: str) -> list[list[str]]:
 
 
 def others(outcomes: Sequence[Outcome]) -> list[list[str]]:
-    """The special cases: a row for each pair of each other part."""
+    """Return the special cases: a row for each pair of each other part."""
     found: list[list[str]] = []
     for part in dict.fromkeys(one.part for one in outcomes if one.part not in (*WHOLE, ALONE)):
         some = [one for one in outcomes if one.part == part]
@@ -42,7 +42,7 @@ def others(outcomes: Sequence[Outcome]) -> list[list[str]]:
 
 
 def table(outcomes: Sequence[Outcome]) -> str:
-    """The whole report for a terminal."""
+    """Return the complete report for a terminal."""
     parts = [_aligned(rows(outcomes, part)) for part in _tried(outcomes)]
     parts += [_aligned(others(outcomes))]
     parts += ["\n".join(f"{'met    ' if p.is_kept else 'NOT MET'}  {p.what}: {p.seen}" for p in promises(outcomes))]
@@ -55,7 +55,7 @@ def table(outcomes: Sequence[Outcome]) -> str:
 
 
 def written(document: str, outcomes: Sequence[Outcome]) -> str:
-    """``document``, with what was measured between its two marks; raises ``ValueError`` where it has none."""
+    """Return ``document`` with the results between its two marks; raises ``ValueError`` without the marks."""
     before, begin, rest = document.partition(BEGIN)
     _, end, after = rest.partition(END)
     if not begin or not end:
@@ -90,7 +90,7 @@ def _aligned(lines: list[list[str]]) -> str:
 
 
 def drawn(outcomes: Sequence[Outcome], title: str) -> str:
-    """The matrix as an SVG: a square for each pair with the way that was found, and the median seconds."""
+    """Return the matrix as an SVG: a square for each pair with the path and the median of the seconds."""
     width, height = LEFT + WIDE * len(MATRIX) + 16, TOP + HIGH * len(MATRIX) + 60
     parts = [f'<text x="12" y="22" font-size="15" font-weight="bold">{escape(title)}</text>']
     for number, kind in enumerate(MATRIX):

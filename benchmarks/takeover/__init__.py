@@ -1,1 +1,1 @@
-"""How long a task stands still when who does it is lost, by cause."""
+"""Measure the time without an acting robot after a failure of the acting one, by cause."""

@@ -1,7 +1,8 @@
-"""``make bench-takeover``: how long a task stands still when who does it is lost, for each cause.
+"""``make bench-takeover``: measure the time without an acting robot after a failure, for each cause.
 
-``--count`` trials of each cause in virtual time, at ``--loss`` of the datagrams, and ``--real`` with processes, each
-node in a network namespace of its own.  Prints a table, writes every trial as JSON and the histograms as SVG.
+``--count`` trials of each cause run in virtual time with the share ``--loss`` of lost datagrams, and ``--real`` trials
+with processes, each node in a separate network namespace. Prints a table, and writes every trial as JSON and the
+histograms as SVG.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ INSIDE = "--inside"
 
 
 def rehearsed(causes: Sequence[Cause], count: int, seed: int, loss: float, jobs: int) -> list[Trial]:
-    """``count`` trials of each cause in virtual time, ``jobs`` at a time."""
+    """Run ``count`` trials of each cause in virtual time, ``jobs`` at a time."""
     wanted = [(cause, seed + number) for cause in causes for number in range(count)]
     with ProcessPoolExecutor(max(1, jobs), multiprocessing.get_context("spawn")) as pool:
         done = pool.map(partial(trial, loss=loss), *zip(*wanted, strict=True)) if wanted else ()
@@ -41,7 +42,7 @@ def rehearsed(causes: Sequence[Cause], count: int, seed: int, loss: float, jobs:
 
 
 def real(causes: Sequence[Cause], count: int, seed: int) -> list[Trial]:
-    """``count`` trials of each cause with processes; to be called inside of ``lan.within``."""
+    """Run ``count`` trials of each cause with processes; call it inside of ``lan.within``."""
     from benchmarks.takeover.real import trial as real_trial
 
     trials = []
@@ -51,7 +52,7 @@ def real(causes: Sequence[Cause], count: int, seed: int) -> list[Trial]:
             for number in range(count):
                 trials.append(_told(await real_trial(reactor, cause, seed + number)))
 
-    with suppress(SystemExit):  # how ``react`` says that it is over; what went wrong it has printed
+    with suppress(SystemExit):  # ``react`` ends with this exception; errors are already printed
         react(lambda reactor: Deferred.fromCoroutine(run(reactor)))
     return trials
 
@@ -67,7 +68,7 @@ def _told(one: Trial) -> Trial:
 
 
 def share(word: str) -> float:
-    """A number from 0 to 1, from the command line."""
+    """Parse a number from 0 to 1."""
     try:
         number = float(word)
     except ValueError:
@@ -78,7 +79,7 @@ def share(word: str) -> float:
 
 
 def main(arguments: Sequence[str] = tuple(sys.argv[1:])) -> int:
-    """The command line; returns 0 where every trial held."""
+    """Run the command line; return 0 if every trial held."""
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.takeover", description="Seconds to take over, by cause."
     )

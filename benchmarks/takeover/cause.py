@@ -1,4 +1,4 @@
-"""The ways in which the one that acts is lost, what is counted of each trial, and the judge that watches one."""
+"""Causes of a failure of the acting robot, the results of a trial, and the observer that records them."""
 
 from __future__ import annotations
 
@@ -10,15 +10,16 @@ from enum import Enum
 from middleware.tasks.task import COMPLETED, Result
 
 WEB, WITNESSES = "page", ("witness1", "witness2")
-"""The nodes beside the bootstrap node and the dogs.  With seven members three may die at once, and four still agree."""
+"""The nodes besides the bootstrap node and the robots. With seven members three may fail at once, and four still
+agree."""
 PHASE_S = (0.2, 2.0)
-"""Seconds from the first move to the loss: anywhere in a period of renewal, and before the task is done."""
+"""Seconds from the first motion to the failure: anywhere in a renewal period, and before the task is done."""
 FROZEN_S = (3.0, 5.0)
-"""Seconds that a frozen node stands still: two leases and more."""
+"""Seconds for which a node is frozen: two leases and more."""
 
 
 class Cause(Enum):
-    """What happens to the dog that acts."""
+    """The fault of the acting robot."""
 
     CRASH = "crash"
     FREEZE = "freeze"
@@ -30,7 +31,7 @@ class Cause(Enum):
 
 
 VIRTUAL = frozenset({Cause.LOST_LINK})
-"""Those that are tried in virtual time only; with processes the demonstration shows it (``--lose link``)."""
+"""Causes in virtual time only; with processes the demonstration has it (``--lose link``)."""
 SAYS = {
     Cause.CRASH: "its node dies (SIGKILL)",
     Cause.FREEZE: "its node stands still (SIGSTOP) for two leases and more, and goes on",
@@ -44,11 +45,11 @@ SAYS = {
 
 @dataclass(frozen=True)
 class Trial:
-    """What came of one loss.
+    """The result of one failure.
 
-    ``takeover`` is in seconds from the loss until another dog moves, None where none ever did; ``done`` whether the
-    task was completed, by ``by``; ``overlaps`` counts the looks at which two dogs moved at once, ``zombies`` those at
-    which the lost one moved after another had taken over.
+    ``takeover`` has the seconds from the failure until another robot moves, None if none moved; ``done`` whether the
+    task was completed, by ``by``; ``overlaps`` the number of samples in which two robots moved at once, ``zombies`` the
+    number of samples in which the failed robot moved after another had taken over.
     """
 
     cause: str
@@ -62,12 +63,12 @@ class Trial:
 
     @property
     def held(self) -> bool:
-        """Whether the task was completed by another, and no two ever acted at once."""
+        """Whether another robot completed the task, and no two robots acted at once."""
         return self.done and self.by not in ("", self.lost) and self.takeover is not None and not self.bad
 
     @property
     def bad(self) -> int:
-        """Looks at which something moved that must not."""
+        """Samples in which a robot moved without permission."""
         return self.overlaps + self.zombies
 
 
@@ -75,34 +76,34 @@ LOOK_S = 0.01
 
 
 class Judge:
-    """What was seen since ``lost`` was lost at ``began``; ``dice`` say for how long it is frozen, if that is the cause.
+    """Observer of a trial in which ``lost`` failed at ``began``; ``rng`` draws the duration of a freeze.
 
-    The trial ends ``limit`` seconds after the loss, or ``after`` seconds after its end was seen.
+    The trial ends ``limit`` seconds after the failure, or ``after`` seconds after its end was observed.
     """
 
     def __init__(
-        self, cause: Cause, seed: int, lost: str, began: float, dice: random.Random, limit: float, after: float = 0.0
+        self, cause: Cause, seed: int, lost: str, began: float, rng: random.Random, limit: float, after: float = 0.0
     ) -> None:
         self.takeover: float | None = None
         self.result: Result | None = None
         self._cause, self._seed, self._lost, self._began = cause, seed, lost, began
-        self._thaw_at = began + dice.uniform(*FROZEN_S) if cause is Cause.FREEZE else None
+        self._thaw_at = began + rng.uniform(*FROZEN_S) if cause is Cause.FREEZE else None
         self._end, self._after = began + limit, after
         self._overlaps = self._zombies = 0
 
     def is_over(self, now: float) -> bool:
-        """Whether nothing more is to be seen; never while the lost one is frozen."""
+        """Return whether the observation is complete; never while the failed node is frozen."""
         return now >= self._end and self._thaw_at is None
 
     def thaws(self, now: float) -> bool:
-        """Whether the lost one is to go on now; true once."""
+        """Return whether the failed node has to continue now; true once."""
         if self._thaw_at is None or now < self._thaw_at:
             return False
         self._thaw_at = None
         return True
 
     def look(self, now: float, moving: Collection[str], result: Result | None) -> None:
-        """Take in who moves now, and how the task ended, if that is seen."""
+        """Record the moving robots, and the result of the task if it is known."""
         self._overlaps += len(moving) > 1
         if self.takeover is not None:
             self._zombies += self._lost in moving
@@ -113,7 +114,7 @@ class Judge:
             self.result = result
 
     def verdict(self) -> Trial:
-        """What came of the loss."""
+        """Return the result of the trial."""
         by, done = ("", False) if self.result is None else (self.result.by, self.result.outcome == COMPLETED)
         cause = self._cause.value
         return Trial(cause, self._seed, self._lost, by, done, self.takeover, self._overlaps, self._zombies)

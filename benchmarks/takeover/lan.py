@@ -1,8 +1,8 @@
-"""Lan: a network namespace for each node and a router between them, whose rules can silence one.
+"""A network namespace for each node, and a router between them that can cut a node off.
 
-Needs Linux with ``unshare`` and ``ip`` and no privilege: ``python -m benchmarks.takeover --real`` runs itself in a user
-and network namespace of its own, where this process is the router.  A robot's body hangs on the router itself, so that
-a node whose radio is lost keeps its body.
+Needs Linux with ``unshare`` and ``ip``, without privileges: ``python -m benchmarks.takeover --real`` runs itself in a
+user and network namespace, in which this process is the router. The robots are attached to the router itself, so a node
+whose radio is lost keeps its robot.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ PORT = 7000
 
 
 def within(arguments: Sequence[str]) -> int:
-    """Run this program's ``arguments`` as the router of a network of its own; returns its exit code."""
+    """Run this program's ``arguments`` as the router of a separate network; return its exit code."""
     own = ["unshare", "--user", "--map-root-user", "--net", "--kill-child", "--fork", "--pid", "--mount-proc"]
     return subprocess.run([*own, sys.executable, *arguments], check=False).returncode
 
 
 class Lan:
-    """Nodes by name, each in a namespace of its own; made inside of ``within``."""
+    """Nodes by name, each in a separate namespace; create it inside of ``within``."""
 
     def __init__(self, names: Sequence[str]) -> None:
         self._numbers = {name: number for number, name in enumerate(names, start=1)}
@@ -36,26 +36,26 @@ class Lan:
             self._join(name)
 
     def host(self, name: str) -> str:
-        """The address of the node ``name``."""
+        """Return the address of the node ``name``."""
         return f"10.9.{self._numbers[name]}.2"
 
     def router(self, name: str) -> str:
-        """The address at which the node ``name`` reaches the router, where its body is."""
+        """Return the router's address for the node ``name``, at which its robot is."""
         return f"10.9.{self._numbers[name]}.1"
 
     def command(self, name: str, arguments: Sequence[str]) -> list[str]:
-        """``arguments`` as a command that runs in the namespace of ``name``."""
+        """Return ``arguments`` as a command that runs in the namespace of ``name``."""
         return ["nsenter", "--net", f"--target={self._holders[name].pid}", *arguments]
 
     def silence(self, name: str, one_way: bool = False) -> None:
-        """Let nothing pass from a node to the others, and unless ``one_way`` nothing to it."""
+        """Drop all traffic from a node to the others, and unless ``one_way`` all traffic to it."""
         _ip("rule", "add", "iif", self._link(name), "blackhole", "priority", RULE)
         for other in self._numbers if not one_way else ():
             if other != name:
                 _ip("rule", "add", "iif", self._link(other), "to", self.host(name), "blackhole", "priority", RULE)
 
     def close(self) -> None:
-        """End every namespace, and what still runs in it."""
+        """Remove every namespace with its processes."""
         for holder in self._holders.values():
             holder.kill()
             holder.wait()

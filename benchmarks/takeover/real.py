@@ -1,4 +1,4 @@
-"""Real: one loss with real processes, each node in a network namespace of its own (``lan``)."""
+"""One failure with real processes, each node in a separate network namespace (``lan``)."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ RATE = 31.0
 
 
 class Stalled(Exception):
-    """Something did not happen in time; says what."""
+    """An event did not happen in time; the message names it."""
 
 
 class Team:
-    """The processes of one trial: a yard on the router, and the nodes; ``reactor`` says what time it is."""
+    """The processes of one trial: a simulator on the router, and the nodes; ``reactor`` is the clock."""
 
     def __init__(self, reactor: Any, others: tuple[str, ...], folder: Path, seed: int) -> None:
         self.web = WEB if WEB in others else BOOTSTRAP
@@ -62,7 +62,7 @@ class Team:
         self.operator.connect().addErrback(lambda _: None)
 
     def page(self, path: str, body: object = None) -> Any:
-        """Ask the page, or (with a ``body``) tell it something."""
+        """Send a request to the page, or (with a ``body``) an order."""
         if not self._token and path != SESSION:
             self._token = self.page(SESSION, {"code": CODE})["token"]
         connection = http.client.HTTPConnection(self._lan.host(self.web), WEB_PORT, timeout=2.0)
@@ -77,7 +77,7 @@ class Team:
             connection.close()
 
     def is_complete(self) -> bool:
-        """Whether the page lists the dogs."""
+        """Return whether the page lists the robots."""
         try:
             here = {device["name"] for device in self.page("/api/v1/state")["devices"]}
         except (OSError, http.client.HTTPException, ValueError):
@@ -85,12 +85,12 @@ class Team:
         return here >= set(self._names) and self.operator.snapshot is not None
 
     def moving(self) -> list[str]:
-        """The dogs that move."""
+        """Return the moving robots."""
         snapshot = self.operator.snapshot or {"dogs": ()}
         return [dog["name"] for dog in snapshot["dogs"] if dog["moving"]]
 
     def outcome(self, task_id: str, lost: str) -> Any:
-        """How the task ended, as a dog that is left has it in its file; None while it is open."""
+        """Return the result of the task from the store of a remaining robot; None while the task is open."""
         for name in DOGS:
             if name != lost:
                 try:
@@ -104,7 +104,7 @@ class Team:
         return None
 
     def lose(self, cause: Cause, name: str) -> None:
-        """Let the dog ``name`` be lost."""
+        """Inject the fault into the robot ``name``."""
         match cause:
             case Cause.CRASH:
                 self._processes[name].kill()
@@ -123,11 +123,11 @@ class Team:
                     self._processes[each].kill()
 
     def thaw(self, name: str) -> None:
-        """Let a frozen node go on."""
+        """Continue a frozen node."""
         os.kill(self._processes[name].pid, signal.SIGCONT)
 
     def stop(self) -> None:
-        """End everything that this team started."""
+        """Stop all processes of this team."""
         self.operator.disconnect()
         for process in self._processes.values():
             process.kill()
@@ -160,27 +160,27 @@ class Team:
 
 
 async def trial(reactor: Any, cause: Cause, seed: int) -> Trial:
-    """Lose the dog that acts in a team of real processes, and watch what the others do."""
-    dice = random.Random(f"takeover/real/{cause.value}/{seed}")
+    """Inject a fault into the acting robot of a team of real processes, and observe the other robots."""
+    rng = random.Random(f"takeover/real/{cause.value}/{seed}")
     with tempfile.TemporaryDirectory(prefix="takeover-") as folder:
         team = Team(reactor, (WEB, *WITNESSES) if cause is Cause.TRIPLE_KILL else (), Path(folder), seed)
         try:
-            return await _trial(reactor, cause, seed, team, dice)
+            return await _trial(reactor, cause, seed, team, rng)
         finally:
             team.stop()
 
 
-async def _trial(reactor: Any, cause: Cause, seed: int, team: Team, dice: random.Random) -> Trial:
+async def _trial(reactor: Any, cause: Cause, seed: int, team: Team, rng: random.Random) -> Trial:
     await _until(reactor, team.is_complete, "the page does not list all devices", 0.2)
     task_id = str(
         team.page("/api/v1/tasks", {"name": "turn-around", "tolerates": 3 if cause is Cause.TRIPLE_KILL else 1})["id"]
     )
     await _until(reactor, lambda: bool(team.moving()), "no dog goes", LOOK_S)
     lost = team.moving()[0]
-    await deferLater(reactor, dice.uniform(*PHASE_S))
+    await deferLater(reactor, rng.uniform(*PHASE_S))
     began = time.monotonic()
     team.lose(cause, lost)
-    judge = Judge(cause, seed, lost, began, dice, LIMIT_S)
+    judge = Judge(cause, seed, lost, began, rng, LIMIT_S)
     while not judge.is_over(time.monotonic()):
         await deferLater(reactor, LOOK_S)
         now = time.monotonic()

@@ -1,4 +1,4 @@
-"""Rehearsed: one loss in virtual time, with the real node, agent, driver and yard (``swarmnode.rehearsal``)."""
+"""One failure in virtual time, with the real node, agent, driver and robot simulator (``swarmnode.rehearsal``)."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from middleware.tasks.task import Task, outcome_of
 from swarmnode.rehearsal import VirtualTeam
 
 WEATHER = Weather(delay_s=0.03, jitter_s=0.01)
-"""One way takes 20 to 40 ms, as on a busy wireless network."""
+"""The one-way delay is 20 to 40 ms, as on a busy wireless network."""
 START_S, LIMIT_S, AFTER_S = 20.0, 25.0, 1.0
 
 
 def trial(cause: Cause, seed: int, loss: float = 0.1) -> Trial:
-    """Lose the dog that acts in the team of ``seed``, and watch what the others do.  ``loss`` is that of a datagram."""
-    dice = random.Random(f"takeover/{cause.value}/{seed}")
+    """Inject a fault into the acting robot of the team of ``seed``; ``loss`` is the share of lost datagrams."""
+    rng = random.Random(f"takeover/{cause.value}/{seed}")
     others = (WEB, *WITNESSES) if cause is Cause.TRIPLE_KILL else ()
     team = VirtualTeam(seed, 0.1, others=others)
     team.scatter(seed)
@@ -40,9 +40,9 @@ def trial(cause: Cause, seed: int, loss: float = 0.1) -> Trial:
     if lost is None:
         team.stop()
         return Trial(cause.value, seed, "", "", False, None, 0, 0)
-    team.clock.advance(dice.uniform(*PHASE_S))
+    team.clock.advance(rng.uniform(*PHASE_S))
     _lose(team, cause, lost)
-    judge = Judge(cause, seed, lost, team.clock.seconds(), dice, LIMIT_S, AFTER_S)
+    judge = Judge(cause, seed, lost, team.clock.seconds(), rng, LIMIT_S, AFTER_S)
     while not judge.is_over(team.clock.seconds()):
         team.clock.advance(LOOK_S)
         now = team.clock.seconds()

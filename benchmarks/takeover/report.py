@@ -1,4 +1,4 @@
-"""Report: the panel of causes as a table and as a picture of histograms."""
+"""Format the causes as a table and as histograms."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from benchmarks.takeover.cause import SAYS, Cause, Trial
 from sim.demo.trials import percentile
 
 TARGETS = {cause.value: (1.5, 2.0) for cause in Cause} | {Cause.POLITE_LEAVE.value: (0.2, 0.5)}
-"""Seconds that half and 99 % of the takeovers may take (consensus targets; reliability for the polite leave)."""
+"""Seconds for 50 % and 99 % of the takeovers (consensus targets; reliability target for the graceful leave)."""
 BIN_S, MOST_S = 0.1, 4.0
 WIDE, HIGH, LEFT = 12, 60, 150
 
 
 def table(trials: Sequence[Trial]) -> str:
-    """One line a cause: how many held, the seconds to take over, and looks at which two moved or a zombie did."""
+    """Return one line per cause: held trials, seconds to take over, and samples with two moving robots or a zombie."""
     lines = [
         f"{'':16}{'trials':>7}{'held':>6}{'p50 s':>8}{'p95 s':>8}{'p99 s':>8}{'max s':>8}"
         f"{'two':>5}{'zombie':>8}  target"
@@ -37,7 +37,7 @@ def table(trials: Sequence[Trial]) -> str:
 
 
 def drawn(trials: Sequence[Trial]) -> str:
-    """A histogram for each cause, in one SVG: tenths of a second to the right, trials upwards."""
+    """Return a histogram for each cause, in one SVG: tenths of a second to the right, trials upwards."""
     bins = round(MOST_S / BIN_S)
     parts, y = [], 10
     for cause in Cause:
