@@ -30,22 +30,26 @@ ARGOS = "ARGoS is quoted with 10,000 e-pucks at 1.7 x real time, by many threads
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure and print; return 1 if the simulation is slower than real time."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.crowd", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--bodies", default="3,100,1000,10000", help="sizes, with commas (default %(default)s)")
     parser.add_argument(
-        "--agents", type=int, default=100, help="attached to 1,000 robots; 0: none (default %(default)s)"
+        "--bodies", default="3,100,1000,10000", help="numbers of robots, comma-separated (default %(default)s)"
     )
-    parser.add_argument("--tasks", default="10,20,40", help="agents that share a task (default %(default)s; 0: none)")
-    parser.add_argument("--controller", default="search", help="of all robots (default %(default)s)")
-    parser.add_argument("--seconds", type=float, default=3.0, help="of processor for each size (default %(default)s)")
+    parser.add_argument(
+        "--agents", type=int, default=100, help="agents attached to 1,000 robots; 0: none (default %(default)s)"
+    )
+    parser.add_argument(
+        "--tasks", default="10,20,40", help="numbers of agents that share a task (default %(default)s; 0: none)"
+    )
+    parser.add_argument("--controller", default="search", help="controller of all robots (default %(default)s)")
+    parser.add_argument("--seconds", type=float, default=3.0, help="processor time for each size (default %(default)s)")
     parser.add_argument("--out", type=Path, help="write the figures to this file, as JSON")
     parser.add_argument("--one", type=int, help=argparse.SUPPRESS)
     given = parser.parse_args(arguments)
     sizes = given.bodies.split(",")
     if not all(size.isdecimal() and 1 <= int(size) <= 100_000 for size in sizes):
-        parser.error(f"--bodies must be numbers from 1 to 100000 with commas between, not {given.bodies!r}")
+        parser.error(f"--bodies must be comma-separated numbers from 1 to 100000, not {given.bodies!r}")
     shared = given.tasks.split(",")
     if not all(size.isdecimal() and int(size) <= 1000 for size in shared):
-        parser.error(f"--tasks must be numbers from 0 to 1000 with commas between, not {given.tasks!r}")
+        parser.error(f"--tasks must be comma-separated numbers from 0 to 1000, not {given.tasks!r}")
     if not 0.1 <= given.seconds <= 600 or not 0 <= given.agents <= 1000:
         parser.error("--seconds must be 0.1 to 600, and --agents 0 to 1000")
     if given.one is not None:

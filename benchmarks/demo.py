@@ -259,9 +259,14 @@ def measured(seed: int, seconds: float, run_dir: Path) -> list[str]:
 
 def main(arguments: Sequence[str]) -> int:
     """Measure and print."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.demo", description="What the demonstration costs.")
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.demo", description="Measure the demonstration.")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--seconds", type=float, default=20.0, help="at least so long the processor is watched")
+    parser.add_argument(
+        "--seconds",
+        type=float,
+        default=20.0,
+        help="minimum time of the measurement of the processor (default %(default)s)",
+    )
     given = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as folder:
         lines = measured(given.seed, given.seconds, Path(folder) / "run")

@@ -203,8 +203,10 @@ def table(rows: Sequence[Sequence[str]]) -> str:
 def main(arguments: Sequence[str]) -> int:
     """Print the tables; return 1 if a node stores more than its share, or a listing is incomplete."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.directory", description=__doc__)
-    parser.add_argument("--devices", type=int, nargs="+", default=[1000, 10_000], help="devices of the model")
-    parser.add_argument("--team", type=int, default=0, help="real nodes, in a second table")
+    parser.add_argument(
+        "--devices", type=int, nargs="+", default=[1000, 10_000], help="numbers of devices in the model"
+    )
+    parser.add_argument("--team", type=int, default=0, help="number of real nodes, in a second table")
     parser.add_argument("--seed", type=int, default=1)
     chosen = parser.parse_args(arguments)
     rows = [modelled(n, chosen.seed, wrong) for n in chosen.devices for wrong in (0.0, 0.2)]

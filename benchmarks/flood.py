@@ -46,9 +46,9 @@ CAPS = {"responses": 512, "unconfirmed": 512, "peers": 4096, "sessions": 4096, "
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure and print; return 1 if a target is missed."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.flood", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--seconds", type=float, default=SECONDS, help="of the flood (default %(default)s)")
+    parser.add_argument("--seconds", type=float, default=SECONDS, help="duration of the flood (default %(default)s)")
     parser.add_argument("--rate", type=int, default=RATE, help="datagrams a second (default %(default)s)")
-    parser.add_argument("--out", type=Path, help="write the figures there, as JSON")
+    parser.add_argument("--out", type=Path, help="write the figures to this file, as JSON")
     parser.add_argument("--fire", help=argparse.SUPPRESS)
     given = parser.parse_args(arguments)
     if given.fire:
@@ -247,7 +247,7 @@ def _printed(found: dict[str, Any]) -> list[str]:
             *(found["amplification"] <= TARGETS["amplification"], ".4f"),
         ),
         "growth_mib": ("memory grown, MiB", found["growth_mib"], found["growth_mib"] <= TARGETS["growth_mib"], ".1f"),
-        "cost_us": ("us of processor, dearest kind", found["cost_us"], found["cost_us"] <= TARGETS["cost_us"], ".1f"),
+        "cost_us": ("us of processor, most expensive", found["cost_us"], found["cost_us"] <= TARGETS["cost_us"], ".1f"),
         "rate": ("share of the rate received", found["rate_reached"], found["rate_reached"] >= TARGETS["rate"], ".3f"),
     }
     missed = [name for name, (_, _, is_met, _) in verdicts.items() if not is_met]

@@ -90,8 +90,8 @@ def main() -> int:
     parser.add_argument("--nodes", type=int, default=16)
     parser.add_argument("--times", type=int, default=400)
     parser.add_argument("--joins", type=int, default=3)
-    parser.add_argument("--flood", type=int, default=0, help="puts of one node, 64 at a time")
-    parser.add_argument("--profile", action="store_true", help="show where the time of the puts and gets goes")
+    parser.add_argument("--flood", type=int, default=0, help="number of puts of one node, 64 at a time")
+    parser.add_argument("--profile", action="store_true", help="print a profile of the puts and gets")
     arguments = parser.parse_args()
     hot = Hot(arguments.nodes)
     nodes, times = list(hot.team.nodes), arguments.times

@@ -68,8 +68,8 @@ def main() -> int:
     """Print the table; return 1 if the idle team exceeds its limits."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.idle", description=__doc__)
     parser.add_argument("--nodes", type=int, default=30)
-    parser.add_argument("--seconds", type=float, default=120.0, help="of virtual time (default 120)")
-    parser.add_argument("--loss", action="store_true", help="read as well after half of the nodes fell silent")
+    parser.add_argument("--seconds", type=float, default=120.0, help="virtual time (default 120)")
+    parser.add_argument("--loss", action="store_true", help="also read after half of the nodes became silent")
     arguments = parser.parse_args()
     team = Team(arguments.nodes, 1)
     team.clock.advance(30.0)

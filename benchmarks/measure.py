@@ -60,7 +60,7 @@ class Child:
         assert self.process.stdout is not None
         line = self.process.stdout.readline()
         if not line:
-            raise RuntimeError("a process of the measurement ended early")
+            raise RuntimeError("a child process exited early; its error output has the reason")
         found: dict[str, Any] = json.loads(line)
         return found
 

@@ -170,7 +170,7 @@ async def signed_in(where: int) -> tuple[str, list[str]]:
             if set(ROBOTS) <= set(found):
                 return ticket, [found[name] for name in ROBOTS]
             await asyncio.sleep(0.1)
-    raise SystemExit("bench-page: the robots did not join")
+    raise SystemExit("bench-page: the robots did not join in time")
 
 
 async def measured(given: Any, web: Child, where: int) -> list[str]:
@@ -204,13 +204,13 @@ async def measured(given: Any, web: Child, where: int) -> list[str]:
         _line("API, 99 of 100", late, "ms", "api", f" ({len(load.answers)} answers)"),
         _line("picture's age, p95", age, "ms", "glass", f" ({rate:.1f} a second and viewer)"),
         _line("slow viewer, oldest", max(load.slow, default=99.0), "s", "lag", f" ({len(load.slow)} pictures)"),
-        _line("dribblers closed", max(load.closed, default=0.0), "s", "closed", f" ({open_still} are still open)"),
+        _line("slow clients closed", max(load.closed, default=0.0), "s", "closed", f" ({open_still} are still open)"),
         _line("timers late", after["late_ms"], "ms", "late", f" (99 of 100: {after['late_p99_ms']:.1f} ms)"),
         _line("memory more", after["rss"] - before["rss"], "MiB", "memory", f" (of {after['rss']:.0f})"),
         f"processor             {(after['processor_s'] - midway['processor_s']) / given.seconds:8.2f} of one core",
         *([f"{load.refused} requests were REFUSED"] if load.refused else []),
         *([f"{len(broken)} clients BROKE: {broken[0].exception()!r}"] if broken else []),
-        *([f"{open_still} dribblers MISSED: still open"] if open_still and given.seconds > 20 else []),
+        *([f"{open_still} slow clients MISSED: still open"] if open_still and given.seconds > 20 else []),
     ]
 
 
@@ -226,7 +226,7 @@ def _line(what: str, value: float, unit: str, target: str, note: str) -> str:
 
 def main(arguments: Sequence[str]) -> int:
     """Load, measure and print."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.page", description="The page under load.")
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.page", description="Load the page and measure it.")
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--streams", type=int, default=200)
     parser.add_argument("--cameras", type=int, default=12)

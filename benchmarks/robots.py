@@ -30,7 +30,9 @@ TARGETS = {"frame_s": 0.032, "late_s": 0.020, "fps": 30.0, "wheel_ms": 20.0, "co
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure and print; return 1 if a target is missed."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.robots", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--seconds", type=float, default=20.0, help="of each of both parts (default %(default)s)")
+    parser.add_argument(
+        "--seconds", type=float, default=20.0, help="duration of each of the two parts (default %(default)s)"
+    )
     parser.add_argument("--yard", help=argparse.SUPPRESS)
     parser.add_argument("--drive", help=argparse.SUPPRESS)
     given = parser.parse_args(arguments)
@@ -169,7 +171,7 @@ def _measure(seconds: float) -> int:
     drivers: list[subprocess.Popen[str]] = []
     try:
         if yard.stdout.readline().strip() != "ready":
-            raise SystemExit("the yard did not start")
+            raise SystemExit("bench-robots: the robot simulator did not start")
         parts = {}
         spent = processor_s(yard.pid)
         began = time.monotonic()
@@ -212,8 +214,8 @@ def _report(parts: dict[str, list[dict[str, Any]]], legs: list[list[str]], share
     waits.sort()
     p50, p95, most = (1e3 * waits[int(part * (len(waits) - 1))] for part in (0.5, 0.95, 1.0))
     held &= p95 <= TARGETS["wheel_ms"]
-    print(f"command to wheel: p50 {p50:.2f} ms, p95 {p95:.2f} ms, most {most:.1f} ms, of {len(waits)}")
-    print(f"the yard with all three: {share:.2f} of a core")
+    print(f"command to wheel: p50 {p50:.2f} ms, p95 {p95:.2f} ms, max {most:.1f} ms, of {len(waits)}")
+    print(f"simulator with all three: {share:.2f} of a core")
     print(
         "targets: a world state each 32 ms, 95 of 100 at most 20 ms late; 30 pictures a second; "
         "command to wheel p95 at most 20 ms; "

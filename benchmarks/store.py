@@ -313,9 +313,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.store", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--kills", type=int, default=0, metavar="N", help="kill a writer N times")
     parser.add_argument("--restart", type=int, default=0, metavar="ROWS", help="start a node with that many rows")
-    parser.add_argument("--rate", action="store_true", help="puts and gets in a second, and how long they take")
-    parser.add_argument("--seed", type=int, default=1, help="of the moments of the kills")
-    parser.add_argument("--folder", default=None, help="where the stores are made, to choose the disk")
+    parser.add_argument("--rate", action="store_true", help="measure puts and gets per second, and their durations")
+    parser.add_argument("--seed", type=int, default=1, help="seed of the times of the kills")
+    parser.add_argument("--folder", default=None, help="folder of the stores, to choose the disk")
     parser.add_argument("--child", nargs=2, metavar=("PATH", "FIRST"), help=argparse.SUPPRESS)
     parser.add_argument("--serve", metavar="PATH", help=argparse.SUPPRESS)
     options = parser.parse_args()
@@ -325,7 +325,7 @@ def main() -> int:
         serve(options.serve)
         return 0
     if not (options.kills or options.restart or options.rate):
-        parser.error("say at least one of --kills, --restart, --rate")
+        parser.error("nothing to do; give --kills, --restart or --rate")
     held = True
     with tempfile.TemporaryDirectory(dir=options.folder) as folder:
         if options.kills:

@@ -18,14 +18,16 @@ from sim.team.takers.trial import Trial
 def main(arguments: list[str] | None = None) -> int:
     """Run trials and print their results."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.takers", description=__doc__.partition("\n")[0])
-    parser.add_argument("--tuples", type=int, default=1000, help="tuples over all trials")
-    parser.add_argument("--takers", type=int, default=8, help="takers of each trial")
-    parser.add_argument("--nodes", type=int, default=12, help="nodes of each trial")
-    parser.add_argument("--loss", default="0.0-0.5", help="share of datagrams lost, or the range it goes through")
-    parser.add_argument("--trials", type=int, default=6, help="trials, from the least loss to the greatest")
+    parser.add_argument("--tuples", type=int, default=1000, help="number of tuples in all trials")
+    parser.add_argument("--takers", type=int, default=8, help="number of takers in each trial")
+    parser.add_argument("--nodes", type=int, default=12, help="number of nodes in each trial")
+    parser.add_argument("--loss", default="0.0-0.5", help="share of lost datagrams, or a range of shares")
+    parser.add_argument("--trials", type=int, default=6, help="number of trials, from the lowest loss to the highest")
     parser.add_argument("--seed", type=int, default=1, help="seed of the first trial")
-    parser.add_argument("--light", action="store_true", help="replicate no records: the councils alone, much faster")
-    parser.add_argument("--calm", action="store_true", help="kill nobody and cut nothing")
+    parser.add_argument(
+        "--light", action="store_true", help="do not replicate records: checks only the councils, much faster"
+    )
+    parser.add_argument("--calm", action="store_true", help="kill no nodes and cut no links")
     wanted = parser.parse_args(arguments)
     kind = LightTrial if wanted.light else Trial
     low, _, high = wanted.loss.partition("-")

@@ -41,11 +41,11 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.consensus", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="up to 100 agents and two missions; ends within 20 s")
     parser.add_argument(
-        "--sizes", default="", help=f"numbers of agents, with commas (default {','.join(map(str, SIZES))})"
+        "--sizes", default="", help=f"numbers of agents, comma-separated (default {','.join(map(str, SIZES))})"
     )
     parser.add_argument(
         "--seeds", type=int, default=0,
-        help=f"missions of each size, but {DEAREST} agents at most (default {SEEDS}, quick {QUICK_SEEDS})",
+        help=f"missions of each size, at most {DEAREST} agents in total (default {SEEDS}, quick {QUICK_SEEDS})",
     )  # fmt: skip
     parser.add_argument("--out", type=Path, help="write everything as JSON")
     parser.add_argument("--plot", type=Path, help="draw the costs as SVG")
@@ -63,14 +63,14 @@ def main() -> int:
             print(line(row), flush=True)
     ways = paths(1 if wanted.quick else 5, QUICK_WAY_S if wanted.quick else WAY_S)
     found = targets(rows, ways, range(1, 1 + seeds))
-    print(f"\nWays through several tasks, sequential, against the best known ({ways['by']}), and the worst of all:")
+    print(f"\nRoutes through several tasks, sequential, relative to the best known ({ways['by']}), and the maximum:")
     for key, ratio in ways["ratios"].items():
         print(f"    {key:12s} {ratio:.3f} {ways['worst'][key]:.3f}")
     print(f"\nTargets (optimum by {rows[0]['by']}):")
     for target in found:
         word = "yes" if target["is_met"] else "NO"
         print(f"    {word:3s}  {target['what']:58s} {target['is']:9.3f} (at most {target['most']:g})")
-    print(f"\nAll of it took {time.monotonic() - began:.0f} s, {time.process_time():.0f} s of processor.")
+    print(f"\nThe run took {time.monotonic() - began:.0f} s, {time.process_time():.0f} s of processor time.")
     if wanted.out:
         wanted.out.write_text(json.dumps({"rows": rows, "ways": ways, "targets": found}, indent=1), encoding="utf-8")
     if wanted.plot:

@@ -55,15 +55,23 @@ async def measured(entry: Entry, size: int, plan: Plan, parts: Sequence[str], re
 
 def main(arguments: Sequence[str]) -> int:
     """Measure, print, write."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.dht", description="This library beside its peers.")
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.dht", description="Compare DHT libraries.")
     parser.add_argument("--nodes", default="8,32", help="sizes of the network, each node a process (default 8,32)")
-    parser.add_argument("--seconds", type=float, default=5.0, help="how long each load lasts (default 5)")
-    parser.add_argument("--peers", default=",".join(ENTRIES), help="which of %(default)s; opendht names both of its")
-    parser.add_argument("--parts", default=",".join(PARTS), help=f"which of %(default)s; losses from {LEAST} nodes on")
-    parser.add_argument("--seed", type=int, default=1, help="who does what (default 1)")
+    parser.add_argument("--seconds", type=float, default=5.0, help="duration of each load (default 5)")
+    parser.add_argument(
+        "--peers",
+        default=",".join(ENTRIES),
+        help="libraries, comma-separated (default %(default)s); opendht selects both of its variants",
+    )
+    parser.add_argument(
+        "--parts",
+        default=",".join(PARTS),
+        help=f"parts, comma-separated (default %(default)s); failures need {LEAST} nodes",
+    )
+    parser.add_argument("--seed", type=int, default=1, help="seed of the choice of nodes (default 1)")
     parser.add_argument("--profile", default="", help="prefix of files for profiles of two nodes under load")
-    parser.add_argument("--out", help="write all figures there, as JSON")
-    parser.add_argument("--plot", help="draw the main figures there, as SVG")
+    parser.add_argument("--out", help="write all figures to this file, as JSON")
+    parser.add_argument("--plot", help="draw the main figures to this file, as SVG")
     given = parser.parse_args(arguments)
     try:
         entries = chosen(given.peers)
@@ -72,7 +80,7 @@ def main(arguments: Sequence[str]) -> int:
         parser.error(str(error))
     parts = given.parts.split(",")
     if min(sizes) < 3 or given.seconds <= 0 or not set(parts) <= set(PARTS):
-        parser.error("it takes 3 nodes, more than 0 seconds, and parts of " + ", ".join(PARTS))
+        parser.error("--nodes must be 3 or more, --seconds above 0, --parts some of " + ", ".join(PARTS))
     keys = min(KEYS, max(10, int(KEYS * given.seconds)))
     plan = Plan(keys, given.seconds, seed=given.seed, profile=given.profile)
     for entry in entries:

@@ -50,7 +50,7 @@ class AsyncioPeer:
 
     def watch(self, key: str, heard: Got, done: Callable[[], None]) -> None:
         """Raise ``NotImplementedError``, unless the library has watches."""
-        raise NotImplementedError("this library has no watch")
+        raise NotImplementedError("this library has no watches")
 
     def space(self, verb: str, fields: list[object], limit_s: float, done: Done) -> None:
         """Raise ``NotImplementedError``: none of these libraries has a tuple space."""
@@ -58,4 +58,4 @@ class AsyncioPeer:
 
     def lose(self, share: float) -> None:
         """Raise ``NotImplementedError``: their sockets are not accessible."""
-        raise NotImplementedError("the datagrams of this library are out of reach")
+        raise NotImplementedError("the sockets of this library are not accessible")

@@ -119,6 +119,6 @@ def chosen(words: str) -> list[Entry]:
     for word in words.split(","):
         named = {n: e for n, e in ENTRIES.items() if word == n or word == n.partition("-")[0]}
         if not named:
-            raise ValueError(f"{word} is none of {', '.join(ENTRIES)}")
+            raise ValueError(f"--peers: {word} is unknown; choose from {', '.join(ENTRIES)}")
         found |= named
     return [entry for name, entry in ENTRIES.items() if name in found]

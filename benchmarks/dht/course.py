@@ -99,7 +99,7 @@ class Course:
             if put["good"] and (await self.once(reader, "get", f"{key} try {number}", value, READ_S))["good"]:
                 return f"{key} try {number}", value
             await asyncio.sleep(1.0)
-        raise Lost(f"what the node on port {writer.port} puts is not found by others")
+        raise Lost(f"other nodes do not find the values that the node on port {writer.port} puts")
 
     async def once(self, node: Node, kind: str, key: str, value: str | int, limit_s: float = LIMIT_S) -> Result:
         """Execute one operation."""

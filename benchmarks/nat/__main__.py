@@ -48,12 +48,12 @@ async def run(count: int, lossy: int, seed: int) -> list[Outcome]:
 
 def main(arguments: Sequence[str] = tuple(sys.argv[1:])) -> int:
     """Run the command line."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.nat", description="Who reaches whom behind routers.")
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.nat", description="Connect real nodes behind NATs.")
     parser.add_argument("--count", type=whole, default=5, help="rounds of every pair (%(default)s)")
-    parser.add_argument("--lossy", type=whole, default=4, help="rounds with 30 %% lost (%(default)s)")
+    parser.add_argument("--lossy", type=whole, default=4, help="rounds with 30 %% loss (%(default)s)")
     parser.add_argument("--seed", type=int, default=1, help="seed of losses and keys (%(default)s)")
     parser.add_argument("--out", type=Path, default=Path("build"), help="folder for the JSON and the picture")
-    parser.add_argument("--docs", action="store_true", help=f"write table and picture into {DOCUMENT}, too")
+    parser.add_argument("--docs", action="store_true", help=f"also write table and picture to {DOCUMENT}")
     given = parser.parse_args(list(arguments))
     why = refusal()
     if why:
@@ -62,7 +62,7 @@ def main(arguments: Sequence[str] = tuple(sys.argv[1:])) -> int:
     try:
         given.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        parser.error(f"--out {given.out} cannot be made ({error.strerror}); name another folder")
+        parser.error(f"--out {given.out} cannot be created ({error.strerror}); choose another folder")
     began = time.monotonic()
     try:
         outcomes = asyncio.run(run(given.count, given.lossy, given.seed))

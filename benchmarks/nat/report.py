@@ -59,7 +59,7 @@ def written(document: str, outcomes: Sequence[Outcome]) -> str:
     before, begin, rest = document.partition(BEGIN)
     _, end, after = rest.partition(END)
     if not begin or not end:
-        raise ValueError(f"the document has no {BEGIN} .. {END}")
+        raise ValueError(f"the document has no marks {BEGIN} and {END}")
     lines = [BEGIN, ""]
     for part in _tried(outcomes):
         head, *body = rows(outcomes, part)

@@ -80,14 +80,14 @@ def share(word: str) -> float:
 
 def main(arguments: Sequence[str] = tuple(sys.argv[1:])) -> int:
     """Run the command line; return 0 if every trial held."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.takeover", description="Seconds to take over, by cause."
-    )
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.takeover", description="Measure takeovers, by cause.")
     parser.add_argument("--count", type=whole, default=200, help="trials of each cause in virtual time (%(default)s)")
     parser.add_argument("--real", type=whole, default=0, help="trials of each cause with real processes (%(default)s)")
     parser.add_argument("--seed", type=int, default=1, help="the first seed")
-    parser.add_argument("--loss", type=share, default=0.1, help="share of datagrams lost in virtual time (%(default)s)")
-    parser.add_argument("--cause", choices=[c.name.lower() for c in Cause], action="append", help="only this one")
+    parser.add_argument("--loss", type=share, default=0.1, help="share of lost datagrams in virtual time (%(default)s)")
+    parser.add_argument(
+        "--cause", choices=[c.name.lower() for c in Cause], action="append", help="only this cause; repeatable"
+    )
     parser.add_argument("--jobs", type=whole, default=os.cpu_count() or 1, help="trials at the same time")
     parser.add_argument("--out", type=Path, default=Path("build"), help="folder for the JSON and the pictures")
     parser.add_argument(INSIDE, action="store_true", help=argparse.SUPPRESS)
@@ -98,7 +98,7 @@ def main(arguments: Sequence[str] = tuple(sys.argv[1:])) -> int:
     try:
         given.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        parser.error(f"--out {given.out} cannot be made ({error.strerror}); name another folder")
+        parser.error(f"--out {given.out} cannot be created ({error.strerror}); choose another folder")
     if given.inside:
         real_ones = real(causes, given.real, given.seed)
         return _reported(real_ones, given.out, "real", f"real processes, {given.real} a cause")

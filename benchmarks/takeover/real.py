@@ -115,7 +115,7 @@ class Team:
             case Cause.ONE_WAY_RADIO:
                 self._lan.silence(name, one_way=True)
             case Cause.LOST_LINK:
-                raise ValueError(f"{cause.value} is tried in virtual time only")
+                raise ValueError(f"{cause.value} is available in virtual time only")
             case Cause.POLITE_LEAVE:
                 self._processes[name].terminate()
             case Cause.TRIPLE_KILL:

@@ -25,7 +25,7 @@ class CommandLineTests(SynchronousTestCase):
             ("--loss some", "--loss: must be a share from 0 to 1, is 'some'"),
             ("--loss nan", "--loss: must be a share from 0 to 1, is 'nan'"),
             ("--count 0", "there is nothing to do"),
-            (f"--out {blocked}", f"--out {blocked} cannot be made (File exists); name another folder"),
+            (f"--out {blocked}", f"--out {blocked} cannot be created (File exists); choose another folder"),
         ):
             errors = io.StringIO()
             with contextlib.redirect_stderr(errors):

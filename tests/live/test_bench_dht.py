@@ -50,4 +50,4 @@ class BenchDhtTests(SynchronousTestCase):
         """A name that is no peer ends in one line that says which there are."""
         ran = self.bench("--peers", "gnutella")
         self.assertEqual(ran.returncode, 2)
-        self.assertIn("gnutella is none of swarm-sqlite", ran.stderr)
+        self.assertIn("gnutella is unknown; choose from swarm-sqlite", ran.stderr)
