@@ -53,7 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not 0.1 <= given.seconds <= 600 or not 0 <= given.agents <= 1000:
         parser.error("--seconds must be 0.1 to 600, and --agents 0 to 1000")
     if given.one is not None:
-        sys.stdout.write(json.dumps(_alone(given.one, given.controller, given.seconds)) + "\n")
+        sys.stdout.write(json.dumps(_measure_robots(given.one, given.controller, given.seconds)) + "\n")
         return 0
     sys.stdout.write(
         f"{'robots':>8}{'rays ms':>9}{'moves':>9}{'control':>9}{'step ms':>9}{'x real time':>13}{'MiB':>8}\n"
@@ -67,19 +67,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
         row = json.loads(child.stdout)
         rows.append(row)
         cells = (f"{row[key]:9.3f}" for key in ("rays", "moves", "control", "step"))
-        _say(f"{row['robots']:>8,}{''.join(cells)}{row['factor']:13.1f}{row['mib']:8.1f}")
-    _say(f"8 rays each, steps of 32 ms, all {given.controller}, one thread; MiB: more than the program without robots")
-    _say(f"{ARGOS}: the same order, on one core")
+        _print_line(f"{row['robots']:>8,}{''.join(cells)}{row['factor']:13.1f}{row['mib']:8.1f}")
+    _print_line(
+        f"8 rays each, steps of 32 ms, all {given.controller}, one thread; MiB: more than the program without robots"
+    )
+    _print_line(f"{ARGOS}: the same order, on one core")
     figures: dict[str, Any] = {"alone": rows}
     if given.agents:
-        figures["attached"] = _attached(given.agents)
-    figures["tasks"] = _tasked([int(size) for size in shared if int(size)])
+        figures["attached"] = _measure_agents(given.agents)
+    figures["tasks"] = _measure_tasks([int(size) for size in shared if int(size)])
     if given.out is not None:
         given.out.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
     return 0 if all(row["factor"] >= 1.0 for row in rows) else 1
 
 
-def _alone(bodies: int, controller: str, seconds: float) -> dict[str, float]:
+def _measure_robots(bodies: int, controller: str, seconds: float) -> dict[str, float]:
     """Measure the simulation without agents: the mean time of a step and of its parts, including neighbour search."""
     from sim.robots.crowd.controller import CONTROLLERS, Senses
     from sim.robots.crowd.crowd import Crowd
@@ -114,7 +116,7 @@ def _alone(bodies: int, controller: str, seconds: float) -> dict[str, float]:
     return {"robots": bodies, **means, "factor": TICK_MS / means["step"], "mib": memory_bytes("VmHWM") / MIB - before}
 
 
-def _attached(agents: int) -> dict[str, float]:
+def _measure_agents(agents: int) -> dict[str, float]:
     """Measure agents with nodes and drivers on 1,000 robots without a task, with and without cameras."""
     from sim.robots.crowd.ground import roomy
     from swarmnode.crowd import CAMERA_FPS, CrowdTeam
@@ -123,8 +125,10 @@ def _attached(agents: int) -> dict[str, float]:
     team = CrowdTeam(1, agents, roomy(max(1000, agents)), stopwatch=time.process_time)
     team.clock.advance(SETTLING_S)
     figures = {"agents": float(agents), "joining": time.process_time() - began}
-    _say(f"\n{agents} agents attached to {team.yard.crowd.ground.bodies:,} robots, without a task; ms a virtual second")
-    _say(f"{'':24}{'moves, rays':>12}{'telling':>9}{'agents':>9}{'yard alone':>13}{'all':>9}{'datagrams':>11}")
+    _print_line(
+        f"\n{agents} agents attached to {team.yard.crowd.ground.bodies:,} robots, without a task; ms a virtual second"
+    )
+    _print_line(f"{'':24}{'moves, rays':>12}{'telling':>9}{'agents':>9}{'yard alone':>13}{'all':>9}{'datagrams':>11}")
     for part, fps in ((f"{CAMERA_FPS:g} pictures a second", CAMERA_FPS), ("no camera", 0.0)):
         for service in team.services.values():
             driver: Any = service.assembly.driver
@@ -139,20 +143,22 @@ def _attached(agents: int) -> dict[str, float]:
         rate = (team.board.counters["sent"] - sent) / LOOK_S
         yard = moving + telling
         costs = "".join(f"{1e3 * cost:{wide}.0f}" for cost, wide in ((moving, 12), (telling, 9), (whole - yard, 9)))
-        _say(f"{part:24}{costs}{1 / yard:11.1f} x{1 / whole:7.2f} x{rate:11,.0f}")
+        _print_line(f"{part:24}{costs}{1 / yard:11.1f} x{1 / whole:7.2f} x{rate:11,.0f}")
         figures |= {f"{part}, yard": yard, f"{part}, all": whole, f"{part}, datagrams": rate}
     team.stop()
     return figures
 
 
-def _tasked(sizes: Sequence[int]) -> list[dict[str, float]]:
+def _measure_tasks(sizes: Sequence[int]) -> list[dict[str, float]]:
     """Count the datagrams of the agents after the assignment of one task, and in the same time without a task."""
     from sim.robots.crowd.ground import roomy
     from swarmnode.crowd import CrowdTeam
 
     rows = []
     if sizes:
-        _say(f"\n{'agents':>8}{'at the task':>13}{'datagrams':>11}{'without':>9}   in the first {TASK_S:g} s of a task")
+        _print_line(
+            f"\n{'agents':>8}{'at the task':>13}{'datagrams':>11}{'without':>9}   in the first {TASK_S:g} s of a task"
+        )
     for agents in sizes:
         team = CrowdTeam(1, agents, roomy(max(100, agents)))
         team.clock.advance(TASK_S)
@@ -165,12 +171,12 @@ def _tasked(sizes: Sequence[int]) -> list[dict[str, float]]:
         rows.append(
             {"agents": float(agents), "taking part": float(len(team.words())), "idle": sent[0], "task": sent[1]}
         )
-        _say(f"{agents:>8}{len(team.words()):>13}{sent[1]:>11,.0f}{sent[0]:>9,.0f}")
+        _print_line(f"{agents:>8}{len(team.words()):>13}{sent[1]:>11,.0f}{sent[0]:>9,.0f}")
         team.stop()
     return rows
 
 
-def _say(line: str) -> None:
+def _print_line(line: str) -> None:
     sys.stdout.write(f"{line}\n")
     sys.stdout.flush()
 

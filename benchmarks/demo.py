@@ -84,7 +84,7 @@ class Viewer:
     def __init__(self, page: Page, host: str) -> None:
         self._page = page
         self._host = host
-        self._ends = False
+        self._is_stopping = False
         self._threads: list[threading.Thread] = []
         self.pictures = 0
         self.bytes = 0
@@ -99,7 +99,7 @@ class Viewer:
 
     def close(self) -> None:
         """Close the streams."""
-        self._ends = True
+        self._is_stopping = True
         for thread in self._threads:
             thread.join(6.0)
 
@@ -107,7 +107,7 @@ class Viewer:
         def look() -> None:
             connection = http.client.HTTPConnection(self._host, timeout=10)
             after = "0"
-            while not self._ends:
+            while not self._is_stopping:
                 connection.request("GET", f"/shot/{uuid}?after={after}&viewer=bench", headers=self._page.headers)
                 response = connection.getresponse()
                 picture = response.read()
@@ -123,7 +123,7 @@ class Viewer:
         connection = http.client.HTTPConnection(self._host, timeout=10)
         connection.request("GET", "/events", headers=self._page.headers)
         response = connection.getresponse()
-        while not self._ends:
+        while not self._is_stopping:
             line = response.readline()
             self.bytes += len(line)
         connection.close()
@@ -141,10 +141,10 @@ def family(root: int) -> dict[int, str]:
     found = [root]
     for pid in found:
         found += [child for child in sorted(parents) if parents[child] == pid]
-    return {pid: _name_of(pid) for pid in found}
+    return {pid: _process_name(pid) for pid in found}
 
 
-def _name_of(pid: int) -> str:
+def _process_name(pid: int) -> str:
     try:
         words = Path(f"/proc/{pid}/cmdline").read_text().split("\0")
     except OSError:
@@ -210,7 +210,7 @@ def task_run(page: Page, least_s: float) -> float:
     return took
 
 
-def _line(what: str, value: float, unit: str, target: str, note: str = "") -> str:
+def _format_line(what: str, value: float, unit: str, target: str, note: str = "") -> str:
     limit = TARGETS[target]
     shown = f"{value:8.2f}" if value < 10 else f"{value:8.1f}" if value < 1000 else f"{value:8.0f}"
     return f"{what:20}{shown} {unit:9} target {limit:g}: {'held' if value <= limit else 'MISSED'}{note}"
@@ -246,10 +246,12 @@ def measured(seed: int, seconds: float, run_dir: Path) -> list[str]:
     joining = "" if joined else " (IT HAS NOT JOINED)"
     lines += [
         "",
-        _line("memory of all", pss, "MiB PSS", "pss"),
-        _line("processor of all", cores, "cores", "cores", f" (over {span:.0f} s, task and page running)"),
-        _line("page", page_bytes, "bytes", "page", f" ({len(weight)} files, uncompressed)"),
-        _line("node without vision", plain_maps["Rss"], "MiB RSS", "plain", f" (PSS {plain_maps['Pss']:.1f}){joining}"),
+        _format_line("memory of all", pss, "MiB PSS", "pss"),
+        _format_line("processor of all", cores, "cores", "cores", f" (over {span:.0f} s, task and page running)"),
+        _format_line("page", page_bytes, "bytes", "page", f" ({len(weight)} files, uncompressed)"),
+        _format_line(
+            "node without vision", plain_maps["Rss"], "MiB RSS", "plain", f" (PSS {plain_maps['Pss']:.1f}){joining}"
+        ),
         f"ready after         {ready_s:8.1f} s; the task took {took:.1f} s",
         f"one open page       {pictures / span:8.1f} pictures a second, {carried / span / 1000:.0f} kB/s",
         f"datagrams           {rate:8.0f} a second (all of this machine's UDP)",

@@ -196,9 +196,9 @@ class Crowd:
         due = party.due
         if due != math.inf and due < self._due[place]:
             self._due[place] = due
-            self.at(max(due, self.now), self._woken, place, due)
+            self.at(max(due, self.now), self._on_timer, place, due)
 
-    def _woken(self, place: int, due: float) -> None:
+    def _on_timer(self, place: int, due: float) -> None:
         if self._due[place] == due:
             self._due[place] = math.inf
             self.pump(place)
@@ -206,16 +206,16 @@ class Crowd:
     def _carry(self, place: int, errand: Errand) -> None:
         to = self._places[errand.to.node_id]
         if isinstance(errand, Cry):
-            self._send(place, to, self._heard_cry, place, to, errand)
+            self._send(place, to, self._deliver_flood, place, to, errand)
             return
         state: dict[str, object] = {}
         for wait in TRIES:
             self.at(self.now + wait, self._try, place, to, errand, state)
-        self.at(self.now + PATIENCE, self._given_up, place, errand, state)
+        self.at(self.now + PATIENCE, self._handle_timeout, place, errand, state)
 
     def _try(self, place: int, to: int, errand: Errand, state: dict[str, object]) -> None:
         if "settled" not in state:
-            self._send(place, to, self._arrived, place, to, errand, state)
+            self._send(place, to, self._deliver, place, to, errand, state)
 
     def _send(self, place: int, to: int, call: Callable[..., None], *arguments: object) -> None:
         self.sent[place] += 1
@@ -229,17 +229,17 @@ class Crowd:
         self.handled[to] += 1
         call(*arguments)
 
-    def _heard_cry(self, place: int, to: int, cry: Cry) -> None:
+    def _deliver_flood(self, place: int, to: int, cry: Cry) -> None:
         self.parties[to].cried(cry.bids, self.ring.contacts[place], self.now)
         self.pump(to)
 
-    def _arrived(self, place: int, to: int, errand: Errand, state: dict[str, object]) -> None:
+    def _deliver(self, place: int, to: int, errand: Errand, state: dict[str, object]) -> None:
         if "reply" not in state or self.weather.twice:  # with duplicates the method runs twice, too (it is idempotent)
-            state["reply"] = self._taken(place, to, errand)
-        self._send(to, place, self._confirmed, place, errand, state)
+            state["reply"] = self._handle(place, to, errand)
+        self._send(to, place, self._handle_reply, place, errand, state)
         self.pump(to)
 
-    def _taken(self, place: int, to: int, errand: Errand) -> Announcement | None:
+    def _handle(self, place: int, to: int, errand: Errand) -> Announcement | None:
         party, sender = self.parties[to], self.ring.contacts[place]
         if isinstance(errand, Offer):
             reply = party.offered(errand.bids, sender, errand.age, errand.is_shared, self.now)
@@ -251,7 +251,7 @@ class Crowd:
         party.announced(errand.announcement, self.now)
         return None
 
-    def _confirmed(self, place: int, errand: Errand, state: dict[str, object]) -> None:
+    def _handle_reply(self, place: int, errand: Errand, state: dict[str, object]) -> None:
         if "settled" in state:
             return
         state["settled"] = True
@@ -261,7 +261,7 @@ class Crowd:
         self.parties[place].answered(errand, self.now)
         self.pump(place)
 
-    def _given_up(self, place: int, errand: Errand, state: dict[str, object]) -> None:
+    def _handle_timeout(self, place: int, errand: Errand, state: dict[str, object]) -> None:
         if "settled" not in state:
             state["settled"] = True
             self.parties[place].failed(errand, self.now)
@@ -286,10 +286,10 @@ class Crowd:
             contacts,
             rng,
             lambda message: b"",
-            lambda reports: self._told(place, reports),
+            lambda reports: self._update_view(place, reports),
         )
 
-    def _told(self, place: int, reports: tuple[Report, ...]) -> None:
+    def _update_view(self, place: int, reports: tuple[Report, ...]) -> None:
         before = self._rule.decided(self.views[place])[0]
         self.views[place] = reports
         if self._rule.decided(reports)[0] != before:

@@ -52,11 +52,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--fire", help=argparse.SUPPRESS)
     given = parser.parse_args(arguments)
     if given.fire:
-        return _fire(json.loads(sys.stdin.readline()))
+        return _send_flood(json.loads(sys.stdin.readline()))
     if given.seconds < len(KINDS) or not 0 < given.rate <= 100_000:
         parser.error(f"--seconds must be {len(KINDS)} or more, --rate 1 to 100000")
-    found = _measured(given.seconds, given.rate)
-    missed = _printed(found)
+    found = _measure(given.seconds, given.rate)
+    missed = _print_table(found)
     if given.out:
         given.out.parent.mkdir(parents=True, exist_ok=True)
         given.out.write_text(json.dumps({**found, "missed": missed}, indent=1) + "\n")
@@ -97,15 +97,15 @@ def makers(order: dict[str, Any]) -> dict[str, Callable[[], bytes]]:
     return {**single, "mixed": lambda: rng.choice(list(single.values()))()}
 
 
-def _fire(order: dict[str, Any]) -> int:
+def _send_flood(order: dict[str, Any]) -> int:
     """Send the requested datagrams, and print their number at the end."""
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(4096, resource.getrlimit(resource.RLIMIT_NOFILE)[1]),) * 2)
-    guns = []
+    senders = []
     for number in range(SOURCES):
-        gun = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        gun.bind((f"127.66.{number // 250}.{1 + number % 250}", 0))
-        gun.setblocking(False)
-        guns.append(gun)
+        sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        sender.bind((f"127.66.{number // 250}.{1 + number % 250}", 0))
+        sender.setblocking(False)
+        senders.append(sender)
     to = ("127.0.0.1", order["port"])
     made = makers(order)
     fired = {}
@@ -116,7 +116,7 @@ def _fire(order: dict[str, Any]) -> int:
             due = int((now - began) * order["rate"])
             while count < due:
                 with suppress(BlockingIOError):
-                    guns[count % SOURCES].sendto(made_one(), to)
+                    senders[count % SOURCES].sendto(made_one(), to)
                 count += 1
             time.sleep(PAUSE_S)
         fired[kind] = count
@@ -129,7 +129,7 @@ def _fire(order: dict[str, Any]) -> int:
 # -- the measuring process -----------------------------------------------------------------------------------------
 
 
-def _measured(seconds: float, rate: int) -> dict[str, Any]:
+def _measure(seconds: float, rate: int) -> dict[str, Any]:
     rng = random.SystemRandom()
     operator = drawn("flooded", rng)
     first = operator.founded("target", ("device", "bootstrap", "gateway"), time.time(), rng)
@@ -145,49 +145,49 @@ def _measured(seconds: float, rate: int) -> dict[str, Any]:
             port = children[0].read()["ready"]
             children.append(Child("benchmarks.flood_node", str(paths[1]), f"127.0.0.1:{port}", keys[0]))
             children[1].read()
-            return _flooded(children, port, seconds, rate)
+            return _measure_kinds(children, port, seconds, rate)
         finally:
             for child in children:
                 child.end()
 
 
-def _flooded(children: list[Child], port: int, seconds: float, rate: int) -> dict[str, Any]:
+def _measure_kinds(children: list[Child], port: int, seconds: float, rate: int) -> dict[str, Any]:
     target, friend = children[:2]
     time.sleep(1.5)
     begun = [target.asked(), friend.asked()]
     time.sleep(FIRST_S)
     quiet = [target.asked(), friend.asked()]
-    gun = Child("benchmarks.flood", "--fire", "yes")
-    children.append(gun)
+    sender = Child("benchmarks.flood", "--fire", "yes")
+    children.append(sender)
     each = seconds / len(KINDS)
     order = {"port": port, "rate": rate, "kinds": [(kind, each) for kind in KINDS]}
-    gun.say(json.dumps({**order, "recorded": quiet[0]["recorded"], "index": quiet[0]["index"]}))
+    sender.say(json.dumps({**order, "recorded": quiet[0]["recorded"], "index": quiet[0]["index"]}))
     idle = _share(begun[0], quiet[0])
     before, found = quiet[0], []
-    calls, gaps, lags, trips = _counted(()), [], [], []
+    calls, gaps, lags, trips = _sum_calls(()), [], [], []
     peak = quiet[0]["rss"]
     for kind in KINDS:
-        fired = gun.read()
+        fired = sender.read()
         time.sleep(0.05)  # datagrams in the socket buffer
         now, other = target.asked(), friend.asked()
-        calls = _counted((calls, now["calls"], other["calls"]))
+        calls = _sum_calls((calls, now["calls"], other["calls"]))
         gaps += now["gaps"] + other["gaps"]
         lags += now["lags"]
         trips += other["trips"]
         peak = max(peak, now["rss"])
-        found.append({"kind": kind, "fired": fired["fired"], **_between(before, now, idle)})
+        found.append({"kind": kind, "fired": fired["fired"], **_compare(before, now, idle)})
         before = now
-        gun.say()
+        sender.say()
     return {
         "seconds": seconds,
         "rate": rate,
-        "quiet": {"cpu": idle, "late_ms": _high(quiet[0]["gaps"] + quiet[1]["gaps"]), "calls": quiet[1]["calls"]},
+        "quiet": {"cpu": idle, "late_ms": _p99_ms(quiet[0]["gaps"] + quiet[1]["gaps"]), "calls": quiet[1]["calls"]},
         "kinds": found,
         "good": calls["good"] / max(1, calls["good"] + calls["bad"]),
         "calls": calls,
-        "late_ms": _high(gaps),
-        "lag_ms": _high(lags),
-        "trip_ms": _high(trips),
+        "late_ms": _p99_ms(gaps),
+        "lag_ms": _p99_ms(lags),
+        "trip_ms": _p99_ms(trips),
         "bytes": before["bytes"],
         "amplification": before["bytes"]["out"] / max(1, before["bytes"]["in"]),
         "growth_mib": (peak - quiet[0]["rss"]) / 2**20,
@@ -200,7 +200,7 @@ def _flooded(children: list[Child], port: int, seconds: float, rate: int) -> dic
     }
 
 
-def _counted(several: Sequence[dict[str, int]]) -> dict[str, int]:
+def _sum_calls(several: Sequence[dict[str, int]]) -> dict[str, int]:
     return {name: sum(each[name] for each in several) for name in ("good", "bad")}
 
 
@@ -209,7 +209,7 @@ def _share(one: dict[str, Any], other: dict[str, Any]) -> float:
     return float((other["cpu"] - one["cpu"]) / (other["at"] - one["at"]))
 
 
-def _between(before: dict[str, Any], now: dict[str, Any], idle: float) -> dict[str, Any]:
+def _compare(before: dict[str, Any], now: dict[str, Any], idle: float) -> dict[str, Any]:
     count = now["bytes"]["count"] - before["bytes"]["count"]
     spent = now["cpu"] - before["cpu"] - idle * (now["at"] - before["at"])
     bytes_in = now["bytes"]["in"] - before["bytes"]["in"]
@@ -220,17 +220,17 @@ def _between(before: dict[str, Any], now: dict[str, Any], idle: float) -> dict[s
         "core": _share(before, now),
         "in": bytes_in,
         "out": bytes_out,
-        "late_ms": _high(now["gaps"]),
+        "late_ms": _p99_ms(now["gaps"]),
         "good": now["calls"]["good"] / max(1, sum(now["calls"].values())),
     }
 
 
-def _high(seconds: Sequence[float]) -> float:
+def _p99_ms(seconds: Sequence[float]) -> float:
     """Return the 99th percentile in milliseconds."""
     return 1000.0 * percentile(seconds, 0.99)
 
 
-def _printed(found: dict[str, Any]) -> list[str]:
+def _print_table(found: dict[str, Any]) -> list[str]:
     """Print the table; return the names of the missed targets."""
     head = f"{'kind':8}{'fired':>9}{'received':>10}{'us each':>9}{'core':>7}{'bytes in':>12}{'out':>9}{'late ms':>9}"
     lines = [head + f"{'good':>8}"]

@@ -61,7 +61,7 @@ class Node(Protocol):
         self.team.attach(self.node, reactor)
         self.endpoint = self.node.endpoint
         self.endpoint.expose("device.settings", lambda peer, value: value)
-        self.endpoint.expose("stream.part", self._beaten)
+        self.endpoint.expose("stream.part", self._record_heartbeat)
         self._others = [bytes.fromhex(other) for other in others]
         self._recorded: list[str] = []
         self._bytes = {"in": 0, "out": 0, "count": 0}
@@ -69,10 +69,10 @@ class Node(Protocol):
         self._tick_at = 0.0
         self._clear()
         self.node.start()
-        self._tap()
+        self._count_traffic()
         self.team.start()
         self.node.join(known)
-        for every, call in ((CALL, self._call), (BEAT, self._beat), (TICK, self._tick)):
+        for every, call in ((CALL, self._call), (BEAT, self._send_heartbeat), (TICK, self._tick)):
             self._repeat(every, call)
 
     def _clear(self) -> None:
@@ -83,23 +83,23 @@ class Node(Protocol):
 
     def connectionMade(self) -> None:
         """Report the address of this node."""
-        self._say({"ready": self.network.address.port, "public": self.team.identity.public.hex()})
+        self._send_line({"ready": self.network.address.port, "public": self.team.identity.public.hex()})
 
     def dataReceived(self, data: bytes) -> None:
         """Send a report for each line."""
         for _ in range(data.count(b"\n")):
-            self._say(self._report())
+            self._send_line(self._report())
 
     def connectionLost(self, reason: object = None) -> None:
         """Exit when the parent has exited."""
         if reactor.running:
             reactor.stop()
 
-    def _say(self, what: dict[str, Any]) -> None:
+    def _send_line(self, what: dict[str, Any]) -> None:
         assert self.transport is not None
         self.transport.write(json.dumps(what).encode() + b"\n")
 
-    def _tap(self) -> None:
+    def _count_traffic(self) -> None:
         receive, send = self.network._receiver, self.network.send
         assert receive is not None
 
@@ -146,11 +146,11 @@ class Node(Protocol):
         for contact in self._contacts():
             self.node.call(contact, "device.settings", value).addCallbacks(done, failed)
 
-    def _beat(self) -> None:
+    def _send_heartbeat(self) -> None:
         for contact in self._contacts():
             self.endpoint.tell(contact, "stream.part", "beat")
 
-    def _beaten(self, peer: Contact, text: str) -> None:
+    def _record_heartbeat(self, peer: Contact, text: str) -> None:
         now = reactor.seconds()
         if self._beat_at:
             self.gaps.append(now - self._beat_at - BEAT)

@@ -181,7 +181,7 @@ async def measured(given: Any, web: Child, where: int) -> list[str]:
     before = web.asked()
     kinds = [(load.events, given.streams), (load.camera, given.cameras), (load.dribble, given.dribblers)]
     tasks = [
-        asyncio.ensure_future(_after(ARRIVAL_S * number / count, client, number))
+        asyncio.ensure_future(_run_after(ARRIVAL_S * number / count, client, number))
         for client, count in kinds
         for number in range(count)
     ]
@@ -200,13 +200,17 @@ async def measured(given: Any, web: Child, where: int) -> list[str]:
     rate = len(load.ages) / given.seconds / max(1, given.cameras)
     late, age = 1000 * percentile(load.answers, 0.99), 1000 * percentile(load.ages, 0.95)
     return [
-        _line("streams not fed", unfed, "of them", "unfed", f" (longest time without a beat {load.longest:.2f} s)"),
-        _line("API, 99 of 100", late, "ms", "api", f" ({len(load.answers)} answers)"),
-        _line("picture's age, p95", age, "ms", "glass", f" ({rate:.1f} a second and viewer)"),
-        _line("slow viewer, oldest", max(load.slow, default=99.0), "s", "lag", f" ({len(load.slow)} pictures)"),
-        _line("slow clients closed", max(load.closed, default=0.0), "s", "closed", f" ({open_still} are still open)"),
-        _line("timers late", after["late_ms"], "ms", "late", f" (99 of 100: {after['late_p99_ms']:.1f} ms)"),
-        _line("memory more", after["rss"] - before["rss"], "MiB", "memory", f" (of {after['rss']:.0f})"),
+        _format_line(
+            "streams not fed", unfed, "of them", "unfed", f" (longest time without a beat {load.longest:.2f} s)"
+        ),
+        _format_line("API, 99 of 100", late, "ms", "api", f" ({len(load.answers)} answers)"),
+        _format_line("picture's age, p95", age, "ms", "glass", f" ({rate:.1f} a second and viewer)"),
+        _format_line("slow viewer, oldest", max(load.slow, default=99.0), "s", "lag", f" ({len(load.slow)} pictures)"),
+        _format_line(
+            "slow clients closed", max(load.closed, default=0.0), "s", "closed", f" ({open_still} are still open)"
+        ),
+        _format_line("timers late", after["late_ms"], "ms", "late", f" (99 of 100: {after['late_p99_ms']:.1f} ms)"),
+        _format_line("memory more", after["rss"] - before["rss"], "MiB", "memory", f" (of {after['rss']:.0f})"),
         f"processor             {(after['processor_s'] - midway['processor_s']) / given.seconds:8.2f} of one core",
         *([f"{load.refused} requests were REFUSED"] if load.refused else []),
         *([f"{len(broken)} clients BROKE: {broken[0].exception()!r}"] if broken else []),
@@ -214,12 +218,12 @@ async def measured(given: Any, web: Child, where: int) -> list[str]:
     ]
 
 
-async def _after(seconds: float, client: Callable[[int], Coroutine[Any, Any, None]], number: int) -> None:
+async def _run_after(seconds: float, client: Callable[[int], Coroutine[Any, Any, None]], number: int) -> None:
     await asyncio.sleep(seconds)
     await client(number)
 
 
-def _line(what: str, value: float, unit: str, target: str, note: str) -> str:
+def _format_line(what: str, value: float, unit: str, target: str, note: str) -> str:
     limit = TARGETS[target]
     return f"{what:22}{value:8.2f} {unit:8} target {limit:g}: {'held' if value <= limit else 'MISSED'}{note}"
 

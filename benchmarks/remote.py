@@ -35,7 +35,7 @@ class Remote:
 
     async def up(self, limit_s: float) -> None:
         """Wait until it is ready for orders."""
-        await self._answered(0, "come up", limit_s)
+        await self._await_answer(0, "come up", limit_s)
 
     async def order(self, do: str, patience_s: float, /, **fields: Any) -> dict[str, Any]:
         """Execute an order and return its answer; raises ``Lost``."""
@@ -43,7 +43,7 @@ class Remote:
         self._waiting[self._number] = asyncio.get_running_loop().create_future()
         assert self._process.stdin is not None
         self._process.stdin.write(json.dumps({"do": do, "id": self._number, **fields}).encode() + b"\n")
-        answer = await self._answered(self._number, do, patience_s)
+        answer = await self._await_answer(self._number, do, patience_s)
         if "cannot" in answer:
             raise Unable(answer["cannot"])
         return answer
@@ -60,7 +60,7 @@ class Remote:
         await self._process.wait()
         self._reading.cancel()
 
-    async def _answered(self, number: int, what: str, limit_s: float) -> dict[str, Any]:
+    async def _await_answer(self, number: int, what: str, limit_s: float) -> dict[str, Any]:
         try:
             return await asyncio.wait_for(self._waiting[number], limit_s)
         except TimeoutError:

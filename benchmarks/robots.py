@@ -39,7 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if given.seconds < 2:
         parser.error("--seconds must be 2 or more")
     if given.yard:
-        return _play(json.loads(given.yard))
+        return _emulate(json.loads(given.yard))
     if given.drive:
         return _drive(json.loads(given.drive), given.seconds)
     return _measure(given.seconds)
@@ -48,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 # -- the robots ---------------------------------------------------------------------------------------------------
 
 
-def _play(ports: list[dict[str, int]]) -> int:
+def _emulate(ports: list[dict[str, int]]) -> int:
     """Emulate three robots; at the end print each motion that reached the legs: robot, forward velocity, time."""
     from random import Random
 
@@ -124,7 +124,7 @@ class Driven:
 
         now = self._reactor.seconds()
         if now >= self._ends_at:
-            return self._tell()
+            return self._write_report()
         self._count += 1
         # Each command has a unique velocity, by which it is recognised.
         vx = 0.05 + (self._count % 1000) * 1e-5
@@ -132,7 +132,7 @@ class Driven:
         self._driver.act({"base.vx": vx}, Permit(1, now + 0.5))
         self._reactor.callLater(COMMAND_S, self._command)
 
-    def _tell(self) -> None:
+    def _write_report(self) -> None:
         began, spent = self._before
         took = time.monotonic() - began
         told = {
@@ -203,7 +203,7 @@ def _report(parts: dict[str, list[dict[str, Any]]], legs: list[list[str]], share
             p95 = gaps[int(0.95 * len(gaps))]
             row = f"{rate:10.2f}{p95 * 1e3:8.1f}{gaps[-1] * 1e3:8.1f}{dog['pictures']:12.2f}{dog['core']:8.3f}"
             print(f"{part:22}{number + 1:4}{row}{dog['rss_mib']:9.1f}{dog['bad']:5.0f}")
-            waits += _waits(dog["commands"], [line for line in legs if line[0] == str(number)])
+            waits += _delays(dog["commands"], [line for line in legs if line[0] == str(number)])
             is_even = rate >= 0.98 / TARGETS["frame_s"] and p95 <= TARGETS["frame_s"] + TARGETS["late_s"]
             has_camera = part != "no camera"
             held &= is_even and not dog["bad"]
@@ -224,7 +224,7 @@ def _report(parts: dict[str, list[dict[str, Any]]], legs: list[list[str]], share
     return 0 if held else 1
 
 
-def _waits(commands: list[list[float]], legs: list[list[str]]) -> list[float]:
+def _delays(commands: list[list[float]], legs: list[list[str]]) -> list[float]:
     """Return the seconds from each command to the first motion of the legs with its velocity."""
     found = []
     place = 0

@@ -42,7 +42,7 @@ def written_as(number: int) -> Record:
     return Record(KEY, str(number % SLOTS), OWNER, number, "team", TTL, value, signature)
 
 
-def _say(*words: object) -> None:
+def _print_line(*words: object) -> None:
     sys.stdout.write(" ".join(map(str, words)) + "\n")
     sys.stdout.flush()
 
@@ -52,7 +52,7 @@ def _say(*words: object) -> None:
 
 def write_until_killed(path: str, first: int) -> None:
     """Write records from ``first`` on, in groups; after each group print the number of the last safe record."""
-    _say("opening")
+    _print_line("opening")
     store = SqliteStore.open(path, 0.0)
     number = first
     while True:
@@ -60,7 +60,7 @@ def write_until_killed(path: str, first: int) -> None:
             store.put(written_as(number), TTL)
             number += 1
         store.flush(60.0)
-        _say(number - 1)
+        _print_line(number - 1)
 
 
 @dataclass
@@ -84,7 +84,7 @@ def killed(path: str, count: int, seed: int) -> Kills:
     seen = Kills()
     safe = 0
     for kill in range(1, count + 1):
-        first = _highest(path) + 1
+        first = _highest_number(path) + 1
         command = [sys.executable, "-m", "benchmarks.store", "--child", path, str(first)]
         child = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
         assert child.stdout is not None
@@ -103,18 +103,18 @@ def killed(path: str, count: int, seed: int) -> Kills:
         last = int(lines[-1]) if lines else safe
         seen.acknowledged += last - first + 1 if lines else 0
         safe = max(safe, last)
-        _look(path, safe, kill, seen)
+        _check_file(path, safe, kill, seen)
     return seen
 
 
-def _highest(path: str) -> int:
+def _highest_number(path: str) -> int:
     if not os.path.exists(path):
         return 0
     with closing(SqliteStore.open(path, 0.0)) as store:
         return max((record.sequence for record in store.records()), default=0)
 
 
-def _look(path: str, safe: int, kill: int, seen: Kills) -> None:
+def _check_file(path: str, safe: int, kill: int, seen: Kills) -> None:
     with closing(sqlite3.connect(path)) as connection:
         (verdict,) = connection.execute("PRAGMA integrity_check").fetchone()
         if verdict != "ok":
@@ -150,7 +150,7 @@ def serve(path: str) -> None:
 
     def serving() -> None:
         service.startService()
-        _say(len(seams.store), memory_bytes(), memory_bytes("VmHWM"))
+        _print_line(len(seams.store), memory_bytes(), memory_bytes("VmHWM"))
 
     reactor.callWhenRunning(serving)
     reactor.run()
@@ -158,7 +158,7 @@ def serve(path: str) -> None:
 
 def restarted(folder: str, rows: int, times: int = 5) -> bool:
     """Print the time until a node with ``rows`` rows serves; return False if it is too long."""
-    _say(f"{'rows':>8} {'file MiB':>9} {'serving after s':>16} {'worst s':>8} {'RSS MiB':>8} {'peak MiB':>9}")
+    _print_line(f"{'rows':>8} {'file MiB':>9} {'serving after s':>16} {'worst s':>8} {'RSS MiB':>8} {'peak MiB':>9}")
     held = True
     for count in (0, rows):
         path = os.path.join(folder, f"{count}.sqlite")
@@ -183,9 +183,9 @@ def restarted(folder: str, rows: int, times: int = 5) -> bool:
         assert said and said[0] >= count
         size = os.path.getsize(path) / MIB
         median = sorted(took)[times // 2]
-        _say(f"{count:8} {size:9.1f} {median:16.2f} {max(took):8.2f} {said[1] / MIB:8.1f} {said[2] / MIB:9.1f}")
+        _print_line(f"{count:8} {size:9.1f} {median:16.2f} {max(took):8.2f} {said[1] / MIB:8.1f} {said[2] / MIB:9.1f}")
         held = held and max(took) <= RESTART_S
-    _say(f"target: at most {RESTART_S:g} s, the worst of {times}: {'held' if held else 'MISSED'}")
+    _print_line(f"target: at most {RESTART_S:g} s, the worst of {times}: {'held' if held else 'MISSED'}")
     return held
 
 
@@ -225,11 +225,11 @@ class Rate:
         started = time.monotonic()
         if not self._count:
             await task.deferLater(reactor, 1.0)
-        await gatherResults([Deferred.fromCoroutine(self._put_on()) for _ in range(self._in_flight)])
+        await gatherResults([Deferred.fromCoroutine(self._put_next()) for _ in range(self._in_flight)])
         running = False
         return time.monotonic() - started
 
-    async def _put_on(self) -> None:
+    async def _put_next(self) -> None:
         while self._left:
             self._left -= 1
             number = self._base + self._left
@@ -245,8 +245,8 @@ async def _rates(folder: str, outcome: list[bool]) -> None:
     from twisted.internet import reactor
 
     deliver = cast(IReactorFromThreads, reactor).callFromThread
-    _say(f"disk: {_sync_s(folder) * 1000:.2f} ms for a write and fsync of 4 KiB (median of 100)")
-    _say(
+    _print_line(f"disk: {_sync_s(folder) * 1000:.2f} ms for a write and fsync of 4 KiB (median of 100)")
+    _print_line(
         f"{'value':>9} {'in flight':>10} {'puts/s':>8} {'safe after p50':>15} {'p99 ms':>8} {'max ms':>8}"
         f" {'late p99 ms':>12} {'max ms':>8} {'gets/s':>9} {'RSS MiB':>8}"
     )
@@ -255,10 +255,10 @@ async def _rates(folder: str, outcome: list[bool]) -> None:
         idle = Rate(store, 0, 0, 0, 0)
         await idle.run()
     usual = percentile(idle.late, 0.99)
-    _say(f"{'idle':>9} {'':61} {usual * 1000:12.2f} {max(idle.late) * 1000:8.2f}")
+    _print_line(f"{'idle':>9} {'':61} {usual * 1000:12.2f} {max(idle.late) * 1000:8.2f}")
     for size, count, in_flight in ((200, 1500, 1), (200, 6000, 64), (10_000, 400, 16), (MIB, 24, 4)):
         if size > MAX_VALUE and size > 10_000:
-            _say(f"{size:9} (a record carries at most {MAX_VALUE} bytes)")
+            _print_line(f"{size:9} (a record carries at most {MAX_VALUE} bytes)")
         path = os.path.join(folder, f"rate-{size}-{in_flight}.sqlite")
         with closing(SqliteStore.open(path, 0.0, max_bytes=64 * MIB, deliver=deliver)) as store:
             rate = Rate(store, size, count, in_flight, base)
@@ -271,7 +271,7 @@ async def _rates(folder: str, outcome: list[bool]) -> None:
             gets = len(keys) * max(1, 20_000 // len(keys)) / (time.perf_counter() - started)
         late = percentile(rate.late, 0.99)
         outcome.append(late <= usual + STALL_S)
-        _say(
+        _print_line(
             f"{size:9} {in_flight:10} {count / seconds:8.0f} {percentile(rate.latencies, 0.5) * 1000:15.2f}"
             f" {percentile(rate.latencies, 0.99) * 1000:8.2f} {max(rate.latencies) * 1000:8.2f}"
             f" {late * 1000:12.2f} {max(rate.late) * 1000:8.2f} {gets:9.0f} {memory_bytes() / MIB:8.1f}"
@@ -301,7 +301,7 @@ def rated(folder: str) -> bool:
     except SystemExit as ended:
         outcome.append(not ended.code)
     held = all(outcome)
-    _say(
+    _print_line(
         f"target: the reactor at most {STALL_S * 1000:g} ms later than an idle one at p99:"
         f" {'held' if held else 'MISSED'}"
     )
@@ -331,13 +331,15 @@ def main() -> int:
         if options.kills:
             started = time.monotonic()
             seen = killed(os.path.join(folder, "kills.sqlite"), options.kills, options.seed)
-            _say(f"{'kills':>6} {'before any':>14} {'acknowledged':>13} {'lost':>5} {'damaged':>8} {'seconds':>8}")
-            _say(
+            _print_line(
+                f"{'kills':>6} {'before any':>14} {'acknowledged':>13} {'lost':>5} {'damaged':>8} {'seconds':>8}"
+            )
+            _print_line(
                 f"{seen.kills:6} {seen.early:14} {seen.acknowledged:13} {len(seen.lost):5} {len(seen.damaged):8}"
                 f" {time.monotonic() - started:8.0f}"
             )
             for line in seen.lost[:10] + seen.damaged[:10]:
-                _say(line)
+                _print_line(line)
             held = seen.is_clean() and held
         if options.restart:
             held = restarted(folder, options.restart) and held

@@ -40,13 +40,13 @@ class Bidder:
         self._capacity = capacity
         self._known: dict[str, dict[str, Statement]] = {task: {} for task in self._tasks}
         self._rival: dict[str, Statement | None] = dict.fromkeys(self._tasks)
-        self._told: dict[str, Statement | None] = dict.fromkeys(self._tasks)
+        self._sent_statements: dict[str, Statement | None] = dict.fromkeys(self._tasks)
         self._out: dict[tuple[str, str], Statement] = {}
-        self._heard: dict[str, dict[tuple[str, str], int]] = {}
+        self._received_statements: dict[str, dict[tuple[str, str], int]] = {}
         self._touched: set[str] = set()
         self._disowned: set[str] = set()
         self._count = 0
-        self._choose()
+        self._rebuild_bundle()
 
     def winner(self, task: str) -> Statement | None:
         """Return the highest valid bid for a task in this agent's view, or None."""
@@ -60,14 +60,14 @@ class Bidder:
         """Process a neighbour's statements; return newer statements that the neighbour should have."""
         corrections = []
         is_moved = False
-        heard = self._heard.setdefault(neighbour, {})
+        heard = self._received_statements.setdefault(neighbour, {})
         for said in statements:
             task, agent, version, bid = said
             bids = self._known.get(task)
             if bids is None or not 0.0 <= bid <= MAX_NUMBER:
                 continue
             if agent == self.agent:
-                is_moved |= self._remembered(said)
+                is_moved |= self._adopt_previous_run(said)
                 continue
             known = bids.get(agent)
             if known is not None and known.version > version:
@@ -79,9 +79,9 @@ class Bidder:
             bids[agent] = said
             if known is not None and known.bid > 0.0:
                 self._out[task, agent] = said  # it replaces the forwarded statement
-            is_moved |= self._looked_again(said)
+            is_moved |= self._update_rival(said)
         if is_moved:
-            self._choose()
+            self._rebuild_bundle()
         return corrections
 
     def drain(self) -> dict[str, tuple[Statement, ...]]:
@@ -91,14 +91,14 @@ class Bidder:
         """
         for task in sorted(self._touched):
             best = self.winner(task)
-            if best is not None and best != self._told[task]:
-                self._out[task, best.agent] = self._told[task] = best
+            if best is not None and best != self._sent_statements[task]:
+                self._out[task, best.agent] = self._sent_statements[task] = best
         news = sorted(self._out.items())
         self._out.clear()
         self._touched.clear()
         found = {}
         for neighbour in self.neighbours:
-            heard = self._heard.get(neighbour, {})
+            heard = self._received_statements.get(neighbour, {})
             fresh = tuple(said for key, said in news if heard.get(key, 0) < said.version)
             if fresh:
                 found[neighbour] = fresh
@@ -109,7 +109,7 @@ class Bidder:
         """Whether there is nothing to send."""
         return not self._out and not self._touched
 
-    def _remembered(self, said: Statement) -> bool:
+    def _adopt_previous_run(self, said: Statement) -> bool:
         """Number new statements above the statements of a previous run of this agent, which others remember."""
         own = self._known[said.task].get(self.agent)
         if said.version <= (own.version if own is not None else 0):
@@ -119,7 +119,7 @@ class Bidder:
         self._disowned.add(said.task)
         return True
 
-    def _looked_again(self, said: Statement) -> bool:
+    def _update_rival(self, said: Statement) -> bool:
         """Recompute the best bid of the others for that task; return whether the own bundle can change."""
         task, before = said.task, self._rival[said.task]
         self._touched.add(task)
@@ -136,7 +136,7 @@ class Bidder:
         own = self._known[task].get(self.agent)
         return task in self.bundle and own is not None and after is not None and not _beats(own.bid, self.agent, after)
 
-    def _choose(self) -> None:
+    def _rebuild_bundle(self) -> None:
         """Rebuild the bundle, best task first, from tasks on which no other agent bids more.
 
         A bid is never higher than the previous one in the bundle (bid warping: Johnson, Choi, How 2012), so the agents

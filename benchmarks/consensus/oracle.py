@@ -32,9 +32,9 @@ def least_star(mission: Mission) -> tuple[float, str]:
 def least_way(mission: Mission, ways: dict[str, list[str]], seconds: float) -> tuple[float, str]:
     """Return the shortest known sum of routes through all tasks, and the solver's name, starting from ``ways``."""
     try:
-        return min(travelled(mission, ways), _by_ortools(mission, seconds)), "OR-Tools"
+        return min(travelled(mission, ways), _solve_with_ortools(mission, seconds)), "OR-Tools"
     except ImportError:
-        return _annealed(mission, ways, round(STEPS_S * seconds)), "own search"
+        return _anneal(mission, ways, round(STEPS_S * seconds)), "own search"
 
 
 def travelled(mission: Mission, ways: dict[str, list[str]]) -> float:
@@ -42,7 +42,7 @@ def travelled(mission: Mission, ways: dict[str, list[str]]) -> float:
     return sum(length(mission.starts[a], [mission.places[t] for t in way]) for a, way in ways.items())
 
 
-def _annealed(mission: Mission, ways: dict[str, list[str]], steps: int) -> float:
+def _anneal(mission: Mission, ways: dict[str, list[str]], steps: int) -> float:
     """Improve the routes by simulated annealing: move single tasks, and sometimes accept a longer route."""
     rng = random.Random(mission.seed)
     now = {agent: list(ways.get(agent, ())) for agent in mission.alive}
@@ -76,7 +76,7 @@ def _annealed(mission: Mission, ways: dict[str, list[str]], steps: int) -> float
     return best
 
 
-def _by_ortools(mission: Mission, seconds: float) -> float:
+def _solve_with_ortools(mission: Mission, seconds: float) -> float:
     from ortools.constraint_solver import pywrapcp, routing_enums_pb2
 
     agents, tasks = mission.alive, list(mission.places)

@@ -41,11 +41,11 @@ class Child:
 
     def _read(self) -> None:
         for line in sys.stdin:
-            self._node.soon(self._obey, json.loads(line))
+            self._node.soon(self._execute, json.loads(line))
         # The parent has exited, perhaps without a message.
         os._exit(0)
 
-    def _obey(self, order: Order) -> None:
+    def _execute(self, order: Order) -> None:
         try:
             getattr(self, "_do_" + order["do"])(order)
         except NotImplementedError as error:
@@ -70,7 +70,7 @@ class Child:
             if wanted is None:
                 self._answer(order, join_ms=ms())
             else:
-                self._timed("get", wanted[0], bytes.fromhex(wanted[1]), TRY_S, read)
+                self._start_timing("get", wanted[0], bytes.fromhex(wanted[1]), TRY_S, read)
 
         def read(is_good: bool, _: float) -> None:
             if is_good or time.monotonic() - began > order["limit_s"]:
@@ -90,11 +90,11 @@ class Child:
         key, value = order["key"], order["value"]
         # A long value is represented by its length: reader and writer generate it from the key.
         data = random.Random(key).randbytes(value) if isinstance(value, int) else bytes.fromhex(value)
-        self._timed(order["kind"], key, data, order["limit_s"], done)
+        self._start_timing(order["kind"], key, data, order["limit_s"], done)
 
     def _do_load(self, order: Order) -> None:
         """Keep operations in flight: each item ``once``, or all of them repeatedly for ``seconds``."""
-        Load(self._timed, self._node.later, order, lambda **fields: self._answer(order, **fields)).fill()
+        Load(self._start_timing, self._node.later, order, lambda **fields: self._answer(order, **fields)).fill()
 
     def _do_space(self, order: Order) -> None:
         """Execute one operation on the tuple space; ``moments`` are its start and end."""
@@ -139,7 +139,9 @@ class Child:
             self._profile.enable()
         self._answer(order)
 
-    def _timed(self, kind: str, key: str, value: bytes, limit_s: float, done: Callable[[bool, float], None]) -> None:
+    def _start_timing(
+        self, kind: str, key: str, value: bytes, limit_s: float, done: Callable[[bool, float], None]
+    ) -> None:
         is_open = True
         began = time.monotonic()
 

@@ -138,24 +138,24 @@ class Course:
         joiners = min(JOINERS, len(self.nodes) - 2)
         async with self.phase("join", 3 * PHASE_S):
             await self.begin(self.nodes[: len(self.nodes) - joiners])
-            self.result["join_ms"] = await self._joined(joiners)
+            self.result["join_ms"] = await self._measure_joins(joiners)
         if "trouble" in self.result:
             return False
         async with self.phase("idle"):
-            await self._rest()
+            await self._measure_idle()
         items = [(f"single {n}", self.value()) for n in range(self.plan.keys)]
         held: list[list[bool | None]] = []
         async with self.phase("singles", 4 * PHASE_S):
-            held = await self._single(items)
+            held = await self._measure_single(items)
         if held:
             async with self.phase("load", 2 * PHASE_S):
-                await self._load(items, held)
+                await self._measure_load(items, held)
         memory = [memory_mib(pid) for pid in self.team.pids]
         self.result["rss_mib"] = percentile([rss for rss, _ in memory], 50)
         self.result["uss_mib"] = percentile([uss for _, uss in memory], 50)
         return True
 
-    async def _joined(self, joiners: int) -> list[float | None]:
+    async def _measure_joins(self, joiners: int) -> list[float | None]:
         """Measure for each of the last nodes the time until it has read an existing key."""
         old = self.nodes[: len(self.nodes) - joiners]
         took: list[float | None] = []
@@ -166,7 +166,7 @@ class Course:
             took.append((await node.order("start", **order))["join_ms"])
         return took
 
-    async def _rest(self) -> None:
+    async def _measure_idle(self) -> None:
         await asyncio.sleep(self.plan.pause(4.0))
         meter = Meter(self.team.pids)
         await asyncio.sleep(self.plan.pause(3.0))
@@ -177,7 +177,7 @@ class Course:
             "core_percent": 100 * self.idle.cpu_s * share,
         }
 
-    async def _single(self, items: list[tuple[str, str]]) -> list[list[bool | None]]:
+    async def _measure_single(self, items: list[tuple[str, str]]) -> list[list[bool | None]]:
         """Put and get one at a time; return the keys that each node stores."""
         nodes, count = self.nodes, range(len(self.nodes))
         writers = [self.rng.choice(count) for _ in items]
@@ -196,7 +196,7 @@ class Course:
             self.result["remote_get"] = await self.singles("get", remote)
         return held
 
-    async def _load(self, items: list[tuple[str, str]], held: list[list[bool | None]]) -> None:
+    async def _measure_load(self, items: list[tuple[str, str]], held: list[list[bool | None]]) -> None:
         """Measure the operations that one node completes with that many in flight."""
         loaded = self.nodes[len(self.nodes) // 2]
         mine = held[len(self.nodes) // 2]

@@ -47,9 +47,9 @@ class LibtorrentPeer(AsyncioPeer):
         if known:
             self._settings["dht_bootstrap_nodes"] = f"{HOST}:{known}"
         self._session = libtorrent.session(self._settings)
-        threading.Thread(target=self._hear, daemon=True).start()
+        threading.Thread(target=self._poll_alerts, daemon=True).start()
         if not known:
-            self.later(1.0, self._is_up)
+            self.later(1.0, self._report_joined)
 
     def put(self, key: str, value: bytes, done: Done) -> None:
         """Store."""
@@ -66,27 +66,27 @@ class LibtorrentPeer(AsyncioPeer):
         """Return False for all keys: reads never come from the own store."""
         return [False] * len(keys)
 
-    def _is_up(self) -> None:
+    def _report_joined(self) -> None:
         joined, self._joined = self._joined, None
         if joined is not None:
             joined()
 
-    def _hear(self) -> None:
+    def _poll_alerts(self) -> None:
         while True:
             if self._session.wait_for_alert(1000):
                 for alert in self._session.pop_alerts():
                     if isinstance(alert, libtorrent.dht_put_alert):
-                        self.soon(self._stored, alert.target.to_bytes(), alert.num_success > 0)
+                        self.soon(self._handle_put, alert.target.to_bytes(), alert.num_success > 0)
                     elif isinstance(alert, libtorrent.dht_immutable_item_alert):
-                        self.soon(self._found, alert.target.to_bytes(), alert.item)
+                        self.soon(self._handle_item, alert.target.to_bytes(), alert.item)
                     elif isinstance(alert, libtorrent.dht_bootstrap_alert):
-                        self.soon(self._is_up)
+                        self.soon(self._report_joined)
 
-    def _stored(self, target: bytes, is_stored: bool) -> None:
+    def _handle_put(self, target: bytes, is_stored: bool) -> None:
         for done in self._puts.pop(target, []):
             done(is_stored)
 
-    def _found(self, target: bytes, item: object) -> None:
+    def _handle_item(self, target: bytes, item: object) -> None:
         value = item.encode("latin-1") if isinstance(item, str) else item if isinstance(item, bytes) else None
         for done in self._gets.pop(target, []):
             done(value)

@@ -34,19 +34,19 @@ async def space(course: Course) -> None:
             course.result.setdefault("skipped", {})["tuple space"] = str(error)
             return
         result: Result = course.result.setdefault("space", {})
-        result["put"] = await _singles(course, "put", [["job", n, 7] for n in range(count)])
-        result["read"] = await _singles(course, "read_if_exists", [["job", n, None] for n in range(count)])
-        result["take"] = await _singles(course, "get_if_exists", [["job", n, None] for n in range(count)])
-        result["crowd"] = await _crowd(course)
-        result["wake"] = await _wakes(course)
-        result["race"] = await _races(course)
+        result["put"] = await _measure_singles(course, "put", [["job", n, 7] for n in range(count)])
+        result["read"] = await _measure_singles(course, "read_if_exists", [["job", n, None] for n in range(count)])
+        result["take"] = await _measure_singles(course, "get_if_exists", [["job", n, None] for n in range(count)])
+        result["crowd"] = await _measure_concurrent(course)
+        result["wake"] = await _measure_wakeups(course)
+        result["race"] = await _measure_races(course)
 
 
 async def _do(node: Node, verb: str, fields: Fields) -> Result:
     return await node.order("space", SPACE_S + 5.0, verb=verb, fields=fields, limit_s=SPACE_S)
 
 
-async def _singles(course: Course, verb: str, works: list[Fields]) -> Result:
+async def _measure_singles(course: Course, verb: str, works: list[Fields]) -> Result:
     """One after the other, each at a random node."""
     meter = Meter(course.team.pids)
     done = [await _do(course.rng.choice(course.nodes), verb, fields) for fields in works]
@@ -54,7 +54,7 @@ async def _singles(course: Course, verb: str, works: list[Fields]) -> Result:
     return {**times(good), "failed": len(done) - len(good), **meter.read().per(len(done), course.idle)}
 
 
-async def _crowd(course: Course) -> Result:
+async def _measure_concurrent(course: Course) -> Result:
     """Put tuples at random nodes without pauses, and count the tuples that are found directly after."""
     count = course.plan.share(CROWD)
     await asyncio.gather(*(_do(course.rng.choice(course.nodes), "put", ["crowd", n, 7]) for n in range(count)))
@@ -62,7 +62,7 @@ async def _crowd(course: Course) -> Result:
     return {"found_percent": 100 * sum(each["good"] for each in asked) / count}
 
 
-async def _wakes(course: Course) -> Result:
+async def _measure_wakeups(course: Course) -> Result:
     """Measure the time from the start of a put until a waiting taker has the tuple."""
     took: list[float] = []
     count = course.plan.share(WAKES)
@@ -77,7 +77,7 @@ async def _wakes(course: Course) -> Result:
     return {**times(took), "lost": count - len(took), "of": count}
 
 
-async def _races(course: Course) -> Result:
+async def _measure_races(course: Course) -> Result:
     """Let several nodes take one tuple at once; count the races with exactly one winner."""
     single = 0
     count = course.plan.share(RACES)

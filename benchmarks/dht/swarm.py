@@ -79,11 +79,11 @@ class SwarmPeer:
 
     def put(self, key: str, value: bytes, done: Done) -> None:
         """Store; call ``done`` when a majority of the replicas has it."""
-        _tell(maybeDeferred(self._node.put, hashed_key(key), NAME, value), lambda held: done(held is not None))
+        _report_result(maybeDeferred(self._node.put, hashed_key(key), NAME, value), lambda held: done(held is not None))
 
     def get(self, key: str, value: bytes, done: Got) -> None:
         """Read; the first answer counts, as with the other libraries."""
-        _tell(self._node.get(hashed_key(key), "fast"), lambda found: done(found[0].value if found else None))
+        _report_result(self._node.get(hashed_key(key), "fast"), lambda found: done(found[0].value if found else None))
 
     def holds(self, keys: list[str]) -> list[bool | None]:
         """Look into the store."""
@@ -110,12 +110,12 @@ class SwarmPeer:
         else:
             waiting = {"timeout": limit_s} if verb in ("get", "read") else {}
             template = tuple(int if field is None else field for field in fields)
-            _tell(getattr(self._space, verb)(template, **waiting), lambda found: done(found is not None))
+            _report_result(getattr(self._space, verb)(template, **waiting), lambda found: done(found is not None))
 
     def lose(self, share: float) -> None:
         """Drop datagrams."""
         self._network.share = share
 
 
-def _tell(outcome: Deferred[Any], tell: Callable[[Any], object]) -> None:
+def _report_result(outcome: Deferred[Any], tell: Callable[[Any], object]) -> None:
     outcome.addErrback(lambda _: None).addCallback(tell)

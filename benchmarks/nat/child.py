@@ -60,8 +60,8 @@ class Member:
         endpoint = self.node.endpoint
         self._ask = endpoint.ask
         # The time at which a node learns of a peer is visible only in its own requests, so they are intercepted.
-        endpoint.ask = self._asked  # type: ignore[method-assign]
-        endpoint.on_contact.add(self._met)
+        endpoint.ask = self._ask_and_record  # type: ignore[method-assign]
+        endpoint.on_contact.add(self._on_contact)
         self.node.rpc(CALL)(lambda peer: True)
 
     def sight(self, public: bytes) -> Sight:
@@ -112,9 +112,9 @@ class Member:
         proved = self.sight(public).proved
         return "" if proved is None else path(proved)
 
-    def _asked(self, contact: Contact, method: str, *arguments: object, **options: Any) -> Deferred[Any]:
+    def _ask_and_record(self, contact: Contact, method: str, *arguments: object, **options: Any) -> Deferred[Any]:
         sight = self.sight(contact.public)
-        self._note(contact, sight)
+        self._record_contact(contact, sight)
         asked = self._ask(contact, method, *arguments, **options)
 
         def answered(answer: object) -> object:
@@ -127,12 +127,12 @@ class Member:
 
         return asked.addCallback(answered)
 
-    def _met(self, contact: Contact) -> None:
+    def _on_contact(self, contact: Contact) -> None:
         sight = self.sight(contact.public)
         sight.proved = contact
-        self._note(contact, sight)
+        self._record_contact(contact, sight)
 
-    def _note(self, contact: Contact, sight: Sight) -> None:
+    def _record_contact(self, contact: Contact, sight: Sight) -> None:
         sight.contact = contact
         if sight.known_at < 0:
             sight.known_at = reactor.seconds()
@@ -166,10 +166,10 @@ class Computer:
 
     def _read(self) -> None:
         for line in sys.stdin:
-            reactor.callFromThread(self._obey, json.loads(line))
+            reactor.callFromThread(self._execute, json.loads(line))
         os._exit(0)
 
-    def _obey(self, order: Order) -> None:
+    def _execute(self, order: Order) -> None:
         try:
             getattr(self, "_do_" + order["do"])(order)
         except Exception as error:

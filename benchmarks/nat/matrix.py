@@ -112,7 +112,7 @@ class Trial:
                 self.outcome.joined_s.append(answer["joined_s"])
             met = await asyncio.gather(*(self._ask("meet", host, meet_s) for host in self.order))
             self.outcome.took_s = [answer["took_s"] for answer in met]
-            self.outcome.path = await self._found([answer["path"] for answer in met])
+            self.outcome.path = await self._worse_path([answer["path"] for answer in met])
         except Lost as error:
             self.outcome.trouble = str(error)
 
@@ -123,7 +123,7 @@ class Trial:
         try:
             answer = await self._ask("call", host, BACK_S)
             outcome.took_s = [answer["took_s"]]
-            outcome.path = await self._found([answer["path"]])
+            outcome.path = await self._worse_path([answer["path"]])
         except Lost as error:
             outcome.trouble = str(error)
         return outcome
@@ -131,7 +131,9 @@ class Trial:
     async def look(self) -> None:
         """Record the present path between them."""
         try:
-            self.outcome.later = await self._found([await self._path(host, self._other(host)) for host in self.order])
+            self.outcome.later = await self._worse_path(
+                [await self._path(host, self._peer_of(host)) for host in self.order]
+            )
         except Lost as error:
             self.outcome.trouble = str(error)
 
@@ -140,16 +142,16 @@ class Trial:
         for host in self._seeds:
             await self._fleet[host].order("stop", trials=[self._name])
 
-    def _other(self, host: str) -> str:
+    def _peer_of(self, host: str) -> str:
         return next(public for other, public in self._publics.items() if other not in (host, PUB))
 
     async def _ask(self, do: str, host: str, limit_s: float) -> dict[str, Any]:
-        return await self._fleet[host].order(do, limit_s, trial=self._name, peer=self._other(host))
+        return await self._fleet[host].order(do, limit_s, trial=self._name, peer=self._peer_of(host))
 
     async def _path(self, host: str, peer: str) -> str:
         return str((await self._fleet[host].order("path", trial=self._name, peer=peer))["path"])
 
-    async def _found(self, between: Sequence[str]) -> str:
+    async def _worse_path(self, between: Sequence[str]) -> str:
         """Return the worse path of the two directions; a relayed path counts as a tunnel if its first hop is one."""
         to_bootstrap = [await self._path(host, self._publics[PUB]) for host in self.order]
         if "" in between:
@@ -168,7 +170,7 @@ class Trial:
             node |= {"roles": ["bootstrap"], "tunnel_port": tunnel_port}
         else:
             node |= {"tunnels": [f"wss://{PUBS[0]}:{tunnel_port}"]}
-        sought = [self._other(host)] if known else []
+        sought = [self._peer_of(host)] if known else []
         order = {"trial": self._name, "node": node, "seed": self._seeds[host].hex(), "sought": sought}
         return await self._fleet[host].order("start", limit_s, **order)
 
@@ -190,40 +192,40 @@ class Matrix:
         self._net.mapping_life("short", SHORT_S)
         for site in ("lateleaky", "lateport"):
             self._net.weather(PUB, to=f"{site}-gw", delay=LATE_MS)
-        (idle,) = await self._wave([IDLE_PAIR], JOIN_S, MEET_S)
+        (idle,) = await self._run_wave([IDLE_PAIR], JOIN_S, MEET_S)
         began = time.monotonic()
         pairs = [*plain_pairs(PLAIN), *special_pairs()]
         for number in range(count):
-            trials = await self._wave(pairs, JOIN_S, MEET_S)
+            trials = await self._run_wave(pairs, JOIN_S, MEET_S)
             self.outcomes += [trial.outcome for trial in trials]
             if number < count - 1:
                 await self._end(trials)
         if count:
-            await self._lost_mappings([trial for trial in trials if trial.pair.part == PLAIN])
+            await self._reset_mappings([trial for trial in trials if trial.pair.part == PLAIN])
             await self._end(trials)
-            await self._moved()
+            await self._move_hosts()
         for name in self._net.sites:
             self._net.weather(name, loss=LOST_PERCENT)
         for _ in range(lossy):
-            trials = await self._wave(plain_pairs(LOSS), LOSSY_JOIN_S, LOSSY_MEET_S)
+            trials = await self._run_wave(plain_pairs(LOSS), LOSSY_JOIN_S, LOSSY_MEET_S)
             self.outcomes += [trial.outcome for trial in trials]
             await self._end(trials)
         for name in self._net.sites:
             self._net.heal(name)
         if count and lossy:
-            self._tell(f"{time.monotonic() - began:.0f} s without a call between the two of the idle pair")
+            self._report(f"{time.monotonic() - began:.0f} s without a call between the two of the idle pair")
             self.outcomes.append(await idle.again(IDLE, 1))
 
-    async def _wave(self, pairs: Sequence[Pair], join_s: float, meet_s: float) -> list[Trial]:
+    async def _run_wave(self, pairs: Sequence[Pair], join_s: float, meet_s: float) -> list[Trial]:
         """Run trials for all pairs at once."""
         trials = [Trial(self._fleet, pair, next(self._numbers), self._rng) for pair in pairs]
         await asyncio.gather(*(trial.run(join_s, meet_s) for trial in trials))
         await asyncio.gather(*(trial.look() for trial in trials if not trial.outcome.trouble))
         there = [trial.outcome for trial in trials if not trial.outcome.trouble]
-        self._tell(f"{pairs[0].part}: {_answered(there)} of {len(trials)} pairs have met")
+        self._report(f"{pairs[0].part}: {_count_answered(there)} of {len(trials)} pairs have met")
         return trials
 
-    async def _lost_mappings(self, trials: Sequence[Trial]) -> None:
+    async def _reset_mappings(self, trials: Sequence[Trial]) -> None:
         """Cut the bootstrap node off; then reset the mappings, and change the external addresses; record recoveries."""
         met = [trial for trial in trials if None not in trial.outcome.took_s]
         self._net.cut(PUB)
@@ -231,33 +233,33 @@ class Matrix:
         found = await asyncio.gather(*(trial.again(ALONE, 0) for trial in direct))
         self._net.heal(PUB)
         self.outcomes += found
-        self._tell(f"{ALONE}: {_answered(found)} of {len(direct)} direct pairs go on")
+        self._report(f"{ALONE}: {_count_answered(found)} of {len(direct)} direct pairs go on")
         routers = [name for name, site in self._net.sites.items() if site.kind is not Kind.NONE and name != "short"]
         for part, first, change in ((FORGOTTEN, 0, self._net.forget), (RENUMBERED, 1, self._net.renumber)):
             for name in routers:
                 change(name)
             found = await asyncio.gather(*(trial.again(part, first) for trial in met))
             self.outcomes += found
-            self._tell(f"{part}: {_answered(found)} of {len(found)} pairs are back")
+            self._report(f"{part}: {_count_answered(found)} of {len(found)} pairs are back")
 
-    async def _moved(self) -> None:
+    async def _move_hosts(self) -> None:
         """Move hosts to another network; record whether both sides reach each other again."""
-        trials = await self._wave(roaming_pairs(), JOIN_S, MEET_S)
+        trials = await self._run_wave(roaming_pairs(), JOIN_S, MEET_S)
         for trial in trials:
             self._net.move(trial.pair.host_a, "phone")
         both = [trial.again(MOVED, first) for trial in trials for first in (0, 1)]
         found = await asyncio.gather(*both)
         self.outcomes += found
-        self._tell(f"{MOVED}: {_answered(found)} of {len(found)} sides are back")
+        self._report(f"{MOVED}: {_count_answered(found)} of {len(found)} sides are back")
         await self._end(trials)
 
     async def _end(self, trials: Sequence[Trial]) -> None:
         await asyncio.gather(*(trial.end() for trial in trials))
 
-    def _tell(self, line: str) -> None:
+    def _report(self, line: str) -> None:
         self._say(f"{time.monotonic() - self._born:6.1f} s  {line}")
 
 
-def _answered(outcomes: Sequence[Outcome]) -> int:
+def _count_answered(outcomes: Sequence[Outcome]) -> int:
     """Return the number of trials in which both sides got an answer."""
     return sum(None not in one.took_s for one in outcomes)

@@ -43,8 +43,8 @@ def others(outcomes: Sequence[Outcome]) -> list[list[str]]:
 
 def table(outcomes: Sequence[Outcome]) -> str:
     """Return the complete report for a terminal."""
-    parts = [_aligned(rows(outcomes, part)) for part in _tried(outcomes)]
-    parts += [_aligned(others(outcomes))]
+    parts = [_align(rows(outcomes, part)) for part in _measured_parts(outcomes)]
+    parts += [_align(others(outcomes))]
     parts += ["\n".join(f"{'met    ' if p.is_kept else 'NOT MET'}  {p.what}: {p.seen}" for p in promises(outcomes))]
     troubles = dict.fromkeys(f"{one.part} {one.a} x {one.b}: {one.trouble}" for one in outcomes if one.trouble)
     parts += ["\n".join(list(troubles)[:12])]
@@ -61,28 +61,28 @@ def written(document: str, outcomes: Sequence[Outcome]) -> str:
     if not begin or not end:
         raise ValueError(f"the document has no marks {BEGIN} and {END}")
     lines = [BEGIN, ""]
-    for part in _tried(outcomes):
+    for part in _measured_parts(outcomes):
         head, *body = rows(outcomes, part)
-        lines += [*_markdown(head, body), ""]
+        lines += [*_format_markdown(head, body), ""]
     kept = [[p.what, p.seen, "met" if p.is_kept else "**not met**"] for p in promises(outcomes)]
-    lines += _markdown(["requirement", "result", ""], kept)
-    lines += ["", *_markdown(["case", "pair", "result"], others(outcomes)), "", END]
+    lines += _format_markdown(["requirement", "result", ""], kept)
+    lines += ["", *_format_markdown(["case", "pair", "result"], others(outcomes)), "", END]
     return before + "\n".join(lines) + after
 
 
-def _tried(outcomes: Sequence[Outcome]) -> list[str]:
+def _measured_parts(outcomes: Sequence[Outcome]) -> list[str]:
     return [part for part in WHOLE if any(one.part == part for one in outcomes)]
 
 
-def _markdown(head: list[str], body: list[list[str]]) -> list[str]:
-    return [_line(head), _line(["---"] * len(head)), *(_line(row) for row in body)]
+def _format_markdown(head: list[str], body: list[list[str]]) -> list[str]:
+    return [_format_row(head), _format_row(["---"] * len(head)), *(_format_row(row) for row in body)]
 
 
-def _line(cells: list[str]) -> str:
+def _format_row(cells: list[str]) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
-def _aligned(lines: list[list[str]]) -> str:
+def _align(lines: list[list[str]]) -> str:
     if not lines:
         return ""
     widths = [max(len(line[column]) for line in lines) for column in range(len(lines[0]))]
@@ -101,7 +101,7 @@ def drawn(outcomes: Sequence[Outcome], title: str) -> str:
         for column, b in enumerate(MATRIX[row:], start=row):
             some = [one for one in outcomes if {one.a, one.b} == {a.value, b.value}]
             if some:
-                parts += _square(LEFT + column * WIDE, TOP + row * HIGH, some)
+                parts += _draw_square(LEFT + column * WIDE, TOP + row * HIGH, some)
     y = height - 28
     for number, (path, colour) in enumerate(COLOURS.items()):
         x = LEFT + number * 130
@@ -114,7 +114,7 @@ def drawn(outcomes: Sequence[Outcome], title: str) -> str:
     )
 
 
-def _square(x: float, y: float, some: Sequence[Outcome]) -> list[str]:
+def _draw_square(x: float, y: float, some: Sequence[Outcome]) -> list[str]:
     there = [one for one in some if one.seconds < math.inf]
     path = statistics.mode(one.path for one in there) if there else ""
     words = f"{statistics.median(one.seconds for one in there):.2f} s" if there else "fails"

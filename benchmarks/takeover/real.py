@@ -171,11 +171,11 @@ async def trial(reactor: Any, cause: Cause, seed: int) -> Trial:
 
 
 async def _trial(reactor: Any, cause: Cause, seed: int, team: Team, rng: random.Random) -> Trial:
-    await _until(reactor, team.is_complete, "the page does not list all devices", 0.2)
+    await _wait_until(reactor, team.is_complete, "the page does not list all devices", 0.2)
     task_id = str(
         team.page("/api/v1/tasks", {"name": "turn-around", "tolerates": 3 if cause is Cause.TRIPLE_KILL else 1})["id"]
     )
-    await _until(reactor, lambda: bool(team.moving()), "no dog goes", LOOK_S)
+    await _wait_until(reactor, lambda: bool(team.moving()), "no dog goes", LOOK_S)
     lost = team.moving()[0]
     await deferLater(reactor, rng.uniform(*PHASE_S))
     began = time.monotonic()
@@ -191,7 +191,7 @@ async def _trial(reactor: Any, cause: Cause, seed: int, team: Team, rng: random.
     return judge.verdict()
 
 
-async def _until(reactor: Any, holds: Any, problem: str, pause: float) -> None:
+async def _wait_until(reactor: Any, holds: Any, problem: str, pause: float) -> None:
     end = time.monotonic() + START_S
     while not holds():
         if time.monotonic() > end:

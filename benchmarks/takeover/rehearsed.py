@@ -36,38 +36,38 @@ def trial(cause: Cause, seed: int, loss: float = 0.1) -> Trial:
     watcher = team.services[WITNESSES[0] if others else asker].assembly.node
     group: list[Record] = []
     watcher.watch_group(task.task_id, lambda records: group.__setitem__(slice(None), records))
-    lost = _until_one_moves(team)
+    lost = _wait_for_motion(team)
     if lost is None:
         team.stop()
         return Trial(cause.value, seed, "", "", False, None, 0, 0)
     team.clock.advance(rng.uniform(*PHASE_S))
-    _lose(team, cause, lost)
+    _inject_fault(team, cause, lost)
     judge = Judge(cause, seed, lost, team.clock.seconds(), rng, LIMIT_S, AFTER_S)
     while not judge.is_over(team.clock.seconds()):
         team.clock.advance(LOOK_S)
         now = team.clock.seconds()
         if judge.thaws(now):
             team.thaw(lost)
-        judge.look(now, _moving(team), outcome_of(submitted[0], group))
+        judge.look(now, _moving_robots(team), outcome_of(submitted[0], group))
     team.stop()
     return judge.verdict()
 
 
-def _moving(team: VirtualTeam) -> list[str]:
+def _moving_robots(team: VirtualTeam) -> list[str]:
     return [name for name, dog in team.yard.world.dogs.items() if dog.is_moving]
 
 
-def _until_one_moves(team: VirtualTeam) -> str | None:
+def _wait_for_motion(team: VirtualTeam) -> str | None:
     end = team.clock.seconds() + START_S
     while team.clock.seconds() < end:
         team.clock.advance(LOOK_S)
-        moving = _moving(team)
+        moving = _moving_robots(team)
         if moving:
             return moving[0]
     return None
 
 
-def _lose(team: VirtualTeam, cause: Cause, name: str) -> None:
+def _inject_fault(team: VirtualTeam, cause: Cause, name: str) -> None:
     match cause:
         case Cause.CRASH:
             team.kill(name)
