@@ -32,7 +32,7 @@ class Team(Fleet):
 
     def __init__(self, n: int, seed: int) -> None:
         super().__init__(n, seed, Weather(delay_s=0.0002))
-        self.rng = random.Random(seed)
+        self.random = random.Random(seed)
 
     def sent(self) -> tuple[int, int]:
         """Return the datagrams and bytes that all nodes have sent."""
@@ -54,7 +54,7 @@ class Team(Fleet):
         for _ in range(times):
             began = self.clock.seconds()
             ended: list[Any] = []
-            done = work(self.rng.choice([node for node in self.nodes if node._running]))
+            done = work(self.random.choice([node for node in self.nodes if node._running]))
             done.addErrback(lambda failure: failure.trap(EntangledError)).addCallback(ended.append)
             while not ended:
                 self.clock.advance(0.0001)
@@ -79,12 +79,12 @@ def main() -> int:
     numbers = iter(range(10**6))
     puts = team.cost(lambda node: node.put(hashed_key(f"k{next(numbers)}"), "v", b"x" * 100), 200)
     report("put", puts)
-    report("get fast", team.cost(lambda node: node.get(some(team.rng), "fast"), 200))
-    report("get majority", team.cost(lambda node: node.get(some(team.rng), "majority"), 200))
+    report("get fast", team.cost(lambda node: node.get(some(team.random), "fast"), 200))
+    report("get majority", team.cost(lambda node: node.get(some(team.random), "majority"), 200))
     if arguments.loss:
-        for node in team.rng.sample(team.nodes, len(team.nodes) // 2):
+        for node in team.random.sample(team.nodes, len(team.nodes) // 2):
             node.vanish()
-        report("get fast, half silent", team.cost(lambda node: node.get(some(team.rng), "fast"), 100))
+        report("get fast, half silent", team.cost(lambda node: node.get(some(team.random), "fast"), 100))
     return int(octets > MAX_BYTES_S or core > MAX_CORE)
 
 
