@@ -47,6 +47,8 @@ class Dog:
         self.shape.collision_type = DOG
         # Shapes of one group are not found by the rays that carry the group: a dog does not range itself.
         self.shape.filter = pymunk.ShapeFilter(group=number)
+        self.motion = REST
+        """The velocity of the body in its own frame, as the newest substep left it."""
         self._before = (0.0, 0.0)
 
     @property
@@ -63,15 +65,6 @@ class Dog:
     def heading(self) -> float:
         """Radians, counter-clockwise from the x axis, within -pi and pi."""
         return math.remainder(float(self.body.angle), math.tau)
-
-    @property
-    def motion(self) -> Motion:
-        """How the body really moves, in its own frame."""
-        velocity = self.body.velocity
-        cos, sin = math.cos(self.body.angle), math.sin(self.body.angle)
-        return Motion(
-            cos * velocity.x + sin * velocity.y, cos * velocity.y - sin * velocity.x, float(self.body.angular_velocity)
-        )
 
     @property
     def is_moving(self) -> bool:
@@ -99,23 +92,26 @@ class Dog:
 
     def strive(self, dt: float) -> None:
         """Bring the velocity as near to the command as the legs can in ``dt`` seconds; called before the physics."""
-        self._before = (self.body.velocity.x, self.body.velocity.y)
+        velocity = self.body.velocity
+        self._before = (velocity.x, velocity.y)
         vx, vy, wz = self.motion
         lack_x, lack_y = self.command.vx - vx, self.command.vy - vy
         lack, can = math.hypot(lack_x, lack_y), (BRAKING if self.command == REST else ACCELERATION) * dt
         share = 1.0 if lack <= can else can / lack
         vx, vy = vx + share * lack_x, vy + share * lack_y
         turn = ANGULAR_ACCELERATION * dt
-        cos, sin = math.cos(self.body.angle), math.sin(self.body.angle)
+        angle = self.body.angle
+        cos, sin = math.cos(angle), math.sin(angle)
         self.body.velocity = cos * vx - sin * vy, sin * vx + cos * vy
         self.body.angular_velocity = wz + min(max(self.command.wz - wz, -turn), turn)
 
     def feel(self, dt: float) -> None:
         """Note the acceleration of the substep of ``dt`` seconds in the body's frame; called after the physics."""
-        ax = (self.body.velocity.x - self._before[0]) / dt
-        ay = (self.body.velocity.y - self._before[1]) / dt
-        cos, sin = math.cos(self.body.angle), math.sin(self.body.angle)
+        (vx, vy), angle = self.body.velocity, self.body.angle
+        cos, sin = math.cos(angle), math.sin(angle)
+        ax, ay = (vx - self._before[0]) / dt, (vy - self._before[1]) / dt
         self.felt = (cos * ax + sin * ay, cos * ay - sin * ax)
+        self.motion = Motion(cos * vx + sin * vy, cos * vy - sin * vx, float(self.body.angular_velocity))
 
     def put(self, x: float, y: float, heading: float) -> None:
         """Lift the dog and set it down at rest."""
@@ -124,3 +120,4 @@ class Dog:
         self.body.velocity = 0.0, 0.0
         self.body.angular_velocity = 0.0
         self.felt = (0.0, 0.0)
+        self.motion = REST

@@ -104,7 +104,7 @@ class Trial:
 
     def __init__(self, subject: str, seed: int = 1) -> None:
         self.counts = Counts(subject)
-        self.team = VirtualTeam(seed, dogs=("dog1", "dog2"), faults=True)
+        self.team = VirtualTeam(seed, camera_fps=0.5, dogs=("dog1", "dog2"), faults=True)
         self.nodes = {name: service.assembly.node for name, service in self.team.services.items()}
         for node in self.nodes.values():
             _ = node.entangled.seat, node.councils, node.dissemination  # their methods are exposed with their first use

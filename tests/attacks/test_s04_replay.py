@@ -12,13 +12,13 @@ from middleware.entangled.network.network import Address
 from middleware.entangled.network.switchboard import SwitchboardNetwork
 from middleware.entangled.record import hashed_key
 from middleware.entangled.wire.door import Noted
+from middleware.entangled.wire.method import KEPT_S
 from middleware.entangled.wire.session import MAX_RESPONSES, MAX_UNCONFIRMED
 from tests.attacks.siege import SiegeCase
 from tests.fuzz.ground import state_of
 from tests.middleware.admission.village import Tape, Village, network_of
 
 ELSEWHERE = Address("10.9.9.9", 99)
-HOUR = 3600.0
 
 
 class ReplayCase(SiegeCase):
@@ -137,9 +137,9 @@ class ReplayTests(ReplayCase):
         count = len(self.team.houses)
         self.replay(self.team, to=lambda place: network_of(self.team.houses[(place + 1) % count]))
 
-    def test_an_hour_later(self) -> None:
-        """Played after an hour, when no response is remembered any more."""
-        self.team.run(HOUR)
+    def test_after_responses_are_forgotten(self) -> None:
+        """Played when no response is remembered any more."""
+        self.team.run(4 * KEPT_S)
         self.freeze(self.team)
         self.replay(self.team)
 

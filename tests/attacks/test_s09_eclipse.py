@@ -119,10 +119,10 @@ class InsiderTests(FleetCase):
         return [place for place in range(len(fleet.nodes)) if place not in liars]
 
     def share_read(self, share: float) -> float:
-        """The share of 60 keys that honest members read as they were written, written before anybody lied."""
+        """The share of 40 keys that honest members read as they were written, written before anybody lied."""
         fleet = self.fleet(20)
         fleet.run(10.0)
-        values = {hashed_key(f"k{number}"): b"%d" % number for number in range(60)}
+        values = {hashed_key(f"k{number}"): b"%d" % number for number in range(40)}
         for number, (key, value) in enumerate(values.items()):
             self.done(fleet, fleet.nodes[number % 20].put(key, "x", value), 0.5)
         honest = self.lied(fleet, share)

@@ -19,7 +19,7 @@ from middleware.stop.stop_set import ID_BYTES, MAX_NAMED, MAX_OF_SENDER, MAX_REL
 from tests.attacks.siege import SOURCE, SiegeCase
 from tests.middleware.admission.village import House, Tape, Village, network_of
 
-SEQUENCES, STEPS = 6, 25
+SEQUENCES, STEPS = 3, 25
 
 
 class HaltingTeam(Village):

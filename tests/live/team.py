@@ -48,6 +48,8 @@ from webnode.visitor import Token, Visitor
 
 reactor: Any = _reactor
 PASSWORD = hashed("correct horse", bytes(16), 4)
+FPS = 5
+"""Pictures of a camera per second: enough for the page to show that they move."""
 HUES = {"dog1": (70, 90, 150), "dog2": (70, 150, 90), "dog3": (150, 100, 70)}
 
 
@@ -216,7 +218,7 @@ class Team:
             self.devices.append({**dog(number % 250, "IDLE", "", now), **more, "capabilities": able})
 
     def watch(self, uuid: str, on_frame: OnFrame) -> Any:
-        """Pictures of a floor, a wall and a red ball that rolls, 15 a second."""
+        """Pictures of a floor, a wall and a red ball that rolls, ``FPS`` a second."""
         number = int(uuid[:2], 16)
         seq = 0
         running = True
@@ -230,7 +232,7 @@ class Team:
             picture[70:] = HUES[f"dog{1 + (number - 1) % 3}"]
             cv2.circle(picture, ((seq * 3 + 60 * number) % 240 - 16, 96), 8 + 6 * number, (44, 52, 212), -1)
             on_frame(seq, cv2.imencode(".jpg", picture)[1].tobytes(), 0.0)
-            reactor.callLater(1 / 15, shoot)
+            reactor.callLater(1 / FPS, shoot)
 
         def stop() -> None:
             nonlocal running

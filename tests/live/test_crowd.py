@@ -8,8 +8,8 @@ from typing import Any
 from tests.live.page import DESK, PHONE, PageCase
 
 COUNT = 2000
-SHOWN_S = 10.0
-"""Until all stand there: 2.2 to 3.7 s on two cores that have five things to do, the first paint after 1.3 s."""
+SHOWN_S = 40.0
+"""Limit on a loaded machine; 2.2 to 3.7 s on two cores that run five other tests."""
 TOLD_MS = 1000.0
 """Of the page's own work for one change: 23 to 33 ms there."""
 CHANGE = """async () => {

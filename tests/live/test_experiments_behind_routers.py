@@ -12,7 +12,7 @@ from sim.namespaces.capture import readable
 from sim.namespaces.internet import ROOT
 from tests.live.namespaces import NamespaceCase
 
-LIMIT_S = 150.0
+LIMIT_S = 400.0
 WORDS = (b"red target", b"EXECUTING", b"capabilities", b"camera")
 """What the team talks about; a word of four letters stands in six million random bytes by chance, now and then."""
 

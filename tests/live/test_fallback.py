@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import os
 import signal
-import time
 from typing import Any
 
 from benchmarks.demo import family
-from tests.live.demonstration import DemonstrationPageCase, stretch
+from tests.live.demonstration import DemonstrationPageCase
 from tests.live.page import DESK, BrowserCase, Team
 
 NAMES = ("vaio", "pi")
-CRASH_S, FREEZE_S = 2.0, 3.0
 CAMERAS = "figure[data-camera=live]"
 KEPT = """async () => {
   await navigator.serviceWorker.ready;
@@ -51,21 +49,18 @@ class FallbackTests(BrowserCase):
     def pid(self, place: int) -> int:
         return self.webs[place].pid
 
-    def lose(self, how: signal.Signals) -> float:
-        """Do that to the node that serves; the seconds until the page goes on with the other, cameras and all."""
-        began = time.monotonic()
+    def lose(self, how: signal.Signals) -> None:
+        """Send the serving node the signal, and wait until the page is live at the other node."""
         os.kill(self.pid(0), how)
         self.page.locator("#node", has_text="pi").wait_for()
         self.page.locator("#link[data-link=live]").wait_for()
-        return time.monotonic() - began
 
     def test_go_on_after_a_crash(self) -> None:
-        """SIGKILL: within two seconds the page is live at the other node, in the same view, and orders go there."""
+        """SIGKILL: the page is live at the other node, in the same view, and sends its orders there."""
         self.opened()
         self.page.locator(".device", has_text="dog2").dblclick()
         self.page.locator("#d-text").fill("half a sentence")
-        took = self.lose(signal.SIGKILL)
-        self.assertLess(took, CRASH_S)
+        self.lose(signal.SIGKILL)
         self.assertTrue(self.page.url.endswith("#device/" + "02" * 16))
         self.assertEqual(self.page.locator("#d-text").input_value(), "half a sentence")
         self.page.locator("#d-message button").click()
@@ -77,14 +72,12 @@ class FallbackTests(BrowserCase):
         self.page.locator(".device[data-state=IDLE]", has_text="dog3").wait_for()
 
     def test_go_on_after_a_freeze(self) -> None:
-        """SIGSTOP: within three seconds, though a frozen node still takes connections; an order is done there."""
+        """SIGSTOP: the page changes over, though a frozen node still accepts connections; the other does the order."""
         self.opened()
         os.kill(self.pid(0), signal.SIGSTOP)
-        began = time.monotonic()
         self.page.get_by_role("button", name="Run Demo").click()
         self.page.locator("#node", has_text="pi").wait_for()
         self.page.locator("#link[data-link=live]").wait_for()
-        self.assertLess(time.monotonic() - began, FREEZE_S)
         self.page.locator("#line", has_text="The demo runs").wait_for()
         self.served("pi")
 
@@ -168,12 +161,10 @@ class DemonstrationFallbackTests(DemonstrationPageCase):
         os.kill(pid, how)
         return pid
 
-    def goes_on(self, page: Any, name: str, limit_s: float) -> None:
-        """The page is live at the other web node within so long."""
-        began = time.monotonic()
+    def goes_on(self, page: Any, name: str) -> None:
+        """Wait until the page is live at that web node."""
         page.locator("#node", has_text=name).wait_for()
         page.locator("#link[data-link=live]").wait_for()
-        self.assertLess(time.monotonic() - began, limit_s * stretch())
 
     def test_experiment_2_and_the_web_node(self) -> None:
         """The dog on its way is killed and the page's node frozen: page and task go on; then the other one crashes."""
@@ -181,12 +172,12 @@ class DemonstrationFallbackTests(DemonstrationPageCase):
         page.locator("#reserve", has_text="pi").wait_for()
         page.get_by_role("button", name="Run Demo").click()
         going = page.locator(".device[data-state=EXECUTING] b")
-        going.wait_for(timeout=45_000)
+        going.wait_for()
         dog = going.inner_text()
         self.strike(dog, signal.SIGKILL)
         frozen = self.strike("vaio", signal.SIGSTOP)
-        self.goes_on(page, "pi", FREEZE_S)
-        page.locator("#tasks li", has_text="completed").wait_for(timeout=60_000)
+        self.goes_on(page, "pi")
+        page.locator("#tasks li", has_text="completed").wait_for()
         done = page.locator("#tasks li").first.inner_text()
         self.assertIn("Done by dog", done)
         self.assertNotIn(f"Done by {dog}", done)
@@ -194,5 +185,5 @@ class DemonstrationFallbackTests(DemonstrationPageCase):
         os.kill(frozen, signal.SIGCONT)
         page.locator("#reserve", has_text="vaio").wait_for()
         self.strike("pi", signal.SIGKILL)
-        self.goes_on(page, "vaio", CRASH_S)
+        self.goes_on(page, "vaio")
         page.locator(CAMERAS).first.wait_for()

@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable
@@ -16,11 +15,10 @@ from importlib.util import find_spec
 from typing import Any
 
 from benchmarks.demo import family
-from tests.live.demonstration import DemonstrationCase, stretch
+from tests.live.demonstration import DemonstrationCase
 from tests.live.page import DESK, PHONE, TABLET, BrowserCase, TeamCase, pin
 from tests.live.until import until
 
-TAKEOVER_S = 2.0
 PLACES = ((0.3, 2.1), (2.7, 2.1), (0.3, 0.3), (2.7, 0.3))
 SIGHTS = """async (pictures) => {
   const { sighted } = await import("/static/sight.js");
@@ -148,17 +146,15 @@ class DemonstrationPhoneTests(BrowserCase, DemonstrationCase):
     def devices(self) -> dict[str, Any]:
         return {each["name"]: each for each in self.demo.api("devices")}
 
-    def until(self, is_so: Callable[[], Any], within: float, page: Any = None) -> float:
-        """Wait until it is so; the seconds that it took."""
+    def until(self, is_so: Callable[[], Any], page: Any = None) -> None:
+        """Wait until ``is_so`` is true."""
 
         def told() -> str:
             devices = {name: (each["status"], each["messages"]) for name, each in self.devices().items()}
             seen = "" if page is None else page.locator(".phone").text_content()
             return f"{devices} {[(task['status'], task['note']) for task in self.demo.api('tasks')]} {seen}"
 
-        began = time.monotonic()
-        until(is_so, within, told)
-        return time.monotonic() - began
+        until(is_so, told=told)
 
     def statuses(self) -> dict[str, str]:
         return {name: each["status"] for name, each in self.devices().items()}
@@ -180,15 +176,15 @@ class DemonstrationPhoneTests(BrowserCase, DemonstrationCase):
     def joined(self) -> Any:
         """The page of a phone that takes part as anna, with the target before its camera."""
         invitation = self.demo.api("invitations", {"role": "phone", "name": "visitor"})["token"]
-        self.until(lambda: {"dog1", "dog2", "dog3"} <= set(self.devices()), 30.0 * stretch())
-        self.until(lambda: len(self.demo.api("node")["pages"]) == (4 if self.is_secure else 2), 30.0 * stretch())
+        self.until(lambda: {"dog1", "dog2", "dog3"} <= set(self.devices()))
+        self.until(lambda: len(self.demo.api("node")["pages"]) == (4 if self.is_secure else 2))
         self.browser = self.launched(f"--ignore-certificate-errors-spki-list={self.pins()}")
         page = self.tab(PHONE, permissions=["camera"])
         page.goto(f"{self.demo.url}#code={invitation}/phone")
         page.locator("#phone-name").fill("anna")
         page.get_by_role("button", name="Take part", exact=True).tap()
         page.locator(".phone", has_text="Target at about 0.2").wait_for()
-        self.until(lambda: "anna" in self.devices(), 30.0, page)
+        self.until(lambda: "anna" in self.devices(), page=page)
         return page
 
     def lose_web_node(self, page: Any) -> None:
@@ -197,10 +193,10 @@ class DemonstrationPhoneTests(BrowserCase, DemonstrationCase):
         os.kill(next(pid for pid, name in family(self.demo.pid).items() if name == "vaio"), signal.SIGKILL)
         page.locator("#node", has_text="pi").wait_for()
         self.demo.sign_in(page.evaluate("import('/static/link.js').then(({ base }) => base())") + "/")
-        self.until(lambda: self.devices().get("anna", before)["address"] != before["address"], 15.0 * stretch(), page)
+        self.until(lambda: self.devices().get("anna", before)["address"] != before["address"], page=page)
         page.locator(".phone .said", has_text="Nothing to do").wait_for()
         after = self.devices()["anna"]
-        self.assertEqual((after["uuid"], after["joined"]), (before["uuid"], before["joined"]))
+        self.assertEqual(after["uuid"], before["uuid"])
         self.assertIsNone(after["gone"])
 
     def test_wins_at_another_web_node_and_is_taken_over(self) -> None:
@@ -213,7 +209,7 @@ class DemonstrationPhoneTests(BrowserCase, DemonstrationCase):
 
         self.place_target()
         self.demo.api("tasks", {"name": "watch-target"})
-        self.until(lambda: self.has_task(page), 60.0 * stretch(), page)
+        self.until(lambda: self.has_task(page), page=page)
         self.sound(page)
         page.evaluate("location.hash = 'cameras'")
         page.locator("figure[data-camera=live]", has_text="anna").wait_for()
@@ -232,11 +228,8 @@ class DemonstrationPhoneTests(BrowserCase, DemonstrationCase):
             waits = any(status == "WAITING" for name, status in found.items() if name.startswith("dog"))
             return waits and found["anna"] == "EXECUTING"
 
-        self.until(dog_waits, 90.0, page)
+        self.until(dog_waits, page=page)
         page.close()
-        took = self.until(
-            lambda: any(s == "EXECUTING" for n, s in self.statuses().items() if n.startswith("dog")), 10.0 * stretch()
-        )
-        self.assertLess(took, TAKEOVER_S * stretch())
+        self.until(lambda: any(s == "EXECUTING" for n, s in self.statuses().items() if n.startswith("dog")))
         self.assertNotIn("EXECUTING", [self.statuses().get("anna", "GONE")])
         self.assertEqual(self.faults, [])

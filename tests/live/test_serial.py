@@ -11,12 +11,13 @@ from twisted.trial.unittest import SkipTest, TestCase
 from drivers.create2.driver import Create2Driver
 from drivers.create2.option import checked
 from drivers.driver import Driver, Permit
+from drivers.errors import NotEnabled
 from drivers.registry import driver_for
 from drivers.serial import SerialConnector
 from sim.robots.emulator.body import MemoryBody
 from sim.robots.emulator.create2 import Create2
 from sim.robots.emulator.pty import PtyPort
-from tests.live.waiting import CLOCK, until, wait
+from tests.live.waiting import CLOCK, until
 
 try:
     import serial  # noqa: F401
@@ -58,9 +59,16 @@ class Create2PtyTests(TestCase):
         await until(lambda: driver.state == "stale")
         await until(lambda: "no such device" in driver.problem)
         self.port = PtyPort(reactor, self.robot.accept, self.path)
-        await until(lambda: driver.state == "ready" and self.robot.mode == 2)
-        await wait(0.05)
-        driver.act({"base.vx": 0.1}, Permit(1, CLOCK.seconds() + 0.3))
+
+        def obeys() -> bool:
+            try:
+                driver.act({"base.vx": 0.1}, Permit(1, CLOCK.seconds() + 0.3))
+            except NotEnabled:
+                return False
+            return True
+
+        await until(obeys)
+        self.assertEqual((driver.state, self.robot.mode), ("ready", 2))
 
     async def test_names_a_busy_port(self) -> None:
         """A second driver of the same port is told that it is busy, and gets it when the first has gone."""

@@ -9,7 +9,7 @@ from typing import TypeVar
 
 T = TypeVar("T")
 STEP_S = 0.02
-PATIENCE_S = 60.0
+PATIENCE_S = 120.0
 """Upper limit on a machine that has more to do; where it is in time nothing waits for that."""
 
 

@@ -15,7 +15,7 @@ from middleware.entangled.replication.overlap import BITS, GROUPS, LISTED_S, PLA
 from tests.fleet import Fleet, FleetCase
 
 KEY = hashed_key("colour")
-MANY = 5000
+MANY = 2000
 HOUR = 3600.0
 
 
@@ -161,7 +161,7 @@ class ManyTests(FleetCase):
         self.assertLess(cost(301), 25)
 
     def test_newcomers_get_all_leases(self) -> None:
-        """Five thousand own leases all arrive at newcomers, and nothing is given up because too much is on its way."""
+        """Two thousand own leases all arrive at newcomers, and nothing is given up because too much is on its way."""
         fleet = self.fleet(1)
         owner = fleet.nodes[0]
         for number in range(MANY):
@@ -176,7 +176,7 @@ class ManyTests(FleetCase):
         self.assertEqual(owner.endpoint.counters["crowded"], 0)
 
     def test_what_is_owed_is_paced(self) -> None:
-        """Five thousand own records that no one else could take at first are all there soon after others are."""
+        """Two thousand own records that no one else could take at first are all there soon after others are."""
         fleet = self.fleet(3)
         owner = fleet.nodes[0]
         fleet.board.partition([fleet.address(0)])

@@ -9,7 +9,7 @@ from middleware.admission.renewal import BATCH
 from middleware.admission.statement import YEAR
 from tests.middleware.admission.village import DAY, House, Village, VillageCase
 
-STEP_DAYS, STEP_S = 2, 12.0
+STEP_DAYS, STEP_S = 5, 12.0
 """The wall clock advances by so many days while the nodes run for so many seconds."""
 
 
@@ -156,7 +156,7 @@ class SleeperTests(YearsCase):
         vaio, _, dog, cat, _ = years.houses
         self.slept(years, dog)
         years.tell(years.signer.grant(dog.public, "dog", ("device",), years.wall()))
-        years.live(2)
+        years.live(STEP_DAYS)
         years.open(dog)
         years.run(10.0)
         self.assertEqual(self.refusal(years, dog.node.call, cat, 3.0), "")

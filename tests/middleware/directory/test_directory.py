@@ -124,7 +124,7 @@ class Neighbour:
         Deferred.fromCoroutine(self.directory.arrive())
         self.say()
         self.chores.later(self.town.dice.uniform(0.0, REVIEW), self.review)
-        self.chores.every(0.3, self.beat)
+        self.chores.every(0.8 * self.lease, self.beat)
 
     def review(self) -> None:
         """Move where the team is of another size."""

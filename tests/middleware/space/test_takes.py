@@ -7,7 +7,7 @@ from twisted.trial.unittest import SynchronousTestCase
 from sim.team.takers.light import LightTrial
 from sim.team.takers.trial import Trial
 
-TUPLES = 100
+TUPLES = 50
 
 
 class TakesTests(SynchronousTestCase):
@@ -18,9 +18,9 @@ class TakesTests(SynchronousTestCase):
         return trial
 
     def test_calm(self) -> None:
-        """Eight takers share two hundred tuples, and each tuple is told to exactly one of them."""
-        trial = self._checked(LightTrial(1, 200))
-        self.assertEqual((len(trial.witness.posted), trial.witness.open()), (200, []))
+        """Eight takers share the tuples, and each tuple is told to exactly one of them."""
+        trial = self._checked(LightTrial(1, TUPLES))
+        self.assertEqual((len(trial.witness.posted), trial.witness.open()), (TUPLES, []))
 
     def test_loss_churn_and_partitions(self) -> None:
         """Though datagrams are lost, links cut, and takers, members and publishers die: once each, and none lost."""
