@@ -1,4 +1,4 @@
-"""PhoneDriver: a visitor's phone, whose looks come in from outside; it senses, and moves as its visitor does."""
+"""Driver of a visitor's phone: its pictures are handed in by the web node; it senses, and its visitor moves it."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from drivers.reading import Description, Frame, Value
 MANIFEST = Manifest()
 
 SIGHT = ("target.bearing", "target.distance")
-"""Where the phone's own page sees the red target: radians, left positive, and metres; NaN while it sees none."""
+"""Position of the red target in the page's detection: radians, left positive, and metres; NaN if it is not seen."""
 
 
 class PhoneDriver(SensingDriver):
-    """One phone, whose page sends what it sees."""
+    """One phone, whose page sends pictures and measurements."""
 
     STALE_S = 0.5
 
@@ -31,7 +31,7 @@ class PhoneDriver(SensingDriver):
         self._began = 0.0
 
     def look(self, jpeg: bytes, width: int, height: int, values: Mapping[str, float]) -> None:
-        """Take one picture and what was measured with it; before ``connect`` and after the end it is dropped."""
+        """Take one picture with its measurements; dropped before ``connect`` and after the end."""
         if self.state in ("idle", "closed"):
             return
         if self.state != "ready" and self.state != "stopped":
@@ -50,10 +50,10 @@ class PhoneDriver(SensingDriver):
 
 
 def make_driver(options: Mapping[str, object], name: str, clock: IReactorTime, connector: Any) -> PhoneDriver:
-    """A driver of a phone; it opens no link, as looks are handed to it."""
+    """Return a driver of a phone; it opens no link, because pictures are passed to ``look``."""
     return PhoneDriver(options, clock)
 
 
 def describe(options: Mapping[str, object], name: str) -> Description:
-    """What that phone is."""
+    """Return the description of that phone."""
     return described(checked(options))
