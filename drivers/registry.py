@@ -145,7 +145,7 @@ def _make_checked(
         driver = make(options, name, clock, connector)
         missing = [each for each in NEEDED if not hasattr(driver, each)]
         if missing or not isinstance(driver.description, Description):
-            raise TypeError(f"it is not a Driver; missing: {', '.join(missing) or 'a Description'}")
+            raise TypeError(f"it is not a Driver: it lacks {', '.join(missing) or 'a Description'}")
     except DriverError:
         raise
     except Exception as error:  # third-party code

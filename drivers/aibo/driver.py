@@ -252,7 +252,7 @@ class AiboDriver(BaseDriver):
                     port.open()
 
     def _open_ports(self) -> None:
-        """Connect to all servers, which run by now or never will, including those that wait for a retry."""
+        """Connect to all servers, which run by now or never will; retry the waiting ones at once."""
         self._main_at = None
         for service, port in self._ports.items():
             if service != "main":

@@ -42,7 +42,7 @@ class Options:
 
     ``source`` is the number of a camera or its device file, a video file, or a folder of JPEGs; ``url`` is instead the
     address of an MJPEG stream.  Pictures of a camera are requested in ``width`` and ``height``, and reduced to that
-    size; those of a folder or a ``url`` are used unchanged.  ``lens`` is the horizontal field of view in degrees,
+    size; other pictures are used unchanged.  ``lens`` is the horizontal field of view in degrees,
     ``quality`` the quality of the JPEGs, ``ahead`` the distance of the camera from the centre of its robot, in metres.
     """
 

@@ -36,7 +36,7 @@ class Shots(Protocol):
         """Open the source; raise ``LinkLost`` with the reason and the remedy."""
 
     def shoot(self) -> Shot:
-        """Return the next picture; raise ``BadFrame`` for an invalid one, ``LinkLost`` if there are no more."""
+        """Return the next picture; raise ``BadFrame`` for an invalid one, ``LinkLost`` after the last one."""
 
     def close(self) -> None:
         """Release the source; may be called in any state."""

@@ -187,7 +187,7 @@ class StreamTests(Conformance, RobotCase):
         """What an earlier connection still brings while it closes is no word of the new one."""
         driver = self.ready()
         film = driver._film
-        old = film._call
+        old = film._attempt
         driver.set_camera_fps(0)
         driver.set_camera_fps(30)
         count = driver.diagnostics()["pictures"]
