@@ -1,4 +1,4 @@
-"""Dog: the body of one simulated ERS-7 in the physics, moved by velocities with limited acceleration."""
+"""Physics of one simulated ERS-7, controlled by velocities with limited acceleration."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pymunk
 from sim.robots.scene import FOOTPRINT, Kennel
 
 LIMITS = {"base.vx": (-0.156, 0.160), "base.vy": (-0.103, 0.103), "base.wz": (-2.03, 2.03)}
-"""The walk figures of the ERS-7 in m/s and rad/s (Tekkotsu's stock gait)."""
+"""Speed limits of the ERS-7 in m/s and rad/s (Tekkotsu's stock gait)."""
 ACCELERATION = 0.8
 BRAKING = 3.0
 ANGULAR_ACCELERATION = 12.0
@@ -20,7 +20,7 @@ DOG, TARGET, WALL = 1, 2, 3
 
 
 class Motion(NamedTuple):
-    """A velocity in the dog's own frame: m/s forward, m/s to the left, rad/s counter-clockwise."""
+    """A velocity in the dog's frame: m/s forward, m/s to the left, rad/s counter-clockwise."""
 
     vx: float = 0.0
     vy: float = 0.0
@@ -31,7 +31,7 @@ REST = Motion()
 
 
 class Dog:
-    """One dog: its place, its command, and the acceleration that its body felt in the newest substep."""
+    """One dog: its position, its command, and its acceleration in the last substep."""
 
     def __init__(self, kennel: Kennel, number: int) -> None:
         self.name = kennel.name
@@ -45,7 +45,7 @@ class Dog:
         self.shape = pymunk.Circle(self.body, FOOTPRINT)
         self.shape.friction = 0.3
         self.shape.collision_type = DOG
-        # Shapes of one group are not found by the rays that carry the group: a dog does not range itself.
+        # Rays ignore shapes of their own group: a dog does not measure the distance to itself.
         self.shape.filter = pymunk.ShapeFilter(group=number)
         self._before = (0.0, 0.0)
 
@@ -66,7 +66,7 @@ class Dog:
 
     @property
     def motion(self) -> Motion:
-        """How the body really moves, in its own frame."""
+        """The real velocity in the dog's frame."""
         velocity = self.body.velocity
         cos, sin = math.cos(self.body.angle), math.sin(self.body.angle)
         return Motion(
@@ -75,13 +75,13 @@ class Dog:
 
     @property
     def is_moving(self) -> bool:
-        """Whether the dog walks, turns, or is about to."""
+        """Whether the dog moves, or has a command to move."""
         vx, vy, wz = self.motion
         return self.command != REST or math.hypot(vx, vy) > 0.005 or abs(wz) > 0.02
 
     @property
     def touches(self) -> list[float]:
-        """Where something touches it now: radians from straight ahead, left positive."""
+        """Directions of current contacts: radians from straight ahead, left positive."""
         found: list[float] = []
 
         def note(arbiter: pymunk.Arbiter) -> None:
@@ -93,32 +93,32 @@ class Dog:
         return found
 
     def drive(self, motion: Motion) -> None:
-        """Move like this from now on, clipped to ``limits``; what has none there is not moved."""
+        """Set the commanded velocity, clipped to ``limits``; an axis without limits is 0."""
         spans = (self.limits.get(key, (0.0, 0.0)) for key in LIMITS)
         self.command = Motion(*(min(max(v, low), high) for v, (low, high) in zip(motion, spans, strict=True)))
 
     def strive(self, dt: float) -> None:
-        """Bring the velocity as near to the command as the legs can in ``dt`` seconds; called before the physics."""
+        """Accelerate towards the command for ``dt`` seconds; called before the physics step."""
         self._before = (self.body.velocity.x, self.body.velocity.y)
         vx, vy, wz = self.motion
-        lack_x, lack_y = self.command.vx - vx, self.command.vy - vy
-        lack, can = math.hypot(lack_x, lack_y), (BRAKING if self.command == REST else ACCELERATION) * dt
-        share = 1.0 if lack <= can else can / lack
-        vx, vy = vx + share * lack_x, vy + share * lack_y
+        error_x, error_y = self.command.vx - vx, self.command.vy - vy
+        error, most = math.hypot(error_x, error_y), (BRAKING if self.command == REST else ACCELERATION) * dt
+        share = 1.0 if error <= most else most / error
+        vx, vy = vx + share * error_x, vy + share * error_y
         turn = ANGULAR_ACCELERATION * dt
         cos, sin = math.cos(self.body.angle), math.sin(self.body.angle)
         self.body.velocity = cos * vx - sin * vy, sin * vx + cos * vy
         self.body.angular_velocity = wz + min(max(self.command.wz - wz, -turn), turn)
 
     def feel(self, dt: float) -> None:
-        """Note the acceleration of the substep of ``dt`` seconds in the body's frame; called after the physics."""
+        """Store the acceleration of a substep of ``dt`` seconds in the dog's frame; called after the physics step."""
         ax = (self.body.velocity.x - self._before[0]) / dt
         ay = (self.body.velocity.y - self._before[1]) / dt
         cos, sin = math.cos(self.body.angle), math.sin(self.body.angle)
         self.felt = (cos * ax + sin * ay, cos * ay - sin * ax)
 
     def put(self, x: float, y: float, heading: float) -> None:
-        """Lift the dog and set it down at rest."""
+        """Move the dog to this place, at rest."""
         self.body.position = x, y
         self.body.angle = heading
         self.body.velocity = 0.0, 0.0

@@ -1,4 +1,4 @@
-"""Picture: the yard from above as a PNG, in the manner of the thesis' Figures 5.3 to 5.7."""
+"""The map of the simulator as a PNG, in the style of the thesis' Figures 5.3 to 5.7."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sim.robots.lens import Colour, Image
 
 WIDTH, HEIGHT = 640, 520
 _FINE = 3
-"""Everything is drawn so many times larger and then shrunk: smooth edges without a vector library."""
+"""Oversampling factor: the drawing is larger by this factor and then reduced, for smooth edges."""
 _MARGIN = 26
 _CAPTION = 40
 _FLOOR: Colour = (146, 172, 158)
@@ -32,7 +32,7 @@ _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
 def overhead(snapshot: Mapping[str, Any], caption: str = "") -> bytes:
-    """A PNG of the yard's ``snapshot``, with a ``caption``."""
+    """Return a PNG of ``snapshot``, with a ``caption``."""
     sheet = _Sheet(snapshot["walls"], caption)
     sheet.draw_yard()
     if snapshot["target"] is not None:
@@ -62,11 +62,11 @@ class _Sheet:
         self._image: Image = np.full((HEIGHT * _FINE, WIDTH * _FINE, 3), _PAPER, np.uint8)
 
     def place(self, x: float, y: float) -> tuple[float, float]:
-        """Where a point of the yard falls, in pixels of the finished picture."""
+        """Return the position of a point in pixels of the finished picture."""
         return self._left + self.scale * x, self._bottom - self.scale * y
 
     def shrunk(self) -> Image:
-        """The finished picture."""
+        """Return the finished picture."""
         return np.asarray(cv2.resize(self._image, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
     def draw_yard(self) -> None:
@@ -136,7 +136,7 @@ class _Sheet:
 
 
 def _rounded(x1: float, x2: float, y1: float, y2: float, radius: float) -> list[tuple[float, float]]:
-    """A rectangle with round corners."""
+    """Return a rectangle with rounded corners."""
     points = []
     for number, (x, y) in enumerate(
         ((x2 - radius, y2 - radius), (x1 + radius, y2 - radius), (x1 + radius, y1 + radius), (x2 - radius, y1 + radius))
@@ -148,7 +148,7 @@ def _rounded(x1: float, x2: float, y1: float, y2: float, radius: float) -> list[
 
 
 def _draw_name(image: Image, sheet: _Sheet, dog: Mapping[str, Any]) -> None:
-    """Write the name beside the dog, on the side that has room."""
+    """Write the name above the dog, or below it near the upper edge."""
     name, size = str(dog["name"]), 0.45
     (wide, high), _ = cv2.getTextSize(name, _FONT, size, 1)
     x, y = sheet.place(dog["x"], dog["y"])
@@ -161,7 +161,7 @@ def _draw_name(image: Image, sheet: _Sheet, dog: Mapping[str, Any]) -> None:
 
 
 def _draw_caption(image: Image, caption: str) -> None:
-    """Write the caption below, in the middle, as large as fits."""
+    """Write the caption at the bottom, centred, reduced if it is too long."""
     width, size = image.shape[1], 0.55
     (wide, _), _ = cv2.getTextSize(caption, _FONT, size, 1)
     if wide > width - 20:
