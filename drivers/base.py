@@ -28,7 +28,7 @@ ENGAGED = "estop.engaged"
 
 
 def heard_at(moment: float, due: float, now: float) -> float:
-    """Return the time at which a robot was last heard, corrected for a check that runs late.
+    """Return the time of a robot's last data, corrected for a check that runs late.
 
     The check was due at ``due`` and runs at ``now``.  The delay does not count as silence of the robot: the process was
     frozen then, and received data may still wait to be read.
@@ -111,7 +111,7 @@ class BaseDriver:
         if self._is_closed:
             return succeed(None)
         self.stop()
-        ended = self._shut()
+        ended = self._mark_closed()
         self._fail_connecting(LinkLost(f"{self._name}: disconnected before the first observation"))
         closed = self._close() if self._is_open else succeed(None)
         return closed if ended is None else gatherResults([closed, ended]).addCallback(lambda _: None)
@@ -133,7 +133,7 @@ class BaseDriver:
         for key, value in action.items():
             if key not in self._motion:
                 known = ", ".join(self._motion) or "none"
-                raise Unsupported(f"{self._name} has no action {key!r}; it knows {known}")
+                raise Unsupported(f"{self._name} has no action {key!r}; its actions are {known}")
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
                 raise Unsupported(f"{key} must be a finite number, not {value!r}")
         if self.state != "ready" or self._newest is None or not self._is_up:
@@ -172,7 +172,7 @@ class BaseDriver:
     def invoke(self, name: str, **arguments: float | str) -> Deferred[Mapping[str, Value]]:
         """Run one of ``description.skills``, or query a value that is not part of the observations."""
         known = ", ".join(self._description.skills) or "none"
-        return fail(Unsupported(f"{self._name} has no skill {name!r}; it knows {known}"))
+        return fail(Unsupported(f"{self._name} has no skill {name!r}; its skills are {known}"))
 
     def diagnostics(self) -> dict[str, float]:
         """Return counters: frames, bad frames, pictures, bytes, links, reconnects, refused; ``age`` of the newest in s.
@@ -248,7 +248,7 @@ class BaseDriver:
 
     def _refused(self, error: Exception) -> None:
         """Close the driver because this robot does not exist; reconnecting cannot help."""
-        self._shut()
+        self._mark_closed()
         self._close()
         if self._connecting is None:
             self.log.error("{robot}: {error}", robot=self._name, error=error)
@@ -256,15 +256,15 @@ class BaseDriver:
 
     @property
     def _may_move(self) -> bool:
-        """Whether a motion is in force whose deadline lies ahead.
+        """Whether a motion is in force and its deadline lies ahead.
 
         Code that repeats a motion has to check this: after a freeze of the node all timers are late, and the timer that
-        repeats a motion may fire before the one that ends it.
+        repeats a motion may fire before the timer that ends it.
         """
         return self._gate.deadline is not None and not self._gate.is_over(self._clock.seconds())
 
     def _guard(self) -> None:
-        """Give the dead man's switch the current halt command."""
+        """Pass the current halt command to the dead man's switch."""
         command = None if self._dead_man is None else self._last_word()
         if self._dead_man is not None and command is not None:
             self._dead_man.guard(command)
@@ -314,7 +314,7 @@ class BaseDriver:
         for key in self._motion:
             self._motion[key] = 0.0
 
-    def _shut(self) -> Deferred[None] | None:
+    def _mark_closed(self) -> Deferred[None] | None:
         self._is_closed = True
         self._rest()
         self._fail_switching(LinkLost(f"{self._name}: disconnected"))

@@ -388,7 +388,7 @@ def check_times(bench: Bench) -> None:
     for before, after in zip(seen, seen[1:], strict=False):
         _require(before.t_host <= after.t_host, f"t_host goes back from {before.t_host} to {after.t_host}")
         _require(before.t_robot <= after.t_robot, f"t_robot goes back from {before.t_robot} to {after.t_robot}")
-    _require(seen[-1].t_host <= bench.now(), f"t_host {seen[-1].t_host} lies after the present {bench.now()}")
+    _require(seen[-1].t_host <= bench.now(), f"t_host {seen[-1].t_host} is later than now, {bench.now()}")
     _require(seen[-1].t_host > bench.now() - bench.settle_s, "t_host is not a time on the driver's clock")
     _require(driver.observe() is seen[-1], "observe does not return the newest observation")
     for key, value in seen[-1].values.items():
@@ -466,7 +466,7 @@ class Conformance:
         return cast(Bench, self if bench is None else bench())
 
 
-def _test_of(check: Callable[[Bench], None]) -> Callable[[Conformance], None]:
+def _make_test(check: Callable[[Bench], None]) -> Callable[[Conformance], None]:
     def test(case: Conformance) -> None:
         check(case._bench())
         # Trial fails a test on logged errors; the driver logs the one of the faulty subscriber.
@@ -477,7 +477,7 @@ def _test_of(check: Callable[[Bench], None]) -> Callable[[Conformance], None]:
 
 
 for _name, _check in CHECKS.items():
-    setattr(Conformance, f"test_{_name}", _test_of(_check))
+    setattr(Conformance, f"test_{_name}", _make_test(_check))
 
 
 def broken(bench: Callable[[], Bench]) -> dict[str, str]:
@@ -538,7 +538,7 @@ def _make_permit(bench: Bench, seconds: float = 0.5, token: int = 1) -> Permit:
 
 
 def _observed_axis(driver: Driver) -> str:
-    """Return the key whose motion ``Bench.true_speed`` measures; empty if the device does not move."""
+    """Return the key of the motion that ``Bench.true_speed`` measures; empty if the device does not move."""
     limits = driver.description.limits
     return "base.vx" if "base.vx" in limits else next(iter(limits), "")
 

@@ -1,4 +1,4 @@
-"""Exceptions of drivers; the class tells faults of the robot, the connection and the caller apart.
+"""Exceptions of drivers; the classes distinguish faults of the robot, the connection and the caller.
 
 ::
 

@@ -1,7 +1,7 @@
 """Check fencing tokens and deadlines of the commands to one robot.
 
 The code is pure: the time is an argument.  A driver checks a command before it sends it, and a robot or its emulator
-checks it on arrival, so that a robot whose node froze stops by itself.
+checks it on arrival, so that the robot stops by itself if its node freezes.
 """
 
 from __future__ import annotations

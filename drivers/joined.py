@@ -143,7 +143,7 @@ class Joined:
             if name in driver.description.skills:
                 return driver.invoke(name, **arguments)
         known = ", ".join(self._description.skills) or "none"
-        return fail(Unsupported(f"{self._name} has no skill {name!r}; it knows {known}"))
+        return fail(Unsupported(f"{self._name} has no skill {name!r}; its skills are {known}"))
 
     def diagnostics(self) -> dict[str, float]:
         """Return the robot's counters, and each part's prefixed with its kind and a dot, as in ``camera.age``.

@@ -71,5 +71,5 @@ if __name__ == "__main__":
     parser.add_argument("--port", type=int, default=0)
     parser.add_argument("--known", default="", metavar="HOST:PORT")
     parser.add_argument("name")
-    given = parser.parse_args()
-    task.react(lambda reactor: defer.ensureDeferred(main(reactor, given.port, given.known, given.name)))
+    args = parser.parse_args()
+    task.react(lambda reactor: defer.ensureDeferred(main(reactor, args.port, args.known, args.name)))

@@ -49,11 +49,11 @@ async def work(reactor: Any, space: TupleSpace, name: str, dies: float) -> None:
         await claim.confirm()
 
 
-async def main(reactor: Any, given: argparse.Namespace) -> None:
+async def main(reactor: Any, args: argparse.Namespace) -> None:
     """Run a boss or a worker."""
-    node = await joined(reactor, given.port, given.known)
+    node = await joined(reactor, args.port, args.known)
     space = TupleSpace(node, reactor, random.SystemRandom())
-    await (boss(space, given.jobs) if given.role == "boss" else work(reactor, space, given.name, given.dies))
+    await (boss(space, args.jobs) if args.role == "boss" else work(reactor, space, args.name, args.dies))
     space.stop()
 
 
@@ -66,5 +66,5 @@ if __name__ == "__main__":
     worker = roles.add_parser("worker")
     worker.add_argument("name")
     worker.add_argument("--dies", type=float, default=0.0)
-    given = parser.parse_args()
-    task.react(lambda reactor: defer.ensureDeferred(main(reactor, given)))
+    args = parser.parse_args()
+    task.react(lambda reactor: defer.ensureDeferred(main(reactor, args)))

@@ -188,18 +188,18 @@ class AiboDriver(BaseDriver):
 
     def _move_head(self, arguments: Mapping[str, float | str]) -> dict[str, Value]:
         done: dict[str, Value] = {}
-        said = b""
+        commands = b""
         for key, value in arguments.items():
             if key not in _HEAD or isinstance(value, (bool, str)) or not -10.0 < value < 10.0:
-                raise Unsupported(f"look knows pan, tilt and nod in radians, not {key} = {value!r}")
+                raise Unsupported(f"look takes pan, tilt and nod in radians, not {key} = {value!r}")
             letter, (low, high) = _HEAD[key]
             angle = min(max(float(value), low), high)
-            said += command(letter, angle / high if angle > 0 else -angle / low if angle < 0 else 0.0)
+            commands += command(letter, angle / high if angle > 0 else -angle / low if angle < 0 else 0.0)
             done[f"ptz.{key}"] = angle
         port = self._get_open_port("head")
         if self._is_engaged:
             raise NotEnabled(f"{self._name}'s motors are off; call enable() first")
-        port.send(said)
+        port.send(commands)
         return done
 
     def _play_sound(self, arguments: Mapping[str, float | str]) -> dict[str, Value]:

@@ -48,7 +48,7 @@ class Options:
     ] = (FORWARD, BACKWARD, ASIDE, TURN)
     ports: Annotated[
         Mapping[str, int],
-        Meta(description=f"a table of ports, such as {{walk = 10050}}; it knows {', '.join(PORTS)}"),
+        Meta(description=f"a table of ports, such as {{walk = 10050}}; its keys are {', '.join(PORTS)}"),
         Then(_all_ports, raw=dict[str, Port]),
     ] = field(default_factory=lambda: dict(PORTS))
 

@@ -96,7 +96,7 @@ def state(values: Mapping[str, Value], joints: Sequence[float], dialect: str, t:
 def _check(row: Sequence[float], bounds: Sequence[tuple[float, float]]) -> None:
     for value, (low, high) in zip(row, bounds, strict=True):
         if not low <= value <= high:  # NaN is in no bounds
-            raise BadFrame(f"{value} lies outside {low} to {high}")
+            raise BadFrame(f"{value} is not from {low} to {high}")
 
 
 class Odometry:

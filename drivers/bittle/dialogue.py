@@ -98,7 +98,7 @@ class Dialogue:
             pending.done.errback(error)
 
     def _remove(self, pending: _PendingCommand) -> bool:
-        """Remove a pending command; return False if it is gone, as the errback of one may end all others."""
+        """Remove a pending command; return False if it was already removed by the errback of another one."""
         if pending not in self._pending:
             return False
         self._pending.remove(pending)

@@ -167,7 +167,7 @@ class BittleDriver(LinkedDriver):
     def _on_no_gait(self, name: str, velocity: Velocity, failure: Failure) -> None:
         if failure.check(Unsupported):
             self._counts["refused"] += 1
-            self.log.error("{robot}: {error}; take it out of gaits", robot=self._name, error=failure.value)
+            self.log.error("{robot}: {error}; remove it from the option gaits", robot=self._name, error=failure.value)
         elif self._is_up and self._requested_gait == name and not self._is_closed:
             if velocity == REST or self._may_move:
                 self._ask_gait(name, velocity)
@@ -265,9 +265,9 @@ class BittleDriver(LinkedDriver):
         if self._link is None or self._is_closed:
             return
         self._name_problem(
-            f"it does not tell its version; is it switched on, and {self._options.baud} baud right?"
+            f"it does not report its version; is it switched on, and {self._options.baud} baud right?"
             if self._options.port
-            else "it does not tell its version; is it switched on, and its web server part of the firmware?"
+            else "it does not report its version; is it switched on, and its web server part of the firmware?"
         )
         self._greet_s = min(self._greet_s * 1.5, 5.0)
         if not failure.check(LinkLost):
@@ -331,13 +331,13 @@ class BittleDriver(LinkedDriver):
         self._update_odometry()
         x, y, yaw = self._pose
         vx, wz = self._velocity
-        values: dict[str, Value] = {"odom.x": x, "odom.y": y, "odom.yaw": yaw, ENGAGED: self._is_lying}
-        values |= {"base.vx": vx, "base.vy": 0.0, "base.wz": wz, "base.moving": self._velocity != REST}
-        values["skill.running"] = self._running_skill or (self._requested_gait if self._velocity != REST else "")
+        observed: dict[str, Value] = {"odom.x": x, "odom.y": y, "odom.yaw": yaw, ENGAGED: self._is_lying}
+        observed |= {"base.vx": vx, "base.vy": 0.0, "base.wz": wz, "base.moving": self._velocity != REST}
+        observed["skill.running"] = self._running_skill or (self._requested_gait if self._velocity != REST else "")
         for group in self._values.values():
-            values |= group
+            observed |= group
         # The robot sends no time.
-        self._observed(values, self._clock.seconds())
+        self._observed(observed, self._clock.seconds())
 
     def _update_odometry(self) -> None:
         now = self._clock.seconds()

@@ -198,7 +198,7 @@ class HttpLine:
             self._send_next()
 
     def passed_over(self) -> None:
-        """Handle a request whose command ``may_leave`` dropped."""
+        """Handle a request with a command that ``may_leave`` dropped."""
         self._end_request()
         self._send_next()
 

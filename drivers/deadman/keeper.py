@@ -138,30 +138,30 @@ class Keeper:
             self._reap(END_S)
 
     def _send_halt_command(self) -> None:
-        word = self._halt_command
-        if word is None:
+        command = self._halt_command
+        if command is None:
             return
-        if word.address is not None:
-            host, port = word.address
-            self._send(CALL, 0.0, f"{host}\0{port}\0".encode("ascii") + word.halt)
+        if command.address is not None:
+            host, port = command.address
+            self._send(CALL, 0.0, f"{host}\0{port}\0".encode("ascii") + command.halt)
             return
-        descriptor = getattr(word.link, "fileno", lambda: -1)()
+        descriptor = getattr(command.link, "fileno", lambda: -1)()
         if descriptor >= 0:
-            self._send(GUARD, 0.0, word.halt, [descriptor])
+            self._send(GUARD, 0.0, command.halt, [descriptor])
 
     def _send(
         self, kind: bytes, moment: float = 0.0, content: bytes = b"", descriptors: list[int] | None = None
     ) -> None:
         if self._socket is None:
             return
-        said = HEAD.pack(kind, moment, len(content)) + content
+        message = HEAD.pack(kind, moment, len(content)) + content
         try:
-            sent = socket.send_fds(self._socket, [said], descriptors or [])
+            sent = socket.send_fds(self._socket, [message], descriptors or [])
         except BlockingIOError:
             sent = 0
         except OSError:
             return  # it died; the next read reports it
-        if sent < len(said) and self._process is not None:
+        if sent < len(message) and self._process is not None:
             # The process does not read.  Kill it; its end is noticed by the next read, which starts another.
             self._process.kill()
 

@@ -21,14 +21,14 @@ SIGHT = ("target.bearing", "target.distance")
 
 
 class PhoneDriver(SensingDriver):
-    """One phone, whose page sends pictures and measurements."""
+    """One phone; its page sends pictures and measurements."""
 
     STALE_S = 0.5
 
     def __init__(self, options: Options | Mapping[str, object], clock: IReactorTime) -> None:
         options = options if isinstance(options, Options) else checked(options)
         super().__init__(described(options), "the phone", clock)
-        self._began = 0.0
+        self._started_at = 0.0
 
     def look(self, jpeg: bytes, width: int, height: int, values: Mapping[str, float]) -> None:
         """Take one picture with its measurements; dropped before ``connect`` and after the end."""
@@ -38,12 +38,12 @@ class PhoneDriver(SensingDriver):
             self._up()
         self._counts["frames"] += 1
         self._counts["bytes"] += len(jpeg)
-        t = self._clock.seconds() - self._began
+        t = self._clock.seconds() - self._started_at
         sensed: dict[str, Value] = {**dict.fromkeys(SIGHT, math.nan), **values}
         self._observed(sensed, t, frame=Frame(self._counts["frames"], width, height, jpeg, t))
 
     def _open(self) -> None:
-        self._began = self._clock.seconds()
+        self._started_at = self._clock.seconds()
 
     def _close(self) -> Deferred[None]:
         return succeed(None)

@@ -345,7 +345,7 @@ class PyroRobot:
     def _invoke(self, skill: str, **arguments: float | str) -> Any:
         known = self.driver.description.skills
         if skill not in known:
-            raise Unsupported(f"this robot has no skill {skill!r}; it knows {', '.join(known) or 'none'}")
+            raise Unsupported(f"this robot has no skill {skill!r}; its skills are {', '.join(known) or 'none'}")
         return self._call(lambda: self.driver.invoke(skill, **arguments).addErrback(self._on_failed, skill))
 
     def _on_failed(self, failure: Any, name: str) -> None:

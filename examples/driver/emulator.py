@@ -11,7 +11,7 @@ class Emulator:
     def __init__(self, clock):
         self._clock = clock
         self._links = []
-        self._began = clock.seconds()
+        self._started_at = clock.seconds()
         self._x = self._y = self._yaw = self._vx = self._wz = 0.0
         self._has_motors = False
         self._report()
@@ -44,7 +44,7 @@ class Emulator:
         self._x += self._vx * math.cos(self._yaw) * PERIOD_S
         self._y += self._vx * math.sin(self._yaw) * PERIOD_S
         self._yaw = math.remainder(self._yaw + self._wz * PERIOD_S, math.tau)
-        t = self._clock.seconds() - self._began
+        t = self._clock.seconds() - self._started_at
         line = f"{t:.3f} {self._x:.4f} {self._y:.4f} {self._yaw:.4f} 0 {self._has_motors:d}\n"
         for link in self._links:
             link.send(line.encode())

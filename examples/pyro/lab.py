@@ -39,7 +39,7 @@ class Pen:
         self._clock = clock
         body = DogBody(self.world, self.dog, self._senses, camera)
         self._emulator = AiboEmulator(clock, body, random.Random(seed + 3))
-        self._loop = LoopingCall.withCount(self._turn)
+        self._loop = LoopingCall.withCount(self._on_tick)
         self._loop.clock = clock
 
     def start(self) -> None:
@@ -56,7 +56,7 @@ class Pen:
         """Return a driver of the dog, connected in memory."""
         return driver_for("aibo", {"host": "pen"}, "pen", self._clock, self._emulator.connector())
 
-    def _turn(self, count: int) -> None:
+    def _on_tick(self, count: int) -> None:
         for _ in range(min(count, 100) * STEPS):
             self.world.step()
             self._senses.sample()
@@ -72,7 +72,7 @@ def main(init: Callable[[Engine], Brain], about: str) -> None:
     )
     parser.add_argument("--seconds", type=float, default=30.0, help="duration of the run (default %(default)s)")
     parser.add_argument("--seed", type=int, default=1, help="of the simulated world (default %(default)s)")
-    chosen = parser.parse_args()
+    args = parser.parse_args()
 
     from twisted.internet import reactor as running
 
@@ -80,17 +80,17 @@ def main(init: Callable[[Engine], Brain], about: str) -> None:
 
     use_monotonic_time()
     reactor: Any = running
-    options: dict[str, object] = {} if chosen.host is None else {"host": chosen.host}
-    for text in chosen.option:
+    options: dict[str, object] = {} if args.host is None else {"host": args.host}
+    for text in args.option:
         key, _, value = text.partition("=")
         options[key] = int(value) if value.isdigit() else value
-    if options or chosen.kind != "aibo":
+    if options or args.kind != "aibo":
         try:
-            driver = driver_for(chosen.kind, options, "lab", reactor)
+            driver = driver_for(args.kind, options, "lab", reactor)
         except UsageError as error:
             parser.error(str(error))
     else:
-        pen = Pen(reactor, chosen.seed)
+        pen = Pen(reactor, args.seed)
         pen.start()
         driver = pen.driver()
     robot = PyroRobot(driver, reactor)
@@ -99,7 +99,7 @@ def main(init: Callable[[Engine], Brain], about: str) -> None:
     async def play() -> None:
         await robot.connect()
         print(f"{robot.type}: has {', '.join(robot.devices)}; press Ctrl-C to stop", flush=True)
-        reactor.callLater(chosen.seconds, engine.stop)
+        reactor.callLater(args.seconds, engine.stop)
         await engine.run(init)
 
     def over(failure: Any = None) -> None:

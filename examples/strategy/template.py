@@ -1,6 +1,6 @@
 """Template with every method of a strategy; this one selects the farthest robot.
 
-Run its tests in this folder with ``python -m twisted.trial test_strategies``; README.md explains how a node finds it.
+Run its tests in this folder with ``python -m twisted.trial test_strategies``; README.md explains its installation.
 """
 
 from __future__ import annotations

@@ -45,7 +45,7 @@ class Dog:
         self.shape = pymunk.Circle(self.body, FOOTPRINT)
         self.shape.friction = 0.3
         self.shape.collision_type = DOG
-        # Rays ignore shapes of their own group: a dog does not measure the distance to itself.
+        # Rays ignore shapes of the same group: a dog does not measure the distance to itself.
         self.shape.filter = pymunk.ShapeFilter(group=number)
         self._before = (0.0, 0.0)
 

@@ -120,18 +120,18 @@ class _Sheet:
         self._line([*points, points[0]], _EDGE, 0.006)
 
     def _polygon(self, points: Sequence[tuple[float, float]], colour: Colour) -> None:
-        cv2.fillPoly(self._image, [self._fine(points)], colour, cv2.LINE_AA, 4)
+        cv2.fillPoly(self._image, [self._to_pixels(points)], colour, cv2.LINE_AA, 4)
 
     def _line(self, points: Sequence[tuple[float, float]], colour: Colour, thickness: float) -> None:
         wide = max(1, round(thickness * self.scale * _FINE))
-        cv2.polylines(self._image, [self._fine(points)], False, colour, wide, cv2.LINE_AA, 4)
+        cv2.polylines(self._image, [self._to_pixels(points)], False, colour, wide, cv2.LINE_AA, 4)
 
     def _disc(self, x: float, y: float, radius: float, colour: Colour) -> None:
-        column, row = self._fine([(x, y)])[0]
+        column, row = self._to_pixels([(x, y)])[0]
         size = round(radius * self.scale * _FINE * 16)
         cv2.circle(self._image, (int(column), int(row)), size, colour, -1, cv2.LINE_AA, 4)
 
-    def _fine(self, points: Sequence[tuple[float, float]]) -> NDArray[np.int32]:
+    def _to_pixels(self, points: Sequence[tuple[float, float]]) -> NDArray[np.int32]:
         return (np.array([self.place(x, y) for x, y in points]) * (_FINE * 16)).round().astype(np.int32)
 
 

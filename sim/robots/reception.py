@@ -57,7 +57,7 @@ class Legs(Protocol):
 class PacedYard:
     """A simulated world with the robots ``names``, which ``legs`` moves, and at most ``most`` connections.
 
-    ``start`` starts its time on ``clock``, ``attach`` adds a connection; a subclass simulates time in ``_play``.
+    ``start`` starts its time on ``clock``, ``attach`` adds a connection; subclasses implement ``_simulate``.
     """
 
     log = Logger()
@@ -108,14 +108,14 @@ class PacedYard:
 
     # -- for subclasses ---------------------------------------------------------------------------------------------
 
-    def _play(self, late: float) -> int:
+    def _simulate(self, late: float) -> int:
         """Simulate the due tick and, of those missed in ``late`` seconds, as many as wanted; return their number."""
         raise NotImplementedError
 
     def _on_other(self, session: Session, message: Message) -> None:
         """Handle a message that is not from a driver."""
 
-    def _withhold(self, name: str) -> None:
+    def _reserve_robot(self, name: str) -> None:
         """Reserve a robot for an emulator, so that no driver can hold it; raise ``UsageError`` for an unknown robot."""
         if name not in self._gates:
             raise UsageError(f"no robot is named {name!r} in this simulator; it has {self._list_names()}")
@@ -174,7 +174,7 @@ class PacedYard:
             late = 0.0
             for name in self._gates:
                 self._halt(name)
-        self._ticks += self._play(late)
+        self._ticks += self._simulate(late)
         self._schedule()
 
     # -- drivers ----------------------------------------------------------------------------------------------------

@@ -47,12 +47,12 @@ def main(arguments: list[str] | None = None, output: TextIO = sys.stdout, errors
         help="a TOML file with the driver settings of each dog that emulates another kind of robot "
         "(docs/how-to/simulate-robots.md)",
     )
-    chosen = parser.parse_args(arguments)
-    if not 0 <= chosen.port <= 65535:
-        return _print_error(errors, f"port {chosen.port} is invalid; choose one from 1 to 65535, or 0 for any")
+    args = parser.parse_args(arguments)
+    if not 0 <= args.port <= 65535:
+        return _print_error(errors, f"port {args.port} is invalid; choose one from 1 to 65535, or 0 for any")
     try:
-        scene = loaded(chosen.scene)
-        table = _read_table(chosen.robots)
+        scene = loaded(args.scene)
+        table = _read_table(args.robots)
     except (SceneError, UsageError) as error:
         return _print_error(errors, str(error))
     # Twisted's timers use the wall clock by default: a step of it would freeze or race the simulation.  Commands from
@@ -69,18 +69,18 @@ def main(arguments: list[str] | None = None, output: TextIO = sys.stdout, errors
     globalLogBeginner.beginLoggingTo(
         [FilteringLogObserver(textFileLogObserver(errors), [warnings])], redirectStandardIO=False
     )
-    yard = Yard(reactor, Random(chosen.seed), scene)
+    yard = Yard(reactor, Random(args.seed), scene)
     try:
-        robots = _make_robots(reactor, chosen.seed, yard, table)
+        robots = _make_robots(reactor, args.seed, yard, table)
     except UsageError as error:
-        return _print_error(errors, f"{chosen.robots}: {error}")
+        return _print_error(errors, f"{args.robots}: {error}")
     try:
-        port = reactor.listenTCP(chosen.port, TcpLinkFactory(yard.attach), interface=chosen.host)
+        port = reactor.listenTCP(args.port, TcpLinkFactory(yard.attach), interface=args.host)
     except CannotListenError as error:
         why: OSError = error.socketError
         is_taken = why.errno in (errno.EADDRINUSE, errno.EACCES)
         remedy = "try another --port" if is_taken else "give --host an address of this machine"
-        return _print_error(errors, f"cannot listen on {chosen.host}:{chosen.port}: {why.strerror or why}; {remedy}")
+        return _print_error(errors, f"cannot listen on {args.host}:{args.port}: {why.strerror or why}; {remedy}")
     address = port.getHost()
     try:
         if robots is not None:
@@ -88,7 +88,7 @@ def main(arguments: list[str] | None = None, output: TextIO = sys.stdout, errors
             reactor.addSystemEventTrigger("before", "shutdown", robots.stop)
     except UsageError as error:
         robots.stop()
-        return _print_error(errors, f"{chosen.robots}: {error}")
+        return _print_error(errors, f"{args.robots}: {error}")
     yard.start()
     reactor.addSystemEventTrigger("before", "shutdown", yard.stop)
     dogs = ", ".join(yard.world.dogs)

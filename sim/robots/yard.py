@@ -59,7 +59,7 @@ class Yard(PacedYard):
 
         Raises ``UsageError`` if there is no such dog.
         """
-        self._withhold(name)
+        self._reserve_robot(name)
         dog = self.world.dogs[name]
         dog.limits = limits
         return DogBody(self.world, dog, self._senses[name], self._camera)
@@ -68,7 +68,7 @@ class Yard(PacedYard):
         """Add the operator's order ``verb``, with arguments of ``kinds``."""
         self._orders[verb] = (work, kinds)
 
-    def _play(self, late: float) -> int:
+    def _simulate(self, late: float) -> int:
         due = 1 + max(0, math.floor(late / TICK + 1e-6))
         for left in range(due - 1, -1, -1):
             # A late simulator drops pictures, never physics.

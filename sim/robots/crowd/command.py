@@ -45,37 +45,37 @@ def main(arguments: Sequence[str], make_team: MakeTeam | None = None) -> int:
     parser.add_argument("--seconds", type=float, default=60.0, help="longest virtual time (default %(default)g)")
     parser.add_argument("--picture", type=Path, help="write a map of the robots to this file, as SVG")
     parser.add_argument("--json", type=Path, help="write the results to this file")
-    given = parser.parse_args(list(arguments))
-    if not 0 <= given.seed < 2**63:
-        parser.error(f"--seed must be a whole number from 0 to {2**63 - 1}, not {given.seed}")
-    if not 0 < given.seconds <= 86400:
-        parser.error(f"--seconds must be more than 0 and at most 86400, not {given.seconds:g}")
-    if given.agents and make_team is None:
+    args = parser.parse_args(list(arguments))
+    if not 0 <= args.seed < 2**63:
+        parser.error(f"--seed must be a whole number from 0 to {2**63 - 1}, not {args.seed}")
+    if not 0 < args.seconds <= 86400:
+        parser.error(f"--seconds must be more than 0 and at most 86400, not {args.seconds:g}")
+    if args.agents and make_team is None:
         parser.error("--agents is not available here; say swarm crowd instead")
-    for path in (given.picture, given.json):
+    for path in (args.picture, args.json):
         if path is not None and not path.parent.is_dir():
             parser.error(f"{path} cannot be written: there is no folder {path.parent}; create it")
     try:
-        ground = roomy(given.bodies, given.room)
-        if given.agents and make_team is not None:
-            return _search(given, ground, make_team)
-        return _alone(given, ground)
+        ground = roomy(args.bodies, args.room)
+        if args.agents and make_team is not None:
+            return _run_search(args, ground, make_team)
+        return _run_alone(args, ground)
     except (SceneError, NotPossible) as error:
         parser.error(str(error))
 
 
-def _search(given: argparse.Namespace, ground: Ground, make_team: MakeTeam) -> int:
-    if not 1 <= given.agents <= ground.bodies:
-        raise SceneError(f"--agents must be from 0 to {ground.bodies}, the robots here, not {given.agents}")
+def _run_search(args: argparse.Namespace, ground: Ground, make_team: MakeTeam) -> int:
+    if not 1 <= args.agents <= ground.bodies:
+        raise SceneError(f"--agents must be from 0 to {ground.bodies}, the robots here, not {args.agents}")
     started_at = time.process_time()
-    controller = CONTROLLERS[given.controller or "wander"]
-    team = make_team(given.seed, given.agents, ground, controller, time.process_time)
+    controller = CONTROLLERS[args.controller or "wander"]
+    team = make_team(args.seed, args.agents, ground, controller, time.process_time)
     spent = time.process_time() - started_at
-    _print(f"{given.agents} agents joined in {team.clock.seconds():.1f} virtual seconds, {spent:.1f} s of processor")
+    _print(f"{args.agents} agents joined in {team.clock.seconds():.1f} virtual seconds, {spent:.1f} s of processor")
     with _interruptible() as is_over:
-        outcome = search(team, given.seed, given.seconds, time.process_time, _progress, is_over)
-    caption = f"{ground.bodies:,} robots, {given.agents} agents, seed {given.seed}, after {outcome.seconds:.0f} s"
-    _write_results(given, drawn(team.yard.crowd, caption, kinds(team, outcome), outcome.trail), asdict(outcome))
+        outcome = search(team, args.seed, args.seconds, time.process_time, _progress, is_over)
+    caption = f"{ground.bodies:,} robots, {args.agents} agents, seed {args.seed}, after {outcome.seconds:.0f} s"
+    _write_results(args, drawn(team.yard.crowd, caption, kinds(team, outcome), outcome.trail), asdict(outcome))
     _print(table(outcome))
     team.stop()
     return 0 if outcome.reach is not None else 1
@@ -101,15 +101,15 @@ def _interruptible() -> Iterator[Callable[[], bool]]:
         signal.signal(signal.SIGINT, usual)
 
 
-def _alone(given: argparse.Namespace, ground: Ground) -> int:
-    name = given.controller or "search"
-    crowd = Crowd(given.seed, ground)
+def _run_alone(args: argparse.Namespace, ground: Ground) -> int:
+    name = args.controller or "search"
+    crowd = Crowd(args.seed, ground)
     crowd.place_target_at_random()
     target = crowd.target
     assert target is not None
     senses, started_at, largest_overlap = Senses(crowd), time.process_time(), 0.0
     with _interruptible() as is_over:
-        while crowd.t < given.seconds and not is_over():
+        while crowd.t < args.seconds and not is_over():
             crowd.wish[:] = CONTROLLERS[name](senses)
             crowd.step()
             largest_overlap = max(largest_overlap, crowd.overlap())
@@ -126,7 +126,7 @@ def _alone(given: argparse.Namespace, ground: Ground) -> int:
         "digest": crowd.digest(),
     }
     _write_results(
-        given, drawn(crowd, f"{ground.bodies:,} robots, {name}, seed {given.seed}, after {crowd.t:.0f} s"), rows
+        args, drawn(crowd, f"{ground.bodies:,} robots, {name}, seed {args.seed}, after {crowd.t:.0f} s"), rows
     )
     for key, value in rows.items():
         _print(f"{key.replace('_', ' '):20}{value}")
@@ -139,11 +139,11 @@ def _progress(outcome: Outcome) -> None:
         _print(f"{outcome.seconds:5.0f} s  {found}, {outcome.datagrams:,} datagrams")
 
 
-def _write_results(given: argparse.Namespace, picture: str, rows: dict[str, object]) -> None:
-    if given.picture is not None:
-        given.picture.write_text(picture, encoding="utf-8")
-    if given.json is not None:
-        given.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+def _write_results(args: argparse.Namespace, picture: str, rows: dict[str, object]) -> None:
+    if args.picture is not None:
+        args.picture.write_text(picture, encoding="utf-8")
+    if args.json is not None:
+        args.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
 
 
 def _print(line: str) -> None:

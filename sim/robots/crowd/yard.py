@@ -63,7 +63,7 @@ class CrowdYard(PacedYard):
 
         Raises ``UsageError`` if no such robot can have a driver.
         """
-        self._withhold(name)
+        self._reserve_robot(name)
         return CrowdBody(self._numbers[name], self.crowd, self._feelings, self._eyes)
 
     def drive(self, name: str, vx: float, vy: float, wz: float) -> None:
@@ -74,7 +74,7 @@ class CrowdYard(PacedYard):
         """Stop the robot, braking as hard as it can."""
         self.crowd.wish[self._numbers[name]] = 0.0
 
-    def _play(self, late: float) -> int:
+    def _simulate(self, late: float) -> int:
         """Simulate one tick, even if several are late: the next one follows at once, with newly received commands."""
         started_at = self._stopwatch()
         self._expire(self.crowd.t)

@@ -1,1 +1,1 @@
-"""Emulators: the robots' side of each protocol, for bodies of the simulator."""
+"""Emulators: the robots' side of each protocol, for simulated robots."""

@@ -1,4 +1,4 @@
-"""The dog's side of Tekkotsu's protocol, over a given body.
+"""The dog's side of Tekkotsu's protocol, for a simulated robot.
 
 It serves main control and the emergency stop from the start and the other ports after they are selected, accepts one
 client per port, starts with its motors off, and stops 3 s after the last walk command.
@@ -30,7 +30,7 @@ DEAD_MAN_S = 3.0
 NATIVE = (208, 160)
 """Native size of the camera; the default is half the width and height."""
 DARK = b"\xff\xd8\xff\xc0\x00\x0b\x08\x00\x50\x00\x68\x01\x01\x11\x00" + bytes(64) + b"\xff\xd9"
-"""The picture of a body without a camera: the header of a JPEG of 104 x 80 pixels."""
+"""The picture of a simulated robot without a camera: the header of a JPEG of 104 x 80 pixels."""
 EMULATED = {**PORTS, "gains": 10032}
 
 
@@ -331,7 +331,7 @@ class MemoryPorts:
 class _MemoryPort(MemoryConnector):
     def __init__(self, clock: IReactorTime, ports: MemoryPorts, port: int, delay: float) -> None:
         super().__init__(clock, lambda link: ports.accept(port, link), delay)
-        self._takes = lambda: ports.takes(port)
+        self._is_accepting = lambda: ports.takes(port)
 
     def opened(self, caller: Receiver) -> Any:
-        return super().opened(caller) if self._takes() else None
+        return super().opened(caller) if self._is_accepting() else None

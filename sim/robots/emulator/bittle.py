@@ -1,4 +1,4 @@
-"""The robot's side of OpenCat, on a cable or behind its web server, over a simulated body."""
+"""The robot's side of OpenCat, on a cable or behind its web server, for a simulated robot."""
 
 from __future__ import annotations
 

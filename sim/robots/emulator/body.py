@@ -11,10 +11,10 @@ from drivers.reading import Value
 
 
 class Body(Protocol):
-    """One body in SI units; x forward, y left, counter-clockwise positive."""
+    """One simulated robot in SI units; x forward, y left, counter-clockwise positive."""
 
     def drive(self, vx: float, vy: float, wz: float) -> None:
-        """Set the velocity in the body's frame (m/s, m/s, rad/s), until the next command."""
+        """Set the velocity in the robot's frame (m/s, m/s, rad/s), until the next command."""
 
     def halt(self) -> None:
         """Stop, braking as hard as it can."""
@@ -28,7 +28,7 @@ class Body(Protocol):
 
 @dataclass
 class MemoryBody:
-    """A body on an endless floor; ``pass_time`` moves it exactly as commanded."""
+    """A simulated robot on an endless floor; ``pass_time`` moves it exactly as commanded."""
 
     x: float = 0.0
     y: float = 0.0

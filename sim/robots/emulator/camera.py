@@ -1,4 +1,4 @@
-"""An emulated camera board that serves MJPEG over HTTP, like an ESP32-CAM."""
+"""An emulated camera board on a simulated robot, which serves MJPEG over HTTP like an ESP32-CAM."""
 
 from __future__ import annotations
 

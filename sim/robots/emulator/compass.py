@@ -1,4 +1,4 @@
-"""An emulated compass that sends a body's heading as NMEA 0183, to a cable or to any number of clients."""
+"""An emulated compass that sends a simulated robot's heading as NMEA 0183, to a cable or any number of clients."""
 
 from __future__ import annotations
 

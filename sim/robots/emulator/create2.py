@@ -1,4 +1,4 @@
-"""The robot's side of the Open Interface, over a simulated body."""
+"""The robot's side of the Open Interface, for a simulated robot."""
 
 from __future__ import annotations
 

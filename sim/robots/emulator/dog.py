@@ -1,4 +1,4 @@
-"""A simulated dog as the body of an emulator."""
+"""A simulated dog behind the interface that emulators use."""
 
 from __future__ import annotations
 

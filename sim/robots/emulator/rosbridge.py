@@ -29,7 +29,7 @@ TYPE_SERVICE = "/rosapi/topic_type"
 BEAMS = 24
 RANGE_MIN, RANGE_MAX = 0.05, 3.5
 ASIDE = {"left": math.pi / 2, "right": -math.pi / 2, "back": math.pi}
-"""Directions of a body's rangers by name; others point ahead."""
+"""Directions of a simulated robot's rangers by name; others point ahead."""
 DOWN = "chest"
 """A ranger that points at the floor and is not part of the scan."""
 TOPICS: Mapping[str, tuple[str, float]] = {
