@@ -80,7 +80,7 @@ class Joined:
 
     @property
     def state(self) -> str:
-        """The state of the robot's link, independent of its parts."""
+        """The state of the robot's link; the parts have no influence."""
         return self._main.state
 
     @property
@@ -94,7 +94,7 @@ class Joined:
         return str(getattr(self._main, "problem", ""))
 
     def connect(self) -> Deferred[Description]:
-        """Open all links; fires when the robot's first observation has arrived, independent of the parts."""
+        """Open all links; fires when the robot's first observation has arrived, whether or not its parts connect."""
         is_first = self._main.state == "idle"
         connecting = self._main.connect()
         if is_first:

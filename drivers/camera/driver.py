@@ -20,7 +20,7 @@ from drivers.option import Manifest
 from drivers.reading import Description, Frame
 from drivers.timer import Timer
 
-MANIFEST = Manifest("cv2", "vision", "but for a folder of JPEGs or an address")
+MANIFEST = Manifest("cv2", "vision", "except for a folder of JPEGs or a url")
 
 
 class CameraDriver(SensingDriver):

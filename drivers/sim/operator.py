@@ -109,11 +109,11 @@ class YardOperator:
         return self._order("scatter", seed)
 
     def unplug(self, name: str) -> Deferred[bool]:
-        """Break the link to the robot ``name``, unless it is a simulated dog's own link (``sim.robots.table``)."""
+        """Break the links to the emulated robot ``name`` (``sim.robots.table``)."""
         return self._order("unplug", name)
 
     def plug(self, name: str) -> Deferred[bool]:
-        """Restore the link to the robot ``name``."""
+        """Restore the links to the emulated robot ``name``."""
         return self._order("plug", name)
 
     def link_up(self, link: Link) -> None:

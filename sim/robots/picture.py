@@ -34,7 +34,7 @@ _FONT = cv2.FONT_HERSHEY_SIMPLEX
 def overhead(snapshot: Mapping[str, Any], caption: str = "") -> bytes:
     """Return a PNG of ``snapshot``, with a ``caption``."""
     sheet = _Sheet(snapshot["walls"], caption)
-    sheet.draw_yard()
+    sheet.draw_world()
     if snapshot["target"] is not None:
         sheet.draw_target(snapshot["target"])
     for dog in snapshot["dogs"]:
@@ -69,7 +69,7 @@ class _Sheet:
         """Return the finished picture."""
         return np.asarray(cv2.resize(self._image, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
-    def draw_yard(self) -> None:
+    def draw_world(self) -> None:
         width, height = self.room
         thick = 0.05
         shade = [(0.03, -0.08), (width + 0.08, -0.08), (width + 0.08, height - 0.03), (0.03, height - 0.03)]

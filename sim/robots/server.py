@@ -34,7 +34,7 @@ USAGE = 2
 def main(arguments: list[str] | None = None, output: TextIO = sys.stdout, errors: TextIO = sys.stderr) -> int:
     """Run a simulator until it is interrupted; return the exit code: 0, or 2 with one line that names the remedy."""
     parser = argparse.ArgumentParser(
-        prog="swarm yard", description="Simulate three robot dogs, for simulated or real drivers."
+        prog="swarm yard", description='Simulate robot dogs for the driver "sim" and for emulators.'
     )
     parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default %(default)s)")
     parser.add_argument("--port", type=int, default=DEFAULT_PORT, help="TCP port, 0 for any (default %(default)s)")

@@ -152,8 +152,8 @@ def table(outcome: Outcome) -> str:
         return "-" if moment is None else f"{moment:.1f} s"
 
     seconds = max(outcome.seconds, 1e-9)
-    yard = outcome.cost["moving"] + outcome.cost["telling"]
-    whole = yard + outcome.cost["agents"]
+    alone = outcome.cost["moving"] + outcome.cost["telling"]
+    whole = alone + outcome.cost["agents"]
     rows = [
         ("robots, agents among them", f"{outcome.bodies:,}, {outcome.agents:,}"),
         ("all agents take part", at(outcome.engaged)),
@@ -162,7 +162,10 @@ def table(outcome: Outcome) -> str:
         ("it was the nearest of those", {True: "yes", False: "NO", None: "-"}[outcome.right]),
         ("the target is reached", f"{at(outcome.reach)} by {outcome.by or 'nobody'}"),
         ("datagrams for each agent and second", f"{outcome.datagrams / seconds / max(1, outcome.agents):.1f}"),
-        ("the yard alone", f"{1e3 * yard / seconds:8.1f} ms a second: {seconds / max(yard, 1e-9):.1f} x real time"),
+        (
+            "the simulator alone",
+            f"{1e3 * alone / seconds:8.1f} ms a second: {seconds / max(alone, 1e-9):.1f} x real time",
+        ),
         ("  rays, moves and controllers", f"{1e3 * outcome.cost['moving'] / seconds:8.1f} ms"),
         ("  sensor frames and pictures", f"{1e3 * outcome.cost['telling'] / seconds:8.1f} ms"),
         ("nodes, drivers and agents", f"{1e3 * outcome.cost['agents'] / seconds:8.1f} ms"),
