@@ -53,7 +53,7 @@ class Gate:
         if self._token is not None and permit.token < self._token:
             self.refused[LOWER] += 1
             raise StaleCommand(
-                f"token {permit.token} is lower than token {self._token}; another agent holds the task's lease now"
+                f"token {permit.token} is lower than token {self._token}, which was obeyed before; take a new lease"
             )
         self.accepted += 1
         self._token = permit.token
