@@ -130,29 +130,24 @@ class Faulty(Exception):
 def check_describes(bench: Bench) -> None:
     """The driver describes its robot before it connects, and the description does not change."""
     driver = bench.make_driver()
-    description = driver.description
+    robot = driver.description
     _require(driver.state == "idle", f"before connect its state is {driver.state!r}, not 'idle'")
     _require(driver.observe() is None, "it observes something before it is connected")
-    _require(
-        isinstance(description, Description) and bool(description.kind and description.model),
-        "its kind or model is empty",
-    )
-    _require(math.isfinite(description.radius) and description.radius > 0.0, f"its radius is {description.radius!r}")
-    for key, (low, high) in description.limits.items():
+    _require(isinstance(robot, Description) and bool(robot.kind and robot.model), "its kind or model is empty")
+    _require(math.isfinite(robot.radius) and robot.radius > 0.0, f"its radius is {robot.radius!r}")
+    for key, (low, high) in robot.limits.items():
         _require(
             math.isfinite(low) and math.isfinite(high) and low < high and low <= 0.0 <= high,
             f"the limits of {key} are {low!r} and {high!r}; they must be finite and include 0",
         )
-    _require(all(rate > 0.0 for rate in description.rates.values()), f"its rates are {dict(description.rates)!r}")
-    _require(
-        all(isinstance(name, str) and name for name in description.skills), f"its skills are {description.skills!r}"
-    )
+    _require(all(rate > 0.0 for rate in robot.rates.values()), f"its rates are {dict(robot.rates)!r}")
+    _require(all(isinstance(name, str) and name for name in robot.skills), f"its skills are {robot.skills!r}")
     try:
-        json.dumps({name: dict(about) for name, about in description.capabilities.items()}, allow_nan=False)
+        json.dumps({name: dict(about) for name, about in robot.capabilities.items()}, allow_nan=False)
     except (TypeError, ValueError) as error:
         raise Breach(f"its capabilities are not valid JSON: {error}") from error
     _connect(bench, driver)
-    _require(driver.description == description, "its description changes when it connects")
+    _require(driver.description == robot, "its description changes when it connects")
 
 
 def check_connects(bench: Bench) -> None:
@@ -178,23 +173,23 @@ def check_motors(bench: Bench) -> None:
     """Nothing moves before ``enable`` or after ``disable``; ``enable`` permits motion again."""
     driver = bench.make_driver()
     action = _half_speed(driver)
-    _check_refused(NotEnabled, driver, action, _make_permit(bench), "before it is connected")
+    _check_refused(NotEnabled, driver, action, _grant(bench), "before it is connected")
     _connect(bench, driver)
     if action:
-        _check_refused(NotEnabled, driver, action, _make_permit(bench), "before enable")
+        _check_refused(NotEnabled, driver, action, _grant(bench), "before enable")
         bench.pass_time(HALT_S)
         _require_rest(bench, driver, "before enable")
     _enable(bench, driver)
-    driver.act(action, _make_permit(bench, 30.0))
+    driver.act(action, _grant(bench, 30.0))
     bench.pass_time(bench.settle_s)
     disabled = _Result(driver.disable())
     bench.pass_time(bench.settle_s)
     _require(disabled.value("disable") is True, "disable does not fire with True")
     _require(driver.state == "stopped", f"disabled its state is {driver.state!r}, not 'stopped'")
     _require_rest(bench, driver, "after disable")
-    _check_refused(NotEnabled, driver, action, _make_permit(bench), "after disable")
+    _check_refused(NotEnabled, driver, action, _grant(bench), "after disable")
     _enable(bench, driver)
-    driver.act(action, _make_permit(bench))
+    driver.act(action, _grant(bench))
 
 
 def check_clips(bench: Bench) -> None:
@@ -202,7 +197,7 @@ def check_clips(bench: Bench) -> None:
     driver = _ready_driver(bench)
     for key, (low, high) in driver.description.limits.items():
         for wanted in (low - 99.0, high + 99.0):
-            done = driver.act({**dict.fromkeys(driver.description.limits, 0.0), key: wanted}, _make_permit(bench))
+            done = driver.act({**dict.fromkeys(driver.description.limits, 0.0), key: wanted}, _grant(bench))
             _require(isinstance(done, Mapping) and key in done, f"the result of act lacks {key}")
             for name, value in done.items():
                 least, most = driver.description.limits.get(name, (-math.inf, math.inf))
@@ -210,38 +205,35 @@ def check_clips(bench: Bench) -> None:
                     isinstance(value, float | int) and least - 1e-9 <= value <= most + 1e-9,
                     f"commanded {key} = {wanted:g} it performs {name} = {value!r}, beyond its limits",
                 )
-    axis = _observed_axis(driver)
+    axis = _axis_of(driver)
     if axis:
         high = driver.description.limits[axis][1]
-        done = driver.act({**dict.fromkeys(driver.description.limits, 0.0), axis: high + 99.0}, _make_permit(bench))
-        _require(
-            done[axis] > 0.5 * high, f"commanded beyond its limit, it performs {axis} = {done[axis]:g}, not {high:g}"
-        )
+        done = driver.act({**dict.fromkeys(driver.description.limits, 0.0), axis: high + 99.0}, _grant(bench))
+        _require(done[axis] > 0.5 * high, f"beyond its limit it performs {axis} = {done[axis]:g}, not {high:g}")
 
 
 def check_keeps(bench: Bench) -> None:
     """A key that an action omits keeps its value while the last command holds, and is zero after a stop."""
     driver = _ready_driver(bench)
-    axis = _observed_axis(driver)
+    axis = _axis_of(driver)
     if not axis:
         return
-    first = driver.act(_half_speed(driver), _make_permit(bench))[axis]
-    _require(driver.act({}, _make_permit(bench)).get(axis) == first, f"{axis} changes though the next action omits it")
+    first = driver.act(_half_speed(driver), _grant(bench))[axis]
+    _require(driver.act({}, _grant(bench)).get(axis) == first, f"{axis} changes though the next action omits it")
     driver.stop()
-    after = driver.act({}, _make_permit(bench)).get(axis)
+    after = driver.act({}, _grant(bench)).get(axis)
     _require(after == 0.0, f"after a stop an empty action performs {axis} = {after!r}")
 
 
 def check_refuses(bench: Bench) -> None:
     """An unknown key, or a value that is not a finite number, raises ``Unsupported``, and nothing moves."""
     driver = _ready_driver(bench)
-    _check_refused(Unsupported, driver, {"base.warp": 1.0}, _make_permit(bench), "with an unknown key")
-    for value in NO_NUMBERS if _observed_axis(driver) else ():
-        action: Any = {_observed_axis(driver): value}
-        _check_refused(Unsupported, driver, action, _make_permit(bench), f"with {value!r}")
-        _check_refused(
-            Unsupported, driver, {**_half_speed(driver), "base.warp": 1.0}, _make_permit(bench), "with a key too many"
-        )
+    _check_refused(Unsupported, driver, {"base.warp": 1.0}, _grant(bench), "with an unknown key")
+    for value in NO_NUMBERS if _axis_of(driver) else ():
+        action: Any = {_axis_of(driver): value}
+        _check_refused(Unsupported, driver, action, _grant(bench), f"with {value!r}")
+        action = {**_half_speed(driver), "base.warp": 1.0}
+        _check_refused(Unsupported, driver, action, _grant(bench), "with a key too many")
     bench.pass_time(HALT_S)
     _require_rest(bench, driver, "after a refused action")
 
@@ -249,14 +241,12 @@ def check_refuses(bench: Bench) -> None:
 def check_deadline(bench: Bench) -> None:
     """The robot moves until its permit expires and then stops by itself; a new permit extends the motion."""
     driver = _ready_driver(bench)
-    if not _observed_axis(driver):
+    if not _axis_of(driver):
         return
-    wanted = abs(driver.act(_half_speed(driver), _make_permit(bench, 0.6))[_observed_axis(driver)])
+    wanted = abs(driver.act(_half_speed(driver), _grant(bench, 0.6))[_axis_of(driver)])
     bench.pass_time(0.5)
-    _require(
-        bench.true_speed() > 0.5 * wanted, f"it reported a speed of {wanted:g} and moves at {bench.true_speed():g}"
-    )
-    driver.act(_half_speed(driver), _make_permit(bench, 0.6))
+    _require(bench.true_speed() > 0.5 * wanted, f"it reports {wanted:g} m/s and moves at {bench.true_speed():g}")
+    driver.act(_half_speed(driver), _grant(bench, 0.6))
     bench.pass_time(0.5)
     _require(bench.true_speed() > 0.5 * wanted, "it stops at the deadline of a command that was renewed")
     bench.pass_time(0.1 + HALT_S)
@@ -267,21 +257,17 @@ def check_token(bench: Bench) -> None:
     """A lower token than one seen, or a deadline that has passed, raises ``StaleCommand`` and is counted."""
     driver = _ready_driver(bench)
     action = _half_speed(driver)
-    driver.act(action, _make_permit(bench, token=5))
+    driver.act(action, _grant(bench, token=5))
     _require(driver.token == 5, f"after it obeyed token 5 its token is {driver.token!r}")
-    _check_refused(StaleCommand, driver, action, _make_permit(bench, token=4), "with a lower token")
+    _check_refused(StaleCommand, driver, action, _grant(bench, token=4), "with a lower token")
     for deadline in (bench.now(), bench.now() - 1.0, math.nan, math.inf):
-        _check_refused(
-            StaleCommand, driver, action, Permit(6, deadline), f"with the deadline {deadline!r}, at {bench.now()!r}"
-        )
-    driver.act(action, _make_permit(bench, token=5))
+        when = f"with the deadline {deadline!r}, at {bench.now()!r}"
+        _check_refused(StaleCommand, driver, action, Permit(6, deadline), when)
+    driver.act(action, _grant(bench, token=5))
     driver.stop()
-    _check_refused(StaleCommand, driver, action, _make_permit(bench, token=4), "with a lower token, after a stop")
+    _check_refused(StaleCommand, driver, action, _grant(bench, token=4), "with a lower token, after a stop")
     counts = driver.diagnostics()
-    _require(
-        (counts["accepted"], counts["lower token"], counts["late"]) == (2, 2, 4),
-        "it miscounts accepted or refused commands",
-    )
+    _require((counts["accepted"], counts["lower token"], counts["late"]) == (2, 2, 4), "it miscounts commands")
 
 
 def check_stops(bench: Bench) -> None:
@@ -293,7 +279,7 @@ def check_stops(bench: Bench) -> None:
     bench.pass_time(bench.settle_s)
     connecting.value("connect, after stop,")
     _enable(bench, driver)
-    driver.act(_half_speed(driver), _make_permit(bench, 30.0))
+    driver.act(_half_speed(driver), _grant(bench, 30.0))
     bench.pass_time(0.3)
     done = driver.stop()
     _require(set(done) == set(driver.description.limits), "the result of stop lacks a key of the limits")
@@ -325,7 +311,7 @@ def check_ends(bench: Bench) -> None:
     bench.pass_time(bench.settle_s)
     _require(connecting.is_error(DriverError), "disconnect during connect does not make connect fail")
     driver = _ready_driver(bench)
-    driver.act(_half_speed(driver), _make_permit(bench, 30.0))
+    driver.act(_half_speed(driver), _grant(bench, 30.0))
     bench.pass_time(0.3)
     first, second = _Result(driver.disconnect()), _Result(driver.disconnect())
     _require(driver.state == "closed", f"disconnected its state is {driver.state!r}, not 'closed'")
@@ -334,13 +320,13 @@ def check_ends(bench: Bench) -> None:
     second.value("disconnect, called twice,")
     _require_rest(bench, driver, "after disconnect")
     _require(_Result(driver.connect()).is_error(DriverError), "after disconnect it can be connected again")
-    _check_refused(DriverError, driver, _half_speed(driver), _make_permit(bench), "after disconnect")
+    _check_refused(DriverError, driver, _half_speed(driver), _grant(bench), "after disconnect")
 
 
 def check_leaves(bench: Bench) -> None:
     """After ``disconnect``, or a cancelled ``connect``, it is closed and has no pending calls on its clock."""
     driver = _ready_driver(bench)
-    driver.act(_half_speed(driver), _make_permit(bench, 30.0))
+    driver.act(_half_speed(driver), _grant(bench, 30.0))
     _Result(driver.disconnect())
     bench.pass_time(bench.settle_s)
     _require_no_pending_calls(bench, "")
@@ -364,18 +350,18 @@ def check_leaves(bench: Bench) -> None:
 def check_link(bench: Bench) -> None:
     """A lost link makes it stale and ends the motion; it reconnects by itself, at rest."""
     driver = _ready_driver(bench)
-    driver.act(_half_speed(driver), _make_permit(bench, 30.0))
+    driver.act(_half_speed(driver), _grant(bench, 30.0))
     bench.pass_time(0.3)
     if not _try_cut_link(bench, driver):
         return
     _require(driver.state == "stale", f"without its link its state is {driver.state!r}, not 'stale'")
-    _check_refused(NotEnabled, driver, _half_speed(driver), _make_permit(bench), "without its link")
+    _check_refused(NotEnabled, driver, _half_speed(driver), _grant(bench), "without its link")
     bench.pass_time(max(1.0, 2.0 * bench.settle_s))
     _require(driver.state == "ready", f"with its link back its state is {driver.state!r}, not 'ready'")
     _require_rest(bench, driver, "after a lost link")
     counts = driver.diagnostics()
     _require(counts["reconnects"] == 1.0, f"it reconnected once and counts {counts['reconnects']:g} reconnects")
-    driver.act(_half_speed(driver), _make_permit(bench))
+    driver.act(_half_speed(driver), _grant(bench))
 
 
 def check_times(bench: Bench) -> None:
@@ -430,10 +416,7 @@ def check_counts(bench: Bench) -> None:
     _require(counts["bad_frames"] == 0, f"it counts {counts['bad_frames']} bad frames of a robot that sends none")
     newest = driver.observe()
     age = math.inf if newest is None else bench.now() - newest.t_host
-    _require(
-        abs(counts["age"] - age) < 1e-6,
-        f"the newest observation is {age:g} s old, and its age is given as {counts['age']:g}",
-    )
+    _require(abs(counts["age"] - age) < 1e-6, f"the newest is {age:g} s old, not {counts['age']:g} s as reported")
     _require(driver.state in STATES, f"its state is {driver.state!r}")
 
 
@@ -504,7 +487,6 @@ class _Result:
         return bool(self._results)
 
     def value(self, what: str) -> Any:
-        """Return the result; ``what`` names the call in the breach."""
         _require(bool(self._results), f"{what} does not fire in time")
         if isinstance(self._results[0], Failure):
             raise Breach(f"{what} fails: {self._results[0].getErrorMessage()}")
@@ -533,11 +515,11 @@ def _ready_driver(bench: Bench) -> Driver:
     return driver
 
 
-def _make_permit(bench: Bench, seconds: float = 0.5, token: int = 1) -> Permit:
+def _grant(bench: Bench, seconds: float = 0.5, token: int = 1) -> Permit:
     return Permit(token, bench.now() + seconds)
 
 
-def _observed_axis(driver: Driver) -> str:
+def _axis_of(driver: Driver) -> str:
     """Return the key of the motion that ``Bench.true_speed`` measures; empty if the device does not move."""
     limits = driver.description.limits
     return "base.vx" if "base.vx" in limits else next(iter(limits), "")
@@ -545,7 +527,7 @@ def _observed_axis(driver: Driver) -> str:
 
 def _half_speed(driver: Driver) -> Action:
     """Return a motion at half of the limit; empty if the device does not move."""
-    axis = _observed_axis(driver)
+    axis = _axis_of(driver)
     return {axis: driver.description.limits[axis][1] / 2.0} if axis else {}
 
 

@@ -137,8 +137,6 @@ class SerialLine:
 
 
 class _SerialLink(StreamLink):
-    """A link over one open device."""
-
     def __init__(self, line: SerialLine, caller: Caller) -> None:
         self._line = line
         self._caller = caller

@@ -137,10 +137,7 @@ def sized(width: int) -> list[str]:
 
 
 def paced(fps: float) -> list[str]:
-    """Return commands for the frame rate.
-
-    The dog waits from the end of one picture, so half the duration of a picture is subtracted.
-    """
+    """Return commands for the frame rate; the dog waits after each picture, so half of its duration is subtracted."""
     wait_ms = 0 if fps <= 0 or fps >= 29 else round(1000.0 / fps - PICTURE_MS / 2.0)
     return [setting("vision.rawcam.interval", wait_ms), setting("vision.rawcam_interval", wait_ms)]
 

@@ -208,7 +208,6 @@ class BittleDriver(LinkedDriver):
         return result if isinstance(result, Failure) else {"skill.done": name}
 
     def _may_leave(self, command: bytes) -> bool:
-        """Return whether a queued command is still wanted."""
         return self._may_move or command not in self._moving_commands
 
     # -- from the robot ---------------------------------------------------------------------------------------------

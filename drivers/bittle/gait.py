@@ -39,11 +39,7 @@ def chosen(vx: float, wz: float, gaits: Mapping[str, Velocity]) -> tuple[str, Ve
     """
     vx = 0.0 if abs(vx) < LEAST_SPEED else vx
     wz = 0.0 if abs(wz) < LEAST_TURN else wz
-    fitting = {
-        name: one
-        for name, one in gaits.items()
-        if one != REST and _has_same_sign(one.vx, vx) and _has_same_sign(one.wz, wz)
-    }
+    fitting = {name: one for name, one in gaits.items() if one != REST and _fits(one.vx, vx) and _fits(one.wz, wz)}
     if not fitting:
         return STAND, REST
     speed = max(abs(one.vx) for one in gaits.values()) or 1.0
@@ -52,5 +48,5 @@ def chosen(vx: float, wz: float, gaits: Mapping[str, Velocity]) -> tuple[str, Ve
     return name, gaits[name]
 
 
-def _has_same_sign(real: float, requested: float) -> bool:
+def _fits(real: float, requested: float) -> bool:
     return real == 0.0 or real * requested > 0.0

@@ -291,7 +291,6 @@ class _Request:
         self._finish(body)
 
     def drop(self) -> None:
-        """Cancel the request."""
         self._is_over = True
         self._timer.cancel()
         self._call.hang_up()

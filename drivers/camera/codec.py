@@ -157,7 +157,6 @@ class _Chunks:
         self._left = 0
 
     def read(self, data: bytes) -> bytes:
-        """Return the content that ``data`` completes."""
         data, self._rest = self._rest + data, b""
         found = bytearray()
         while data and not self.is_over:

@@ -101,7 +101,7 @@ class CameraDriver(SensingDriver):
         return self._film.stop()
 
     def _report_idle(self) -> None:
-        """Observe without a new picture, so that the link does not count as stale while no pictures are requested."""
+        """Observe without a new picture, so that the link does not become stale while no pictures are requested."""
         self._idle_timer.set(self.STALE_S / 2, self._report_idle)
         self._observed({}, self._clock.seconds() - self._started_at, frame=self._frame)
 

@@ -147,14 +147,11 @@ class _Attempt:
         self._request = request
 
     def link_up(self, link: Link) -> None:
-        """Request the stream; called by the link."""
         self.is_up = True
         link.send(self._request)
 
     def received(self, data: bytes) -> None:
-        """Take bytes; called by the link."""
         self._film.heard(self, data)
 
     def link_down(self) -> None:
-        """Report the close; called by the link."""
         self._film.lost(self)

@@ -143,10 +143,7 @@ _FIXED = {
 
 
 def drive(velocity: int, radius: int) -> bytes:
-    """Drive at ``velocity`` mm/s on an arc of ``radius`` mm, left positive.
-
-    The radii ``STRAIGHT``, 1 and -1 (spin) are special.
-    """
+    """Drive at ``velocity`` mm/s on an arc of ``radius`` mm, left positive; or ``STRAIGHT``; 1 and -1 spin."""
     return struct.pack(">Bhh", DRIVE, velocity, radius)
 
 

@@ -116,7 +116,7 @@ class RosbridgeDriver(BaseDriver):
             if values.get("success") is True:
                 self._has_motors = on
             else:
-                self._warn(f"{self._options.motor_service} refused: {codec.brief(values.get('message'), 200)}")
+                self._warn_once(f"{self._options.motor_service} refused: {codec.brief(values.get('message'), 200)}")
 
         if self._options.motor_service:
             self._call(self._options.motor_service, data=on).addCallbacks(switched, self._on_call_failed)
@@ -225,7 +225,7 @@ class RosbridgeDriver(BaseDriver):
             case Status(level, text):
                 self._counts["refused"] += level == "error"
                 if level in ("error", "warning"):
-                    self._warn(f"rosbridge says: {text}")
+                    self._warn_once(f"rosbridge says: {text}")
 
     def _on_published(self, source: str, content: Mapping[str, Any]) -> None:
         values: dict[str, Value] = {}
@@ -287,12 +287,12 @@ class RosbridgeDriver(BaseDriver):
             return
         # The topic has no subscriber yet, or another type; the base may still be starting.
         state = f"is {found}" if found else "has no subscriber"
-        self._warn(f"{topic} {state}; is velocity_topic right? retrying")
+        self._warn_once(f"{topic} {state}; is velocity_topic right? retrying")
         self._type_timer.set(ASK_S, self._request_type)
 
     def _on_no_type(self) -> None:
         default = "TwistStamped" if self._was_stamped else "Twist"
-        self._warn(f"rosapi does not report the type of the velocity: using {default}; or set velocity_type")
+        self._warn_once(f"rosapi does not report the type of the velocity: using {default}; or set velocity_type")
         self._start_with_type(self._was_stamped)
 
     def _on_other_type(self, is_stamped: bool, found: str) -> None:
@@ -300,7 +300,7 @@ class RosbridgeDriver(BaseDriver):
             self._advertise(is_stamped)  # the answer arrived late
             return
         wanted, topic = "twist_stamped" if is_stamped else "twist", self._options.velocity_topic
-        self._warn(f'{topic} is {found}, so it would not move: write velocity_type = "{wanted}" or "auto"')
+        self._warn_once(f'{topic} is {found}, so it would not move: write velocity_type = "{wanted}" or "auto"')
 
     def _start_with_type(self, is_stamped: bool) -> None:
         self._advertise(is_stamped)
@@ -323,10 +323,9 @@ class RosbridgeDriver(BaseDriver):
 
     def _on_call_failed(self, failure: Failure) -> None:
         if not failure.check(LinkLost):
-            self._warn(f"{self._options.motor_service}: {failure.getErrorMessage()[:200]}")
+            self._warn_once(f"{self._options.motor_service}: {failure.getErrorMessage()[:200]}")
 
-    def _warn(self, text: str) -> None:
-        """Log a warning once."""
+    def _warn_once(self, text: str) -> None:
         if text not in self._warned and len(self._warned) < 100:
             self._warned.add(text)
             self.log.warn("{robot}: {text}", robot=self._name, text=text)

@@ -66,7 +66,6 @@ class _Sheet:
         return self._left + self.scale * x, self._bottom - self.scale * y
 
     def shrunk(self) -> Image:
-        """Return the finished picture."""
         return np.asarray(cv2.resize(self._image, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
     def draw_world(self) -> None:
@@ -91,7 +90,6 @@ class _Sheet:
         self._disc(x - radius * 0.3, y + radius * 0.3, radius * 0.26, (120, 112, 240))
 
     def draw_dog(self, dog: Mapping[str, Any]) -> None:
-        """Draw a dog from above: legs, trunk, tail, ears, and a head with its yellow stripes."""
         x, y, heading = dog["x"], dog["y"], dog["heading"]
         cos, sin = math.cos(heading), math.sin(heading)
 
@@ -136,7 +134,6 @@ class _Sheet:
 
 
 def _rounded(x1: float, x2: float, y1: float, y2: float, radius: float) -> list[tuple[float, float]]:
-    """Return a rectangle with rounded corners."""
     points = []
     for number, (x, y) in enumerate(
         ((x2 - radius, y2 - radius), (x1 + radius, y2 - radius), (x1 + radius, y1 + radius), (x2 - radius, y1 + radius))

@@ -140,13 +140,11 @@ class PacedYard:
         session.send(Sensors(t, sensed, samples, self._gates[name].token or 0))
 
     def _expire(self, t: float) -> None:
-        """Halt the robots with commands that have expired at ``t``."""
         for name, gate in self._gates.items():
             if gate.is_over(t):
                 self._halt(name)
 
     def _drop_silent(self) -> None:
-        """Close connections without data for ``SILENT_S``."""
         now = self._now()
         for session in list(self._sessions):
             if now - session.heard_at > SILENT_S:

@@ -71,7 +71,7 @@ def main(arguments: list[str] | None = None, output: TextIO = sys.stdout, errors
     )
     yard = Yard(reactor, Random(args.seed), scene)
     try:
-        robots = _make_robots(reactor, args.seed, yard, table)
+        robots = _make_emulators(reactor, args.seed, yard, table)
     except UsageError as error:
         return _print_error(errors, f"{args.robots}: {error}")
     try:
@@ -100,7 +100,6 @@ def main(arguments: list[str] | None = None, output: TextIO = sys.stdout, errors
 
 
 def _read_table(path: Path | None) -> dict[str, Any]:
-    """Read the robots in the file ``path``; raise ``UsageError`` if it is invalid."""
     if path is None:
         return {}
     try:
@@ -110,7 +109,7 @@ def _read_table(path: Path | None) -> dict[str, Any]:
     return table
 
 
-def _make_robots(reactor: Any, seed: int, yard: Yard, table: dict[str, Any]) -> Any:
+def _make_emulators(reactor: Any, seed: int, yard: Yard, table: dict[str, Any]) -> Any:
     """Return the emulators of ``table``; without any, their modules are not imported, to save memory."""
     if not table:
         return None

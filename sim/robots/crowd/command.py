@@ -27,10 +27,7 @@ AT_IT = 0.6
 
 
 def main(arguments: Sequence[str], make_team: MakeTeam | None = None) -> int:
-    """Run the simulation and print its results.
-
-    Returns 0 if the target was reached, 1 if not, 2 for invalid arguments.
-    """
+    """Run the simulation; return 0 if the target was reached, 1 if not, 2 for invalid arguments."""
     parser = argparse.ArgumentParser(
         prog="python -m sim.robots.crowd" if make_team is None else "swarm crowd",
         description=(__doc__ or "").splitlines()[0],
@@ -38,9 +35,7 @@ def main(arguments: Sequence[str], make_team: MakeTeam | None = None) -> int:
     parser.add_argument("--bodies", type=int, default=1000, help="number of robots (default %(default)s)")
     parser.add_argument("--room", type=float, default=ROOM, help="square metres per robot (default %(default)g)")
     parser.add_argument("--agents", type=int, default=0, help="number of robots with their own node and agent")
-    parser.add_argument(
-        "--controller", choices=sorted(CONTROLLERS), help="controller of the other robots (default: wander, or search)"
-    )
+    parser.add_argument("--controller", choices=sorted(CONTROLLERS), help="for the others (default: wander, or search)")
     parser.add_argument("--seed", type=int, default=1, help="seed of the random generators (default %(default)s)")
     parser.add_argument("--seconds", type=float, default=60.0, help="longest virtual time (default %(default)g)")
     parser.add_argument("--picture", type=Path, help="write a map of the robots to this file, as SVG")

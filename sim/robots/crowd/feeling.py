@@ -57,7 +57,7 @@ class Feelings:
         shake = np.where(moving, 0.25, 0.04)
         x, y, yaw = self._odometry
         columns = (
-            *(vx, vy, wz, x, y, _normalize(yaw), _normalize(heading + self._deviation)),
+            *(vx, vy, wz, x, y, _normalize_angle(yaw), _normalize_angle(heading + self._deviation)),
             *(_read_ranger(gap, limits, n) for gap, limits, n in ((ahead, NEAR, noise[2]), (ahead, FAR, noise[3]))),
             _read_ranger(slant, CHEST, noise[4]),
             cos * crowd.ax[first] + sin * crowd.ay[first] + shake * noise[5],
@@ -86,8 +86,7 @@ def sampled(values: dict[str, Value]) -> dict[str, tuple[float, ...]]:
     return {key: (float(values[key]),) for key in SAMPLED}
 
 
-def _normalize(angle: Floats) -> Floats:
-    """Normalize angles to -pi to pi."""
+def _normalize_angle(angle: Floats) -> Floats:
     normalized: Floats = np.remainder(angle + math.pi, math.tau) - math.pi
     return normalized
 

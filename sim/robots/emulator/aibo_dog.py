@@ -280,8 +280,6 @@ class AiboEmulator:
 
 
 class _Client:
-    """The client of a port."""
-
     def __init__(self, dog: AiboEmulator, service: str, outlet: Outlet, link: Link) -> None:
         self.service = service
         self.outlet = outlet

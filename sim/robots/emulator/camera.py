@@ -20,8 +20,6 @@ MOST_REQUEST = 8192
 
 
 class _Client(Client):
-    """One connection."""
-
     def __init__(self, device: Broadcast[Client], link: Link, outlet: Outlet) -> None:
         super().__init__(device, link, outlet)
         self.is_watching = False

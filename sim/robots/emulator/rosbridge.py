@@ -201,8 +201,6 @@ class RosbridgeRobot:
 
 
 class _Client:
-    """One connection."""
-
     def __init__(self, robot: RosbridgeRobot, outlet: Outlet) -> None:
         self.outlet = outlet
         self._robot = robot
@@ -211,7 +209,6 @@ class _Client:
         self._types: dict[str, str] = {}
 
     def wants(self, topic: str, now: float) -> bool:
-        """Return whether a message on ``topic`` is due."""
         due = False
         for sid, (period, next_at) in self._topics.get(topic, {}).items():
             if now >= next_at - 1e-6:
@@ -220,11 +217,9 @@ class _Client:
         return due
 
     def say(self, message: Mapping[str, Any]) -> None:
-        """Send one message."""
         self.outlet.send(self._socket.text(json.dumps(message).encode()))
 
     def received(self, data: bytes) -> None:
-        """Take bytes from the client."""
         if self._robot.faults.half_open:
             return
         messages, reply = self._socket.received(data)
@@ -237,12 +232,10 @@ class _Client:
             self.close()
 
     def close(self) -> None:
-        """Close the connection."""
         if self.outlet.link is not None:
             self.outlet.link.close()
 
     def link_down(self) -> None:
-        """Handle the loss of the connection."""
         self.outlet.link = None
         self._robot.forget(self)
 
