@@ -1,5 +1,6 @@
-"""The robots: SI units in and out.
+"""Drivers: one interface in SI units for every kind of robot.
 
-``driver`` is the contract, ``reading`` what goes through it, ``errors`` what goes wrong,
-``registry`` finds the driver of a kind.  One folder a robot below.  This room knows no network of peers.
+``driver`` defines the interface, ``reading`` the values that pass through it, ``errors`` the exceptions;
+``registry`` finds the driver of a kind.  Each kind of robot has its own package.  This package does not use the
+peer-to-peer network.
 """

@@ -1,7 +1,7 @@
-"""Base: what the driver of any robot does the same way; a robot of one's own adds how its link speaks.
+"""Base classes of drivers: the behaviour that is the same for every kind of robot.
 
-A kind of robot inherits from ``BaseDriver``, says five things to its robot (``_open _close _power _drive _halt``), and
-tells what it hears (``_up _observed _down _refused``).
+A kind of robot inherits from ``BaseDriver``, implements five methods that command its robot (``_open _close _power
+_drive _halt``) and calls four methods to report on it (``_up _observed _down _refused``).
 """
 
 from __future__ import annotations
@@ -24,13 +24,14 @@ from drivers.subscribers import Subscribers
 from drivers.timer import Timer
 
 ENGAGED = "estop.engaged"
-"""Whether the robot's own switch keeps its motors off; a robot without one leaves the key out."""
+"""Key of the robot's motor switch: true while the motors are off.  A robot without such a switch omits the key."""
 
 
 def heard_at(moment: float, due: float, now: float) -> float:
-    """When a robot was heard last, for who should have looked at ``due`` and does so ``now``.
+    """Return the time of a robot's last data, corrected for a check that runs late.
 
-    While this process was frozen nobody listened: that time is no silence of the robot's, whose words wait to be read.
+    The check was due at ``due`` and runs at ``now``.  The delay does not count as silence of the robot: the process was
+    frozen then, and received data may still wait to be read.
     """
     return min(now, moment + max(0.0, now - due))
 
@@ -38,17 +39,17 @@ def heard_at(moment: float, due: float, now: float) -> float:
 class BaseDriver:
     """One robot called ``name``; everything happens on the reactor's thread.
 
-    ``state`` says ``ready`` while observations flow, ``stale`` while they do not (none for ``STALE_S``, or the link is
-    being opened again) and ``stopped`` after ``disable``.  A link that comes back finds the motors as they were asked
-    for, and the motion at rest.  The motion ends by itself at the permit's deadline, and no token older than the
-    newest is obeyed.  Where the robot itself knows no deadlines, ``dead_man`` halts it when this process stands still.
+    ``state`` is ``ready`` while observations arrive, ``stale`` when none has arrived for ``STALE_S`` or the link is
+    being reopened, and ``stopped`` after ``disable``.  After a reconnect the motors have the state that was requested
+    last, and the motion is zero.  The motion ends at the permit's deadline; a token lower than the highest seen is
+    refused.  For a robot that has no deadlines itself, ``dead_man`` halts it when this process freezes.
     """
 
     log = Logger()
     STALE_S = 0.25
-    """Without an observation for so long the link counts as stale."""
+    """Seconds without an observation after which the link counts as stale."""
     SWITCH_S = 1.0
-    """A robot that has not switched its motors after so long does not answer."""
+    """Seconds within which the robot must confirm that it switched its motors."""
 
     def __init__(
         self, description: Description, name: str, clock: IReactorTime, dead_man: DeadMan | None = None
@@ -69,16 +70,16 @@ class BaseDriver:
         self._seen = Subscribers[Observation](name, self.log)
         self._counts = dict.fromkeys(("frames", "bad_frames", "pictures", "bytes", "links", "refused"), 0)
 
-    # -- the contract -----------------------------------------------------------------------------------------------
+    # -- the interface ----------------------------------------------------------------------------------------------
 
     @property
     def description(self) -> Description:
-        """What the robot is; valid before ``connect``."""
+        """The description of the robot; valid before ``connect``."""
         return self._description
 
     @property
     def state(self) -> str:
-        """Where the link stands: ``idle connecting ready stale stopped closed``."""
+        """The state of the link: ``idle connecting ready stale stopped closed``."""
         if self._is_closed:
             return "closed"
         if not self._is_open:
@@ -91,7 +92,7 @@ class BaseDriver:
 
     @property
     def token(self) -> int:
-        """The highest token that the robot has obeyed, as far as it told, whoever commanded it then."""
+        """The highest token that the robot has obeyed, of any commander, according to its reports."""
         return self._gate.token or 0
 
     def connect(self) -> Deferred[Description]:
@@ -99,7 +100,7 @@ class BaseDriver:
         if self._is_closed:
             return fail(UsageError("this driver was disconnected; make a new one"))
         if self._is_open:
-            return fail(UsageError("this driver is connected already, or on its way"))
+            return fail(UsageError("this driver is already connected or connecting; use it as it is"))
         self._is_open = True
         connecting = self._connecting = Deferred(self._on_cancelled_connecting)
         self._open()
@@ -110,29 +111,29 @@ class BaseDriver:
         if self._is_closed:
             return succeed(None)
         self.stop()
-        ended = self._shut()
+        ended = self._mark_closed()
         self._fail_connecting(LinkLost(f"{self._name}: disconnected before the first observation"))
         closed = self._close() if self._is_open else succeed(None)
         return closed if ended is None else gatherResults([closed, ended]).addCallback(lambda _: None)
 
     def enable(self) -> Deferred[bool]:
-        """Motors on; fires with True when the robot says so, fails with ``LinkLost`` or ``NoReply``."""
+        """Switch the motors on; fires with True when the robot confirms, fails with ``LinkLost`` or ``NoReply``."""
         return self._switch(True)
 
     def disable(self) -> Deferred[bool]:
-        """Motors off; fires with True when the robot says so, fails with ``LinkLost`` or ``NoReply``."""
+        """Switch the motors off; fires with True when the robot confirms, fails with ``LinkLost`` or ``NoReply``."""
         self.stop()
         return self._switch(False)
 
     def act(self, action: Action, permit: Permit) -> Action:
-        """Do ``action`` until ``permit.deadline``; returns what is really done, clipped to the limits.  Never blocks.
+        """Perform ``action`` until ``permit.deadline``; return the action clipped to the limits.  Never blocks.
 
         Raises ``NotEnabled``, ``Unsupported`` (unknown key, NaN), ``StaleCommand``.
         """
         for key, value in action.items():
             if key not in self._motion:
                 known = ", ".join(self._motion) or "none"
-                raise Unsupported(f"{self._name} has no action {key!r}; it knows {known}")
+                raise Unsupported(f"{self._name} has no action {key!r}; its actions are {known}")
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
                 raise Unsupported(f"{key} must be a finite number, not {value!r}")
         if self.state != "ready" or self._newest is None or not self._is_up:
@@ -141,7 +142,7 @@ class BaseDriver:
             raise NotEnabled(f"{self._name}'s motors are off; call enable() first")
         now = self._clock.seconds()
         if self._gate.is_over(now):
-            # This process stood still: what was in force is not, whoever has halted the robot.
+            # This process was frozen beyond the deadline of the last motion.
             self.stop()
         self._gate.admit(permit, now)
         for key, value in action.items():
@@ -154,30 +155,30 @@ class BaseDriver:
         return dict(done)
 
     def stop(self) -> Action:
-        """Zero motion now; safe in any state and never refused."""
+        """Set the motion to zero now; safe in any state and never refused."""
         self._rest()
         if self._is_up:
             self._halt()
         return dict(self._motion)
 
     def observe(self) -> Observation | None:
-        """The newest observation; never blocks."""
+        """Return the newest observation, None before the first; never blocks."""
         return self._newest
 
     def subscribe(self, seen: Callable[[Observation], None]) -> Callable[[], None]:
-        """Call ``seen`` at each observation; call what is returned to end that."""
+        """Call ``seen`` with each observation; return a function that ends the subscription."""
         return self._seen.add(seen)
 
     def invoke(self, name: str, **arguments: float | str) -> Deferred[Mapping[str, Value]]:
-        """Have the robot do one of ``description.skills``, or tell something that is not observed all the time."""
+        """Run one of ``description.skills``, or query a value that is not part of the observations."""
         known = ", ".join(self._description.skills) or "none"
-        return fail(Unsupported(f"{self._name} has no skill {name!r}; it knows {known}"))
+        return fail(Unsupported(f"{self._name} has no skill {name!r}; its skills are {known}"))
 
     def diagnostics(self) -> dict[str, float]:
-        """Counters: frames, bad frames, pictures, bytes, links, reconnects, refused; ``age`` of the newest in s.
+        """Return counters: frames, bad frames, pictures, bytes, links, reconnects, refused; ``age`` of the newest in s.
 
-        Also the commands ``accepted`` here, and those refused as ``lower token`` or ``late``; ``halts``, how often the
-        dead man's switch halted the robot, where it has one.
+        Includes the commands ``accepted`` here and the refused ones as ``lower token`` or ``late``; with a dead man's
+        switch also ``halts``, the number of times that the switch halted the robot.
         """
         counts: dict[str, float] = {**self._counts, "accepted": self._gate.accepted, **self._gate.refused}
         if self._dead_man is not None:
@@ -186,34 +187,34 @@ class BaseDriver:
         counts["age"] = math.inf if self._newest is None else self._clock.seconds() - self._newest.t_host
         return counts
 
-    # -- what a kind of robot says to its robot ---------------------------------------------------------------------
+    # -- implemented by each kind of robot --------------------------------------------------------------------------
 
     def _open(self) -> None:
-        """Begin to open the link, and open it again whenever it is lost; ``_up`` when there is one."""
+        """Start to open the link, and reopen it after each loss; call ``_up`` each time that it opens."""
         raise NotImplementedError
 
     def _close(self) -> Deferred[None]:
-        """Close the link for good."""
+        """Close the link; it is not reopened."""
         raise NotImplementedError
 
     def _power(self, on: bool) -> None:
-        """Switch the motors; done when an observation says so, or where it says nothing of that, at once."""
+        """Switch the motors; complete when an observation confirms it, or at once if the robot has no such state."""
 
     def _drive(self, motion: Action, permit: Permit) -> Action:
-        """Move like this from now on; returns what the robot really does, where it can do only some of it."""
+        """Set the motion; return the motion that the robot performs, which can be a part of ``motion``."""
         raise NotImplementedError
 
     def _halt(self) -> None:
-        """Stand still now."""
+        """Command the robot to stand still."""
 
     def _last_word(self) -> LastWord | None:
-        """By what another process halts the robot while there is a link; None where the robot stops by itself."""
+        """Return the command by which the dead man's switch halts the robot; None if the robot stops by itself."""
         return None
 
-    # -- what a kind of robot hears from its robot ------------------------------------------------------------------
+    # -- called by each kind of robot -------------------------------------------------------------------------------
 
     def _up(self) -> None:
-        """There is a link: a first one, or one after a loss."""
+        """Report that the link has opened, for the first time or again."""
         self._is_up = True
         self._counts["links"] += 1
         self._guard()
@@ -221,12 +222,12 @@ class BaseDriver:
             self._power(True)
 
     def _down(self) -> None:
-        """The link is gone: the motion is at rest, as far as it is known."""
+        """Report that the link is lost; the motion counts as zero."""
         self._is_up = self._is_heard = False
         self._rest()
         if self._dead_man is not None:
             self._dead_man.leave()
-        self._fail_switching(LinkLost(f"the link to {self._name} went away; it is being opened again"))
+        self._fail_switching(LinkLost(f"the link to {self._name} was lost; the driver is reconnecting"))
 
     def _observed(
         self,
@@ -235,9 +236,9 @@ class BaseDriver:
         samples: Mapping[str, Sequence[float]] | None = None,
         frame: Frame | None = None,
     ) -> None:
-        """The robot says how it is."""
-        told = {key: tuple(row) for key, row in (samples or {}).items()}
-        observation = self._newest = Observation(self._clock.seconds(), t_robot, values, told, frame)
+        """Publish a new observation of the robot."""
+        rows = {key: tuple(row) for key, row in (samples or {}).items()}
+        observation = self._newest = Observation(self._clock.seconds(), t_robot, values, rows, frame)
         self._is_heard = True
         self._settle_switching(values.get(ENGAGED))
         connecting, self._connecting = self._connecting, None
@@ -246,8 +247,8 @@ class BaseDriver:
         self._seen.tell(observation)
 
     def _refused(self, error: Exception) -> None:
-        """There is no such robot, for good."""
-        self._shut()
+        """Close the driver because this robot does not exist; reconnecting cannot help."""
+        self._mark_closed()
         self._close()
         if self._connecting is None:
             self.log.error("{robot}: {error}", robot=self._name, error=error)
@@ -255,23 +256,23 @@ class BaseDriver:
 
     @property
     def _may_move(self) -> bool:
-        """Whether a motion is in force whose deadline lies ahead.
+        """Whether a motion is in force and its deadline lies ahead.
 
-        Asked by whoever says a motion again: after a freeze of the node all timers are late, and what repeats a motion
-        may be called before what ends it.
+        Code that repeats a motion has to check this: after a freeze of the node all timers are late, and the timer that
+        repeats a motion may fire before the timer that ends it.
         """
         return self._gate.deadline is not None and not self._gate.is_over(self._clock.seconds())
 
     def _guard(self) -> None:
-        """Tell the dead man's switch by what the robot is halted now."""
-        word = None if self._dead_man is None else self._last_word()
-        if self._dead_man is not None and word is not None:
-            self._dead_man.guard(word)
+        """Pass the current halt command to the dead man's switch."""
+        command = None if self._dead_man is None else self._last_word()
+        if self._dead_man is not None and command is not None:
+            self._dead_man.guard(command)
 
     def _switch(self, on: bool) -> Deferred[bool]:
         if not self._is_up or self._newest is None:
             return fail(LinkLost(f"{self._name} is {self.state}; connect first, or wait for the link"))
-        self._fail_switching(UsageError("another enable() or disable() came in between"))
+        self._fail_switching(UsageError("a later enable() or disable() replaced this one"))
         self._wants_motors = on
         self._power(on)
         if ENGAGED not in self._newest.values:
@@ -313,7 +314,7 @@ class BaseDriver:
         for key in self._motion:
             self._motion[key] = 0.0
 
-    def _shut(self) -> Deferred[None] | None:
+    def _mark_closed(self) -> Deferred[None] | None:
         self._is_closed = True
         self._rest()
         self._fail_switching(LinkLost(f"{self._name}: disconnected"))
@@ -321,9 +322,9 @@ class BaseDriver:
 
 
 class SensingDriver(BaseDriver):
-    """What only senses, and moves as whoever holds it does.
+    """A device that only senses and has no motors, such as a phone or a camera.
 
-    It has no motors: ``enable`` is always granted while readings come, and of actions there is only ``{}``.
+    ``enable`` succeeds while readings arrive, and ``{}`` is the only action.
     """
 
     def _drive(self, motion: Action, permit: Permit) -> Action:
@@ -331,12 +332,12 @@ class SensingDriver(BaseDriver):
 
     def _switch(self, on: bool) -> Deferred[bool]:
         if self.state == "stale":
-            return fail(LinkLost(f"{self._name} is stale; wait until it is heard again"))
+            return fail(LinkLost(f"{self._name} is stale; wait for its next reading"))
         return super()._switch(on)
 
 
 class Reader(Protocol):
-    """What cuts the bytes of a robot into messages."""
+    """Splits a robot's bytes into messages."""
 
     bad_frames: int
 
@@ -345,9 +346,9 @@ class Reader(Protocol):
 
 
 class LinkedDriver(BaseDriver):
-    """A robot at the other end of one link, which ``connector`` opens to ``place``.
+    """A robot at the other end of one link, which ``connector`` opens to ``place`` (host and port, or device and baud).
 
-    A kind makes ``_reader`` for each new link, and tells what the robot says (``_heard``).
+    A kind of robot creates ``_reader`` for each new link and handles the messages in ``_heard``.
     """
 
     def __init__(
@@ -370,11 +371,11 @@ class LinkedDriver(BaseDriver):
 
     @property
     def problem(self) -> str:
-        """What keeps the robot from being heard, and the remedy; empty where it is heard."""
+        """The reason why no data arrives from the robot, and the remedy; empty while data arrives."""
         return str(getattr(self._line, "problem", "")) or self._problem
 
     def received(self, data: bytes) -> None:
-        """Take bytes from the robot; called by the line."""
+        """Take bytes from the robot; called by the link."""
         self._counts["bytes"] += len(data)
         reader = self._reader
         bad = reader.bad_frames
@@ -385,7 +386,7 @@ class LinkedDriver(BaseDriver):
         self._counts["bad_frames"] += reader.bad_frames - bad
 
     def _heard(self, message: Any) -> None:
-        """Take one message of the robot."""
+        """Handle one message of the robot."""
         raise NotImplementedError
 
     def _open(self) -> None:
@@ -400,7 +401,7 @@ class LinkedDriver(BaseDriver):
             self._link.send(data)
 
     def _name_problem(self, problem: str) -> None:
-        """Log why the robot is not heard, unless that was logged last."""
+        """Store and log the reason why no data arrives from the robot; the same reason is not logged twice in a row."""
         if problem != self._problem:
             self.log.warn("{robot}: {problem}", robot=self._name, problem=problem)
         self._problem = problem

@@ -1,15 +1,14 @@
-"""Conformance: what every driver must hold to, as tests that anyone can run on one's own robot.
+"""Conformance tests for drivers, for use by any project.
 
 ::
 
     class RoverTests(Conformance, SynchronousTestCase):
         bench = partial(MemoryBench, Rover, Emulator, {"host": "rover"})
 
-or, without a test case, ``broken(partial(MemoryBench, ...))``, which gives a line for each rule that is broken.  Who
-has a bench of another kind gives ``bench`` a function that makes that, or is the bench oneself: a test case with the
-methods of ``Bench``.
+Without a test case, ``broken(partial(MemoryBench, ...))`` returns a line for each rule that is broken.  For another
+kind of test rig set ``bench`` to a function that creates it, or implement the methods of ``Bench`` in the test case.
 
-What only senses (a description without limits) is held to the same rules but those of motion.
+Devices that only sense (a description without limits) are exempt from the rules of motion.
 """
 
 from __future__ import annotations
@@ -30,52 +29,52 @@ from drivers.reading import Action, Description, Observation
 
 STATES = ("idle", "connecting", "ready", "stale", "stopped", "closed")
 COUNTS = ("frames", "bad_frames", "bytes", "reconnects", "age", "accepted", "lower token", "late")
-"""What ``diagnostics`` tells at least."""
+"""Keys that ``diagnostics`` must contain."""
 AT_REST = 0.01
-"""A robot that is slower, in m/s or rad/s, stands still."""
+"""Speed in m/s or rad/s below which a robot counts as standing still."""
 HALT_S = 0.2
-"""After a stop, or its deadline, a robot has so long to stand still."""
+"""Seconds within which a robot must stand still after a stop or its deadline."""
 NO_NUMBERS = (math.nan, math.inf, -math.inf, True, None, "0.1")
 
 
 class Bench(Protocol):
-    """A robot, or its stand-in, on a bench: what the rules need beside the driver.
+    """A test rig with a robot or its emulator.
 
-    ``settle_s`` is how long it may take to connect, to switch the motors, or to close.
+    ``settle_s`` is the time in seconds that connecting, switching the motors, or closing may take.
     """
 
     settle_s: float
 
     def make_driver(self) -> Driver:
-        """A fresh driver of the robot that is not connected."""
+        """Return a new, unconnected driver of the robot."""
 
     def pass_time(self, seconds: float) -> None:
         """Let time pass for driver and robot."""
 
     def now(self) -> float:
-        """The driver's clock, in seconds."""
+        """Return the time on the driver's clock, in seconds."""
 
     def true_speed(self) -> float:
-        """How fast the robot really moves, in m/s; asked of those that move."""
+        """Return the real speed of the robot in m/s; called only for robots that move."""
 
     def cut_link(self) -> None:
-        """Break the link as a lost network does; it can be opened again.  ``NotImplementedError``: there is none."""
+        """Break the link; it can be reopened.  Raises ``NotImplementedError`` if there is no link."""
 
 
 class StandIn(Protocol):
-    """An emulated robot as ``MemoryBench`` needs it; it is made with the clock by which it lives."""
+    """An emulated robot for ``MemoryBench``; it is created with its clock."""
 
     def accept(self, link: Link) -> Receiver:
-        """Serve a new link; returns who shall hear what arrives on it."""
+        """Serve a new link; return the receiver of its data."""
 
     def true_speed(self) -> float:
-        """How fast it moves now, in m/s."""
+        """Return its current speed in m/s."""
 
 
 class MemoryBench:
-    """A driver and an emulated robot, joined through memory, each by a clock that is turned by hand.
+    """A driver and an emulated robot connected in memory, each with a clock in virtual time.
 
-    ``make`` is what makes the driver, as ``drivers.registry`` calls it: (options, name, clock, connector).
+    ``make`` creates the driver, with the arguments (options, name, clock, connector).
     """
 
     settle_s = 0.3
@@ -94,21 +93,21 @@ class MemoryBench:
         self.connector = MemoryConnector(self._robots_clock, self.robot.accept)
 
     def make_driver(self) -> Driver:
-        """A fresh driver of the robot."""
+        """Return a new driver of the robot."""
         return self._make(self._options, "robot", self._clock, self.connector)
 
     def pass_time(self, seconds: float) -> None:
-        """Turn both clocks, in small steps so that answers to answers arrive."""
+        """Advance both clocks in steps small enough for exchanges of several messages."""
         for _ in range(round(seconds / self.STEP_S)):
             self._robots_clock.advance(self.STEP_S)
             self._clock.advance(self.STEP_S)
 
     def now(self) -> float:
-        """The driver's clock."""
+        """Return the time on the driver's clock."""
         return self._clock.seconds()
 
     def true_speed(self) -> float:
-        """What the robot does."""
+        """Return the speed of the emulated robot."""
         return self.robot.true_speed()
 
     def cut_link(self) -> None:
@@ -116,39 +115,39 @@ class MemoryBench:
         self.connector.cut()
 
     def left_over(self) -> int:
-        """How many calls the driver has left on its clock."""
+        """Return the number of calls pending on the driver's clock."""
         return len(self._clock.getDelayedCalls())
 
 
 class Breach(AssertionError):
-    """A driver breaks a rule; the text says how."""
+    """A driver breaks a rule; the message gives the details."""
 
 
 class Faulty(Exception):
-    """What a subscriber raises on purpose."""
+    """Raised deliberately by a subscriber."""
 
 
 def check_describes(bench: Bench) -> None:
-    """It says what its robot is and can do before it connects, and that stays so."""
+    """The driver describes its robot before it connects, and the description does not change."""
     driver = bench.make_driver()
-    body = driver.description
-    _demand(driver.state == "idle", f"before connect its state is {driver.state!r}, not 'idle'")
-    _demand(driver.observe() is None, "it observes something before it is connected")
-    _demand(isinstance(body, Description) and bool(body.kind and body.model), "it does not say its kind and model")
-    _demand(math.isfinite(body.radius) and body.radius > 0.0, f"its radius is {body.radius!r}")
-    for key, (low, high) in body.limits.items():
-        _demand(
+    robot = driver.description
+    _require(driver.state == "idle", f"before connect its state is {driver.state!r}, not 'idle'")
+    _require(driver.observe() is None, "it observes something before it is connected")
+    _require(isinstance(robot, Description) and bool(robot.kind and robot.model), "its kind or model is empty")
+    _require(math.isfinite(robot.radius) and robot.radius > 0.0, f"its radius is {robot.radius!r}")
+    for key, (low, high) in robot.limits.items():
+        _require(
             math.isfinite(low) and math.isfinite(high) and low < high and low <= 0.0 <= high,
-            f"the limits of {key} are {low!r} and {high!r}; rest lies between them",
+            f"the limits of {key} are {low!r} and {high!r}; they must be finite and include 0",
         )
-    _demand(all(rate > 0.0 for rate in body.rates.values()), f"its rates are {dict(body.rates)!r}")
-    _demand(all(isinstance(name, str) and name for name in body.skills), f"its skills are {body.skills!r}")
+    _require(all(rate > 0.0 for rate in robot.rates.values()), f"its rates are {dict(robot.rates)!r}")
+    _require(all(isinstance(name, str) and name for name in robot.skills), f"its skills are {robot.skills!r}")
     try:
-        json.dumps({name: dict(about) for name, about in body.capabilities.items()}, allow_nan=False)
+        json.dumps({name: dict(about) for name, about in robot.capabilities.items()}, allow_nan=False)
     except (TypeError, ValueError) as error:
-        raise Breach(f"its capabilities cannot be told to others: {error}") from error
-    _connected(bench, driver)
-    _demand(driver.description == body, "connected it describes itself otherwise")
+        raise Breach(f"its capabilities are not valid JSON: {error}") from error
+    _connect(bench, driver)
+    _require(driver.description == robot, "its description changes when it connects")
 
 
 def check_connects(bench: Bench) -> None:
@@ -156,276 +155,278 @@ def check_connects(bench: Bench) -> None:
     driver = bench.make_driver()
     has_seen: list[bool] = []
 
-    def fired(told: Description) -> Description:
+    def fired(description: Description) -> Description:
         has_seen.append(driver.observe() is not None)
-        return told
+        return description
 
-    connected = _Answer(driver.connect().addCallback(fired))
-    _demand(not connected.is_there, "connect fires within its own call")
-    _demand(driver.state == "connecting", f"while it connects its state is {driver.state!r}")
+    connected = _Result(driver.connect().addCallback(fired))
+    _require(not connected.has_fired, "connect fires within its own call")
+    _require(driver.state == "connecting", f"while it connects its state is {driver.state!r}")
     bench.pass_time(bench.settle_s)
-    _demand(connected.value("connect") == driver.description, "connect does not fire with the description")
-    _demand(has_seen == [True], "connect fires before there is something to observe")
-    _demand(driver.state == "ready", f"connected its state is {driver.state!r}, not 'ready'")
-    _demand(_Answer(driver.connect()).is_error(DriverError), "connected once, it can be connected again")
+    _require(connected.value("connect") == driver.description, "connect does not fire with the description")
+    _require(has_seen == [True], "connect fires before there is something to observe")
+    _require(driver.state == "ready", f"connected its state is {driver.state!r}, not 'ready'")
+    _require(_Result(driver.connect()).is_error(DriverError), "a connected driver can be connected again")
 
 
 def check_motors(bench: Bench) -> None:
-    """Nothing moves before ``enable`` and after ``disable``; ``enable`` lifts that."""
+    """Nothing moves before ``enable`` or after ``disable``; ``enable`` permits motion again."""
     driver = bench.make_driver()
-    wish = _wish(driver)
-    _refuses(NotEnabled, driver, wish, _permit(bench), "before it is connected")
-    _connected(bench, driver)
-    if wish:
-        _refuses(NotEnabled, driver, wish, _permit(bench), "before enable")
+    action = _half_speed(driver)
+    _check_refused(NotEnabled, driver, action, _grant(bench), "before it is connected")
+    _connect(bench, driver)
+    if action:
+        _check_refused(NotEnabled, driver, action, _grant(bench), "before enable")
         bench.pass_time(HALT_S)
-        _demand_rest(bench, driver, "before enable")
-    _enabled(bench, driver)
-    driver.act(wish, _permit(bench, 30.0))
+        _require_rest(bench, driver, "before enable")
+    _enable(bench, driver)
+    driver.act(action, _grant(bench, 30.0))
     bench.pass_time(bench.settle_s)
-    disabled = _Answer(driver.disable())
+    disabled = _Result(driver.disable())
     bench.pass_time(bench.settle_s)
-    _demand(disabled.value("disable") is True, "disable does not fire with True")
-    _demand(driver.state == "stopped", f"disabled its state is {driver.state!r}, not 'stopped'")
-    _demand_rest(bench, driver, "after disable")
-    _refuses(NotEnabled, driver, wish, _permit(bench), "after disable")
-    _enabled(bench, driver)
-    driver.act(wish, _permit(bench))
+    _require(disabled.value("disable") is True, "disable does not fire with True")
+    _require(driver.state == "stopped", f"disabled its state is {driver.state!r}, not 'stopped'")
+    _require_rest(bench, driver, "after disable")
+    _check_refused(NotEnabled, driver, action, _grant(bench), "after disable")
+    _enable(bench, driver)
+    driver.act(action, _grant(bench))
 
 
 def check_clips(bench: Bench) -> None:
-    """What ``act`` returns is what is really done: within the limits of the description."""
-    driver = _ready(bench)
+    """``act`` returns the action that is really performed, within the limits of the description."""
+    driver = _ready_driver(bench)
     for key, (low, high) in driver.description.limits.items():
         for wanted in (low - 99.0, high + 99.0):
-            done = driver.act({**dict.fromkeys(driver.description.limits, 0.0), key: wanted}, _permit(bench))
-            _demand(isinstance(done, Mapping) and key in done, f"act does not say what {key} became")
+            done = driver.act({**dict.fromkeys(driver.description.limits, 0.0), key: wanted}, _grant(bench))
+            _require(isinstance(done, Mapping) and key in done, f"the result of act lacks {key}")
             for name, value in done.items():
                 least, most = driver.description.limits.get(name, (-math.inf, math.inf))
-                _demand(
+                _require(
                     isinstance(value, float | int) and least - 1e-9 <= value <= most + 1e-9,
-                    f"asked for {key} = {wanted:g} it does {name} = {value!r}, beyond its limits",
+                    f"commanded {key} = {wanted:g} it performs {name} = {value!r}, beyond its limits",
                 )
-    axis = _axis(driver)
+    axis = _axis_of(driver)
     if axis:
         high = driver.description.limits[axis][1]
-        done = driver.act({**dict.fromkeys(driver.description.limits, 0.0), axis: high + 99.0}, _permit(bench))
-        _demand(done[axis] > 0.5 * high, f"asked for more than it can, it does {axis} = {done[axis]:g}, not {high:g}")
+        done = driver.act({**dict.fromkeys(driver.description.limits, 0.0), axis: high + 99.0}, _grant(bench))
+        _require(done[axis] > 0.5 * high, f"beyond its limit it performs {axis} = {done[axis]:g}, not {high:g}")
 
 
 def check_keeps(bench: Bench) -> None:
-    """A key that an action does not name stays as it was while the last command holds, and is zero after a stop."""
-    driver = _ready(bench)
-    axis = _axis(driver)
+    """A key that an action omits keeps its value while the last command holds, and is zero after a stop."""
+    driver = _ready_driver(bench)
+    axis = _axis_of(driver)
     if not axis:
         return
-    first = driver.act(_wish(driver), _permit(bench))[axis]
-    _demand(driver.act({}, _permit(bench)).get(axis) == first, f"{axis} changes though the next action leaves it out")
+    first = driver.act(_half_speed(driver), _grant(bench))[axis]
+    _require(driver.act({}, _grant(bench)).get(axis) == first, f"{axis} changes though the next action omits it")
     driver.stop()
-    after = driver.act({}, _permit(bench)).get(axis)
-    _demand(after == 0.0, f"after a stop an action that names nothing does {axis} = {after!r}")
+    after = driver.act({}, _grant(bench)).get(axis)
+    _require(after == 0.0, f"after a stop an empty action performs {axis} = {after!r}")
 
 
 def check_refuses(bench: Bench) -> None:
-    """An unknown key, or a value that is no finite number, raises ``Unsupported``, and nothing moves."""
-    driver = _ready(bench)
-    _refuses(Unsupported, driver, {"base.warp": 1.0}, _permit(bench), "with an unknown key")
-    for value in NO_NUMBERS if _axis(driver) else ():
-        action: Any = {_axis(driver): value}
-        _refuses(Unsupported, driver, action, _permit(bench), f"with {value!r}")
-        _refuses(Unsupported, driver, {**_wish(driver), "base.warp": 1.0}, _permit(bench), "with a key too many")
+    """An unknown key, or a value that is not a finite number, raises ``Unsupported``, and nothing moves."""
+    driver = _ready_driver(bench)
+    _check_refused(Unsupported, driver, {"base.warp": 1.0}, _grant(bench), "with an unknown key")
+    for value in NO_NUMBERS if _axis_of(driver) else ():
+        action: Any = {_axis_of(driver): value}
+        _check_refused(Unsupported, driver, action, _grant(bench), f"with {value!r}")
+        action = {**_half_speed(driver), "base.warp": 1.0}
+        _check_refused(Unsupported, driver, action, _grant(bench), "with a key too many")
     bench.pass_time(HALT_S)
-    _demand_rest(bench, driver, "after what it refused")
+    _require_rest(bench, driver, "after a refused action")
 
 
 def check_deadline(bench: Bench) -> None:
-    """The robot moves while its permit holds, and stands still by itself soon after; a new permit moves that."""
-    driver = _ready(bench)
-    if not _axis(driver):
+    """The robot moves until its permit expires and then stops by itself; a new permit extends the motion."""
+    driver = _ready_driver(bench)
+    if not _axis_of(driver):
         return
-    wanted = abs(driver.act(_wish(driver), _permit(bench, 0.6))[_axis(driver)])
+    wanted = abs(driver.act(_half_speed(driver), _grant(bench, 0.6))[_axis_of(driver)])
     bench.pass_time(0.5)
-    _demand(bench.true_speed() > 0.5 * wanted, f"it said that it does {wanted:g} and does {bench.true_speed():g}")
-    driver.act(_wish(driver), _permit(bench, 0.6))
+    _require(bench.true_speed() > 0.5 * wanted, f"it reports {wanted:g} m/s and moves at {bench.true_speed():g}")
+    driver.act(_half_speed(driver), _grant(bench, 0.6))
     bench.pass_time(0.5)
-    _demand(bench.true_speed() > 0.5 * wanted, "it stops at the deadline of a command that was renewed")
+    _require(bench.true_speed() > 0.5 * wanted, "it stops at the deadline of a command that was renewed")
     bench.pass_time(0.1 + HALT_S)
-    _demand_rest(bench, driver, "after its deadline")
+    _require_rest(bench, driver, "after its deadline")
 
 
 def check_token(bench: Bench) -> None:
-    """A lower token than one seen, or a deadline that is not ahead, raises ``StaleCommand`` and is counted."""
-    driver = _ready(bench)
-    wish = _wish(driver)
-    driver.act(wish, _permit(bench, token=5))
-    _demand(driver.token == 5, f"having obeyed token 5 it tells {driver.token!r}")
-    _refuses(StaleCommand, driver, wish, _permit(bench, token=4), "with a lower token")
+    """A lower token than one seen, or a deadline that has passed, raises ``StaleCommand`` and is counted."""
+    driver = _ready_driver(bench)
+    action = _half_speed(driver)
+    driver.act(action, _grant(bench, token=5))
+    _require(driver.token == 5, f"after it obeyed token 5 its token is {driver.token!r}")
+    _check_refused(StaleCommand, driver, action, _grant(bench, token=4), "with a lower token")
     for deadline in (bench.now(), bench.now() - 1.0, math.nan, math.inf):
-        _refuses(StaleCommand, driver, wish, Permit(6, deadline), f"with the deadline {deadline!r}, at {bench.now()!r}")
-    driver.act(wish, _permit(bench, token=5))
+        when = f"with the deadline {deadline!r}, at {bench.now()!r}"
+        _check_refused(StaleCommand, driver, action, Permit(6, deadline), when)
+    driver.act(action, _grant(bench, token=5))
     driver.stop()
-    _refuses(StaleCommand, driver, wish, _permit(bench, token=4), "with a lower token, after a stop")
+    _check_refused(StaleCommand, driver, action, _grant(bench, token=4), "with a lower token, after a stop")
     counts = driver.diagnostics()
-    _demand((counts["accepted"], counts["lower token"], counts["late"]) == (2, 2, 4), "it miscounts what it refused")
+    _require((counts["accepted"], counts["lower token"], counts["late"]) == (2, 2, 4), "it miscounts commands")
 
 
 def check_stops(bench: Bench) -> None:
-    """``stop`` is never refused, whatever the state, and brings the motion to rest."""
+    """``stop`` is never refused, in any state, and ends the motion."""
     driver = bench.make_driver()
     driver.stop()
-    connecting = _Answer(driver.connect())
+    connecting = _Result(driver.connect())
     driver.stop()
     bench.pass_time(bench.settle_s)
     connecting.value("connect, after stop,")
-    _enabled(bench, driver)
-    driver.act(_wish(driver), _permit(bench, 30.0))
+    _enable(bench, driver)
+    driver.act(_half_speed(driver), _grant(bench, 30.0))
     bench.pass_time(0.3)
     done = driver.stop()
-    _demand(set(done) == set(driver.description.limits), "stop does not say what became of every limit's key")
-    _demand(not any(done.values()), f"stop says that {dict(done)!r} is done")
+    _require(set(done) == set(driver.description.limits), "the result of stop lacks a key of the limits")
+    _require(not any(done.values()), f"stop returns a motion that is not zero: {dict(done)!r}")
     bench.pass_time(HALT_S)
-    _demand_rest(bench, driver, "after stop")
-    _Answer(driver.disable())
+    _require_rest(bench, driver, "after stop")
+    _Result(driver.disable())
     driver.stop()
     bench.pass_time(bench.settle_s)
     driver.stop()
-    if _cut(bench, driver):
+    if _try_cut_link(bench, driver):
         driver.stop()
-    _Answer(driver.disconnect())
+    _Result(driver.disconnect())
     driver.stop()
     bench.pass_time(bench.settle_s)
     driver.stop()
 
 
 def check_ends(bench: Bench) -> None:
-    """``disconnect`` stops the motion first, may be called twice and in any state, and is for good."""
+    """``disconnect`` stops the motion first, is final, and may be called twice and in any state."""
     idle = bench.make_driver()
-    left = _Answer(idle.disconnect())
+    left = _Result(idle.disconnect())
     bench.pass_time(bench.settle_s)
     left.value("disconnect before connect")
-    _demand(idle.state == "closed", f"disconnected before connect its state is {idle.state!r}")
+    _require(idle.state == "closed", f"disconnected before connect its state is {idle.state!r}")
     early = bench.make_driver()
-    connecting = _Answer(early.connect())
-    _Answer(early.disconnect())
+    connecting = _Result(early.connect())
+    _Result(early.disconnect())
     bench.pass_time(bench.settle_s)
-    _demand(connecting.is_error(DriverError), "disconnected while it connects, connect does not fail")
-    driver = _ready(bench)
-    driver.act(_wish(driver), _permit(bench, 30.0))
+    _require(connecting.is_error(DriverError), "disconnect during connect does not make connect fail")
+    driver = _ready_driver(bench)
+    driver.act(_half_speed(driver), _grant(bench, 30.0))
     bench.pass_time(0.3)
-    first, second = _Answer(driver.disconnect()), _Answer(driver.disconnect())
-    _demand(driver.state == "closed", f"disconnected its state is {driver.state!r}, not 'closed'")
+    first, second = _Result(driver.disconnect()), _Result(driver.disconnect())
+    _require(driver.state == "closed", f"disconnected its state is {driver.state!r}, not 'closed'")
     bench.pass_time(bench.settle_s)
     first.value("disconnect")
     second.value("disconnect, called twice,")
-    _demand_rest(bench, driver, "after disconnect")
-    _demand(_Answer(driver.connect()).is_error(DriverError), "disconnected, it can be connected again")
-    _refuses(DriverError, driver, _wish(driver), _permit(bench), "after disconnect")
+    _require_rest(bench, driver, "after disconnect")
+    _require(_Result(driver.connect()).is_error(DriverError), "after disconnect it can be connected again")
+    _check_refused(DriverError, driver, _half_speed(driver), _grant(bench), "after disconnect")
 
 
 def check_leaves(bench: Bench) -> None:
-    """After ``disconnect``, or a ``connect`` that was cancelled, it is closed, and has no calls left on its clock."""
-    driver = _ready(bench)
-    driver.act(_wish(driver), _permit(bench, 30.0))
-    _Answer(driver.disconnect())
+    """After ``disconnect``, or a cancelled ``connect``, it is closed and has no pending calls on its clock."""
+    driver = _ready_driver(bench)
+    driver.act(_half_speed(driver), _grant(bench, 30.0))
+    _Result(driver.disconnect())
     bench.pass_time(bench.settle_s)
-    _demand_nothing_left(bench, "")
+    _require_no_pending_calls(bench, "")
     for seconds in (0.0, 0.01):
         driver, seen = bench.make_driver(), list[Observation]()
         connecting = driver.connect()
-        _Answer(connecting)
+        _Result(connecting)
         bench.pass_time(seconds)
         if driver.observe() is not None:
-            _Answer(driver.disconnect())
+            _Result(driver.disconnect())
             bench.pass_time(bench.settle_s)
             return
         driver.subscribe(seen.append)
         connecting.cancel()
         bench.pass_time(bench.settle_s)
-        _demand(driver.state == "closed", f"its connect cancelled, its state is {driver.state!r}, not 'closed'")
-        _demand(not seen, "its connect cancelled, it observes all the same")
-        _demand_nothing_left(bench, "its connect cancelled, ")
+        _require(driver.state == "closed", f"after a cancelled connect its state is {driver.state!r}, not 'closed'")
+        _require(not seen, "after a cancelled connect it still observes")
+        _require_no_pending_calls(bench, "after a cancelled connect ")
 
 
 def check_link(bench: Bench) -> None:
-    """A lost link makes it stale and brings the motion to rest; it comes back by itself, at rest."""
-    driver = _ready(bench)
-    driver.act(_wish(driver), _permit(bench, 30.0))
+    """A lost link makes it stale and ends the motion; it reconnects by itself, at rest."""
+    driver = _ready_driver(bench)
+    driver.act(_half_speed(driver), _grant(bench, 30.0))
     bench.pass_time(0.3)
-    if not _cut(bench, driver):
+    if not _try_cut_link(bench, driver):
         return
-    _demand(driver.state == "stale", f"without its link its state is {driver.state!r}, not 'stale'")
-    _refuses(NotEnabled, driver, _wish(driver), _permit(bench), "without its link")
+    _require(driver.state == "stale", f"without its link its state is {driver.state!r}, not 'stale'")
+    _check_refused(NotEnabled, driver, _half_speed(driver), _grant(bench), "without its link")
     bench.pass_time(max(1.0, 2.0 * bench.settle_s))
-    _demand(driver.state == "ready", f"with its link back its state is {driver.state!r}, not 'ready'")
-    _demand_rest(bench, driver, "after a lost link")
+    _require(driver.state == "ready", f"with its link back its state is {driver.state!r}, not 'ready'")
+    _require_rest(bench, driver, "after a lost link")
     counts = driver.diagnostics()
-    _demand(counts["reconnects"] == 1.0, f"it came back once and counts {counts['reconnects']:g} reconnects")
-    driver.act(_wish(driver), _permit(bench))
+    _require(counts["reconnects"] == 1.0, f"it reconnected once and counts {counts['reconnects']:g} reconnects")
+    driver.act(_half_speed(driver), _grant(bench))
 
 
 def check_times(bench: Bench) -> None:
-    """Observations come in the order of time, none from the future, and ``observe`` gives the newest."""
-    driver = _ready(bench)
+    """Observations arrive in order of time, none from the future, and ``observe`` returns the newest."""
+    driver = _ready_driver(bench)
     seen: list[Observation] = []
     driver.subscribe(seen.append)
     bench.pass_time(2.0 * bench.settle_s)
-    _demand(len(seen) > 1, f"in {2.0 * bench.settle_s:g} s it observes {len(seen)} times")
+    _require(len(seen) > 1, f"in {2.0 * bench.settle_s:g} s it observes {len(seen)} times")
     for before, after in zip(seen, seen[1:], strict=False):
-        _demand(before.t_host <= after.t_host, f"t_host goes back from {before.t_host} to {after.t_host}")
-        _demand(before.t_robot <= after.t_robot, f"t_robot goes back from {before.t_robot} to {after.t_robot}")
-    _demand(seen[-1].t_host <= bench.now(), f"it observes at {seen[-1].t_host} what is now {bench.now()}")
-    _demand(seen[-1].t_host > bench.now() - bench.settle_s, "t_host is not a moment of the driver's clock")
-    _demand(driver.observe() is seen[-1], "observe does not give the newest observation")
+        _require(before.t_host <= after.t_host, f"t_host goes back from {before.t_host} to {after.t_host}")
+        _require(before.t_robot <= after.t_robot, f"t_robot goes back from {before.t_robot} to {after.t_robot}")
+    _require(seen[-1].t_host <= bench.now(), f"t_host {seen[-1].t_host} is later than now, {bench.now()}")
+    _require(seen[-1].t_host > bench.now() - bench.settle_s, "t_host is not a time on the driver's clock")
+    _require(driver.observe() is seen[-1], "observe does not return the newest observation")
     for key, value in seen[-1].values.items():
-        _demand(isinstance(value, bool | int | float | str), f"{key} is {value!r}")
-        _demand(isinstance(value, str) or not math.isinf(value), f"{key} is infinite; NaN says that there is nothing")
+        _require(isinstance(value, bool | int | float | str), f"{key} is {value!r}")
+        _require(isinstance(value, str) or not math.isinf(value), f"{key} is infinite; use NaN for nothing in range")
 
 
 def check_subscribers(bench: Bench) -> None:
-    """Each subscriber is told until it leaves, whatever another one does."""
-    driver = _ready(bench)
+    """Each subscriber is called until it unsubscribes, even if another one raises."""
+    driver = _ready_driver(bench)
     seen: list[Observation] = []
 
     def faulty(_observation: Observation) -> None:
-        raise Faulty("not the driver's")
+        raise Faulty("raised by the conformance test")
 
     end_faulty = driver.subscribe(faulty)
     end = driver.subscribe(seen.append)
     bench.pass_time(bench.settle_s)
-    _demand(bool(seen), "a subscriber is told nothing, where another one raises")
+    _require(bool(seen), "a subscriber is not called if another one raises")
     end_faulty()
     end()
     end()
     count = len(seen)
     bench.pass_time(bench.settle_s)
-    _demand(len(seen) == count, "a subscriber that has left is told more")
+    _require(len(seen) == count, "a subscriber is called after it unsubscribed")
 
 
 def check_counts(bench: Bench) -> None:
-    """``diagnostics`` are numbers under the agreed names, valid in any state, and the age is that of the newest."""
+    """``diagnostics`` returns numbers under the agreed names in any state; ``age`` is the newest observation's."""
     driver = bench.make_driver()
-    _demand(driver.diagnostics().get("age") == math.inf, "before the first observation its age is not infinite")
-    _connected(bench, driver)
+    _require(driver.diagnostics().get("age") == math.inf, "before the first observation its age is not infinite")
+    _connect(bench, driver)
     counts: Mapping[str, Any] = driver.diagnostics()
     missing = [name for name in COUNTS if name not in counts]
-    _demand(not missing, f"diagnostics lack {', '.join(missing)}")
+    _require(not missing, f"diagnostics lack {', '.join(missing)}")
     for name, value in counts.items():
-        _demand(isinstance(value, float | int), f"{name} is {value!r}, no number")
-    _demand(counts["frames"] > 0, "it counts no frames")
-    _demand(counts["bad_frames"] == 0, f"it counts {counts['bad_frames']} bad frames of a robot that sends none")
+        _require(isinstance(value, float | int), f"{name} is {value!r}, not a number")
+    _require(counts["frames"] > 0, "it counts no frames")
+    _require(counts["bad_frames"] == 0, f"it counts {counts['bad_frames']} bad frames of a robot that sends none")
     newest = driver.observe()
     age = math.inf if newest is None else bench.now() - newest.t_host
-    _demand(abs(counts["age"] - age) < 1e-6, f"the newest is {age:g} s old, and it tells {counts['age']:g}")
-    _demand(driver.state in STATES, f"its state is {driver.state!r}")
+    _require(abs(counts["age"] - age) < 1e-6, f"the newest is {age:g} s old, not {counts['age']:g} s as reported")
+    _require(driver.state in STATES, f"its state is {driver.state!r}")
 
 
 def check_invoke(bench: Bench) -> None:
-    """``invoke`` fails with ``Unsupported`` for a skill that there is not."""
-    driver = _ready(bench)
+    """``invoke`` fails with ``Unsupported`` for an unknown skill."""
+    driver = _ready_driver(bench)
     for name in ("no such skill", ""):
-        answer = _Answer(driver.invoke(name))
+        answer = _Result(driver.invoke(name))
         bench.pass_time(0.1)
-        _demand(answer.is_error(Unsupported), f"invoke({name!r}) does not fail with Unsupported")
+        _require(answer.is_error(Unsupported), f"invoke({name!r}) does not fail with Unsupported")
 
 
 CHECKS: dict[str, Callable[[Bench], None]] = {
@@ -435,7 +436,7 @@ CHECKS: dict[str, Callable[[Bench], None]] = {
 
 
 class Conformance:
-    """Tests to be mixed into a test case that says ``bench = ...``, or that is a ``Bench`` itself.
+    """A mixin for test cases that set ``bench = ...`` or implement ``Bench`` themselves.
 
     It has a method ``test_NAME`` for each rule of ``CHECKS``.
     """
@@ -448,10 +449,10 @@ class Conformance:
         return cast(Bench, self if bench is None else bench())
 
 
-def _test_of(check: Callable[[Bench], None]) -> Callable[[Conformance], None]:
+def _make_test(check: Callable[[Bench], None]) -> Callable[[Conformance], None]:
     def test(case: Conformance) -> None:
         check(case._bench())
-        # Under trial what a driver logs of a faulty subscriber fails the test, unless it is expected.
+        # Trial fails a test on logged errors; the driver logs the one of the faulty subscriber.
         getattr(case, "flushLoggedErrors", lambda _: None)(Faulty)
 
     test.__doc__ = check.__doc__
@@ -459,79 +460,78 @@ def _test_of(check: Callable[[Bench], None]) -> Callable[[Conformance], None]:
 
 
 for _name, _check in CHECKS.items():
-    setattr(Conformance, f"test_{_name}", _test_of(_check))
+    setattr(Conformance, f"test_{_name}", _make_test(_check))
 
 
 def broken(bench: Callable[[], Bench]) -> dict[str, str]:
-    """Which rules a driver breaks, and how; one that raises breaks the rule.  Each rule gets a bench of its own."""
+    """Return each broken rule with its message; an exception breaks the rule.  Each rule gets a new ``bench``."""
     found = {}
     for name, check in CHECKS.items():
         try:
             check(bench())
-        except Exception as error:  # the driver is foreign code
+        except Exception as error:  # the driver is third-party code
             found[name] = str(error) if isinstance(error, Breach) else f"{type(error).__name__}: {error}"
     return found
 
 
-class _Answer:
-    """What a Deferred has fired with so far; an error that nobody asks for is nobody's."""
+class _Result:
+    """The result of a Deferred so far; its error is handled here, so it is not logged as unhandled."""
 
     def __init__(self, deferred: Deferred[Any]) -> None:
-        self._told: list[Any] = []
-        _demand(isinstance(deferred, Deferred), f"{deferred!r} is no Deferred")
-        deferred.addBoth(self._told.append)
+        self._results: list[Any] = []
+        _require(isinstance(deferred, Deferred), f"{deferred!r} is not a Deferred")
+        deferred.addBoth(self._results.append)
 
     @property
-    def is_there(self) -> bool:
-        return bool(self._told)
+    def has_fired(self) -> bool:
+        return bool(self._results)
 
     def value(self, what: str) -> Any:
-        """The value; ``what`` names the call in the breach."""
-        _demand(bool(self._told), f"{what} does not fire in time")
-        if isinstance(self._told[0], Failure):
-            raise Breach(f"{what} fails: {self._told[0].getErrorMessage()}")
-        return self._told[0]
+        _require(bool(self._results), f"{what} does not fire in time")
+        if isinstance(self._results[0], Failure):
+            raise Breach(f"{what} fails: {self._results[0].getErrorMessage()}")
+        return self._results[0]
 
     def is_error(self, kind: type[Exception]) -> bool:
-        return bool(self._told) and isinstance(self._told[0], Failure) and bool(self._told[0].check(kind))
+        return bool(self._results) and isinstance(self._results[0], Failure) and bool(self._results[0].check(kind))
 
 
-def _connected(bench: Bench, driver: Driver) -> None:
-    connected = _Answer(driver.connect())
+def _connect(bench: Bench, driver: Driver) -> None:
+    connected = _Result(driver.connect())
     bench.pass_time(bench.settle_s)
     connected.value("connect")
 
 
-def _enabled(bench: Bench, driver: Driver) -> None:
-    enabled = _Answer(driver.enable())
+def _enable(bench: Bench, driver: Driver) -> None:
+    enabled = _Result(driver.enable())
     bench.pass_time(bench.settle_s)
-    _demand(enabled.value("enable") is True, "enable does not fire with True")
+    _require(enabled.value("enable") is True, "enable does not fire with True")
 
 
-def _ready(bench: Bench) -> Driver:
+def _ready_driver(bench: Bench) -> Driver:
     driver = bench.make_driver()
-    _connected(bench, driver)
-    _enabled(bench, driver)
+    _connect(bench, driver)
+    _enable(bench, driver)
     return driver
 
 
-def _permit(bench: Bench, seconds: float = 0.5, token: int = 1) -> Permit:
+def _grant(bench: Bench, seconds: float = 0.5, token: int = 1) -> Permit:
     return Permit(token, bench.now() + seconds)
 
 
-def _axis(driver: Driver) -> str:
-    """The key whose motion ``Bench.true_speed`` sees; empty for what does not move."""
+def _axis_of(driver: Driver) -> str:
+    """Return the key of the motion that ``Bench.true_speed`` measures; empty if the device does not move."""
     limits = driver.description.limits
     return "base.vx" if "base.vx" in limits else next(iter(limits), "")
 
 
-def _wish(driver: Driver) -> Action:
-    """A motion at half of what the robot can; nothing, for what does not move."""
-    axis = _axis(driver)
+def _half_speed(driver: Driver) -> Action:
+    """Return a motion at half of the limit; empty if the device does not move."""
+    axis = _axis_of(driver)
     return {axis: driver.description.limits[axis][1] / 2.0} if axis else {}
 
 
-def _cut(bench: Bench, driver: Driver) -> bool:
+def _try_cut_link(bench: Bench, driver: Driver) -> bool:
     try:
         bench.cut_link()
     except NotImplementedError:
@@ -541,7 +541,7 @@ def _cut(bench: Bench, driver: Driver) -> bool:
     return True
 
 
-def _refuses(kind: type[Exception], driver: Driver, action: Action, permit: Permit, when: str) -> None:
+def _check_refused(kind: type[Exception], driver: Driver, action: Action, permit: Permit, when: str) -> None:
     try:
         driver.act(action, permit)
     except kind:
@@ -551,18 +551,18 @@ def _refuses(kind: type[Exception], driver: Driver, action: Action, permit: Perm
     raise Breach(f"act {when} does not raise {kind.__name__}")
 
 
-def _demand_rest(bench: Bench, driver: Driver, when: str) -> None:
+def _require_rest(bench: Bench, driver: Driver, when: str) -> None:
     if driver.description.limits:
         speed = bench.true_speed()
-        _demand(speed < AT_REST, f"{when} the robot moves at {speed:.3g}")
+        _require(speed < AT_REST, f"{when} the robot moves at {speed:.3g}")
 
 
-def _demand_nothing_left(bench: Bench, when: str) -> None:
+def _require_no_pending_calls(bench: Bench, when: str) -> None:
     left_over = getattr(bench, "left_over", None)
     count = 0 if left_over is None else left_over()
-    _demand(count == 0, f"{when}it leaves {count} calls on its clock")
+    _require(count == 0, f"{when}it leaves {count} pending calls on its clock")
 
 
-def _demand(is_so: bool, otherwise: str) -> None:
+def _require(is_so: bool, otherwise: str) -> None:
     if not is_so:
         raise Breach(otherwise)

@@ -1,4 +1,4 @@
-"""The contract that every robot's driver keeps (after the "describe before you connect" rule)."""
+"""The interface of all drivers.  A driver describes its robot before it connects to it."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ MAX_FPS = 30.0
 
 @dataclass(frozen=True)
 class Permit:
-    """The right to move a robot for a while: a fencing token and a deadline on the driver's clock, in seconds.
+    """The right to move a robot until a deadline: a fencing token, and the deadline in seconds on the driver's clock.
 
-    A driver keeps the highest token it has seen, refuses lower ones with ``StaleCommand``, and stops the robot by
-    itself when the deadline of the last command has passed.
+    A driver stores the highest token it has seen, refuses lower ones with ``StaleCommand``, and stops the robot when
+    the deadline of the last command has passed.
     """
 
     token: int
@@ -27,34 +27,34 @@ class Permit:
 
 @runtime_checkable
 class Filming(Protocol):
-    """A driver whose camera takes as many pictures a second as it is asked for."""
+    """A driver with an adjustable camera frame rate."""
 
     @property
     def camera_fps(self) -> float:
-        """So many it takes."""
+        """The frame rate in pictures per second."""
 
     def set_camera_fps(self, fps: float) -> None:
-        """Have it take ``fps``, 0 to ``MAX_FPS``; 0: none."""
+        """Set the frame rate in pictures per second, 0 to ``MAX_FPS``; 0 switches the camera off."""
 
 
 class Driver(Protocol):
-    """One robot, asked asynchronously; everything happens on the reactor's thread.
+    """One robot with an asynchronous interface; everything happens on the reactor's thread.
 
-    One whose camera can be asked for more or fewer pictures is ``Filming`` as well.
+    A driver with an adjustable camera frame rate implements ``Filming`` as well.
     ``state`` is one of ``idle connecting ready stale stopped closed``.
     """
 
     @property
     def description(self) -> Description:
-        """What the robot is; valid before ``connect``."""
+        """The description of the robot; valid before ``connect``."""
 
     @property
     def state(self) -> str:
-        """Where the link stands."""
+        """The state of the link."""
 
     @property
     def token(self) -> int:
-        """The highest token that the robot has obeyed, as far as it told: a new claim has to lie above it."""
+        """The highest token that the robot reports to have obeyed; a new lease needs a higher one."""
 
     def connect(self) -> Deferred[Description]:
         """Open the link; fires when the first observation has arrived.  Lost links are opened again with back-off."""
@@ -63,34 +63,34 @@ class Driver(Protocol):
         """Stop the motion, then close.  May be called twice."""
 
     def enable(self) -> Deferred[bool]:
-        """Motors on."""
+        """Switch the motors on."""
 
     def disable(self) -> Deferred[bool]:
-        """Motors off."""
+        """Switch the motors off."""
 
     def act(self, action: Action, permit: Permit) -> Action:
-        """Do ``action`` until ``permit.deadline``; returns what is really done, clipped to the limits.  Never blocks.
+        """Perform ``action`` until ``permit.deadline``; return the action clipped to the limits.  Never blocks.
 
         Raises ``NotEnabled``, ``Unsupported`` (unknown key, NaN), ``StaleCommand``.
         """
 
     def stop(self) -> Action:
-        """Zero motion now; safe in any state and never refused."""
+        """Set the motion to zero now; safe in any state and never refused."""
 
     def observe(self) -> Observation | None:
-        """The newest observation; never blocks."""
+        """Return the newest observation, None before the first; never blocks."""
 
     def subscribe(self, seen: Callable[[Observation], None]) -> Callable[[], None]:
-        """Call ``seen`` at each observation; call what is returned to end that."""
+        """Call ``seen`` with each observation; return a function that ends the subscription."""
 
     def invoke(self, name: str, **arguments: float | str) -> Deferred[Mapping[str, Value]]:
-        """Have the robot do one of ``description.skills``; fires with what it tells of that when it is done.
+        """Run one of ``description.skills``; fires with its results when it has finished.
 
         Fails with ``Unsupported`` for another name or a wrong argument, with ``LinkLost`` or ``NoReply``.
         """
 
     def diagnostics(self) -> dict[str, float]:
-        """Counters: frames, bad frames, bytes, reconnects, age of the newest observation in seconds.
+        """Return counters: frames, bad frames, bytes, reconnects; ``age`` of the newest observation in seconds.
 
-        Also the commands ``accepted`` here, and those refused as ``lower token`` or ``late``.
+        Includes the commands ``accepted`` here, and those refused as ``lower token`` or ``late``.
         """

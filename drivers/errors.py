@@ -1,14 +1,14 @@
-"""Every exception of this room; the class says who is to blame, and so what to do.
+"""Exceptions of drivers; the classes distinguish faults of the robot, the connection and the caller.
 
 ::
 
     DriverError
-      RobotError      the robot's fault: count it, drop the frame, live on
+      RobotError      fault of the robot: count it, drop the frame, continue
         BadFrame
-      LinkError       nobody's fault: stop the motion, reconnect
+      LinkError       fault of the connection: stop the motion, reconnect
         LinkLost
         NoReply
-      UsageError      the caller's fault: let it fly
+      UsageError      fault of the caller: let it propagate
         NotEnabled
         Unsupported
         StaleCommand
@@ -16,11 +16,11 @@
 
 
 class DriverError(Exception):
-    """The root of what a driver raises."""
+    """Base class of the exceptions of drivers."""
 
 
 class RobotError(DriverError):
-    """The robot said something that it should not have said."""
+    """The robot sent data that violates its protocol."""
 
 
 class BadFrame(RobotError):
@@ -28,11 +28,11 @@ class BadFrame(RobotError):
 
 
 class LinkError(DriverError):
-    """The way to the robot does not work at the moment."""
+    """The connection to the robot does not work at present."""
 
 
 class LinkLost(LinkError):
-    """The link to the robot went away; the driver tries to open it again."""
+    """The link to the robot was lost; the driver reconnects."""
 
 
 class NoReply(LinkError):
@@ -40,16 +40,16 @@ class NoReply(LinkError):
 
 
 class UsageError(DriverError):
-    """The driver was asked for something that cannot be."""
+    """The driver was called in a way that it does not allow."""
 
 
 class NotEnabled(UsageError):
-    """A motion was asked for while the robot is not ready or its motors are off; call ``enable()`` first."""
+    """A motion was commanded while the robot is not ready or its motors are off; call ``enable()`` first."""
 
 
 class Unsupported(UsageError):
-    """This robot has no such capability, key or skill; look at ``description``."""
+    """This robot has no such capability, key or skill; see ``description``."""
 
 
 class StaleCommand(UsageError):
-    """A command carries a token older than one already seen, or its deadline has passed; it was not sent."""
+    """A command has a token lower than one already seen, or its deadline has passed; it was not sent."""

@@ -1,7 +1,7 @@
-"""Gate: who may move a robot now, and until when; the robot's own last word on fencing.
+"""Check fencing tokens and deadlines of the commands to one robot.
 
-Pure: the moment is an argument.  A driver asks it before a command leaves, and a robot (or its stand-in) asks it when
-a command arrives, so that a robot whose node froze stops by itself.
+The code is pure: the time is an argument.  A driver checks a command before it sends it, and a robot or its emulator
+checks it on arrival, so that the robot stops by itself if its node freezes.
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ from drivers.driver import Permit
 from drivers.errors import StaleCommand
 
 LOWER, LATE = "lower token", "late"
-"""Why a command is refused: its token is older than one seen, or its deadline is not ahead."""
+"""Reasons to refuse a command: its token is lower than one already seen, or its deadline has passed."""
 
 
 class Gate:
-    """The highest token seen, and the deadline of the last command let through.
+    """The highest token seen, and the deadline of the last accepted command.
 
-    A gate serves one robot for as long as that robot runs, whoever holds the link: a new holder does not make an old
-    token young again.  Tokens of different tasks are compared with each other.  ``accepted`` counts the commands that
-    were let through, ``refused`` those that were not, by the reason.
+    A gate serves one robot while that robot runs, across all links: a new connection does not make an old token
+    valid again.  Tokens of different tasks are compared with each other.  ``accepted`` counts accepted commands,
+    ``refused`` the refused ones by reason.
     """
 
     def __init__(self) -> None:
@@ -31,21 +31,21 @@ class Gate:
 
     @property
     def token(self) -> int | None:
-        """The highest token that was let through or told, None before the first."""
+        """The highest token that was accepted or learned, None before the first."""
         return self._token
 
     @property
     def deadline(self) -> float | None:
-        """When the motion must end; None while nothing is in force."""
+        """The time at which the motion must end; None while no motion is in force."""
         return self._deadline
 
     def learn(self, token: int) -> None:
-        """Take over what a gate further down has seen: from now on nothing lower is let through."""
+        """Adopt a token that the robot's own gate reports; lower tokens are refused from now on."""
         if token > (self._token or 0):
             self._token = token
 
     def admit(self, permit: Permit, now: float) -> None:
-        """Let a command through, or raise ``StaleCommand``: token older than one seen, or deadline not ahead."""
+        """Accept a command; raise ``StaleCommand`` if its token is lower than one seen or its deadline has passed."""
         if not math.isfinite(permit.deadline) or permit.deadline <= now:
             self.refused[LATE] += 1
             late = now - permit.deadline
@@ -53,16 +53,16 @@ class Gate:
         if self._token is not None and permit.token < self._token:
             self.refused[LOWER] += 1
             raise StaleCommand(
-                f"token {permit.token} is older than token {self._token}; someone else holds the task now"
+                f"token {permit.token} is lower than token {self._token}, which was obeyed before; take a new lease"
             )
         self.accepted += 1
         self._token = permit.token
         self._deadline = permit.deadline
 
     def is_over(self, now: float) -> bool:
-        """Whether the motion in force has reached its deadline and must be stopped now."""
+        """Return whether the motion in force has reached its deadline and must be stopped now."""
         return self._deadline is not None and now >= self._deadline
 
     def close(self) -> None:
-        """Forget the motion in force, because it was stopped; the token is kept, so that fencing holds."""
+        """Clear the motion in force after a stop; the token stays, so that fencing holds."""
         self._deadline = None

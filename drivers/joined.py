@@ -1,6 +1,6 @@
-"""Joined: one device out of a robot and the parts on its back that only sense, as a camera board or a compass.
+"""Combine a robot and parts mounted on it that only sense (a camera board, a compass) into one device.
 
-The robot is asked for everything that moves, and its link is the device's; parts come and go by themselves.
+Motion commands go to the robot, and its link is the device's link; parts connect and disconnect independently.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ CAMERA = "camera"
 
 
 def described(main: Description, parts: Sequence[Description]) -> Description:
-    """What ``main`` and ``parts`` are together; what two of them have is the robot's, or else the earlier part's.
+    """Combine the descriptions of ``main`` and ``parts``; the robot's value wins, then the earlier part's.
 
-    Raises ``UsageError`` for a part that could move.
+    Raises ``UsageError`` for a part that can move.
     """
     capabilities, rates, skills = dict(main.capabilities), dict(main.rates), list(main.skills)
     for number, part in enumerate(parts, 1):
         if part.limits:
             raise UsageError(
                 f"part {number}: a robot of kind {part.kind!r} moves, but parts only sense; "
-                "make it the robot, or a device of its own"
+                "make it the robot, or a separate device"
             )
         for name, properties in part.capabilities.items():
             capabilities.setdefault(name, properties)
@@ -42,17 +42,17 @@ def described(main: Description, parts: Sequence[Description]) -> Description:
 
 
 def joined(main: Driver, parts: Sequence[Driver], name: str) -> Joined:
-    """The driver of the device ``name``; it is ``Filming`` where whoever has its camera is."""
-    is_filming = isinstance(_seeing((main, *parts)), Filming)
+    """Return the driver of the device ``name``; it is ``Filming`` if the driver that has the camera is."""
+    is_filming = isinstance(_camera_driver((main, *parts)), Filming)
     return (FilmingJoined if is_filming else Joined)(main, parts, name)
 
 
 class Joined:
-    """``main`` with the senses of ``parts``.
+    """``main`` with the sensors of ``parts``.
 
-    Each observation of the robot carries the newest values of those parts that are ``ready``, and the picture of the
-    part that has the camera where the robot has none; a part alone makes no observation.  A key that the robot has
-    told once stays the robot's.  ``samples`` are the robot's alone.
+    Each observation of the robot also carries the newest values of those parts that are ``ready``.  If the robot has no
+    camera, it carries the picture of the first part that has one.  A part alone creates no observation.  Once the robot
+    has reported a key, no part overrides it.  ``samples`` come from the robot only.
     """
 
     log = Logger()
@@ -60,95 +60,95 @@ class Joined:
     def __init__(self, main: Driver, parts: Sequence[Driver], name: str) -> None:
         self._description = described(main.description, [part.description for part in parts])
         self._main = main
-        self._parts = dict(zip(_named(parts), parts, strict=True))
+        self._parts = dict(zip(_part_names(parts), parts, strict=True))
         self._name = name
-        self._camera = _seeing((main, *parts))
-        self._is_left = False
-        self._leaving: list[Deferred[None]] = []
-        self._told: set[str] = set()
+        self._camera = _camera_driver((main, *parts))
+        self._is_leaving_parts = False
+        self._parts_closing: list[Deferred[None]] = []
+        self._robot_keys: set[str] = set()
         self._source: Observation | None = None
         self._newest: Observation | None = None
         self._seen = Subscribers[Observation](name, self.log)
         main.subscribe(self._on_main)
 
-    # -- the contract -----------------------------------------------------------------------------------------------
+    # -- the interface ----------------------------------------------------------------------------------------------
 
     @property
     def description(self) -> Description:
-        """What the robot and its parts are; valid before ``connect``."""
+        """The combined description of the robot and its parts; valid before ``connect``."""
         return self._description
 
     @property
     def state(self) -> str:
-        """Where the robot's link stands, however its parts are."""
+        """The state of the robot's link; the parts have no influence."""
         return self._main.state
 
     @property
     def token(self) -> int:
-        """The highest token that the robot has obeyed, as far as it told."""
+        """The highest token that the robot reports to have obeyed."""
         return self._main.token
 
     @property
     def problem(self) -> str:
-        """What keeps the robot from being heard, and the remedy, where its driver says so."""
+        """The reason why no data arrives from the robot, and the remedy, if its driver reports one."""
         return str(getattr(self._main, "problem", ""))
 
     def connect(self) -> Deferred[Description]:
-        """Open all links; fires when the first observation of the robot has arrived, whatever its parts do."""
+        """Open all links; fires when the robot's first observation has arrived, whether or not its parts connect."""
         is_first = self._main.state == "idle"
         connecting = self._main.connect()
         if is_first:
             for kind, part in self._parts.items():
-                maybeDeferred(part.connect).addErrback(self._on_no_part, kind)
-            connecting.addCallbacks(lambda _: self._description, self._on_no_main)
+                maybeDeferred(part.connect).addErrback(self._on_part_failed, kind)
+            connecting.addCallbacks(lambda _: self._description, self._on_robot_failed)
         return connecting
 
     def disconnect(self) -> Deferred[None]:
         """Stop the motion, then close all links.  May be called twice."""
         closing = self._main.disconnect()
-        self._leave_parts()
-        return DeferredList([closing, *self._leaving]).addCallback(lambda _: None)
+        self._disconnect_parts()
+        return DeferredList([closing, *self._parts_closing]).addCallback(lambda _: None)
 
     def enable(self) -> Deferred[bool]:
-        """The robot's motors on."""
+        """Switch the robot's motors on."""
         return self._main.enable()
 
     def disable(self) -> Deferred[bool]:
-        """The robot's motors off."""
+        """Switch the robot's motors off."""
         return self._main.disable()
 
     def act(self, action: Action, permit: Permit) -> Action:
-        """Have the robot do ``action`` until ``permit.deadline``; raises as its driver does."""
+        """Have the robot perform ``action`` until ``permit.deadline``; raises as its driver does."""
         return self._main.act(action, permit)
 
     def stop(self) -> Action:
-        """Zero motion now; safe in any state and never refused."""
+        """Set the motion to zero now; safe in any state and never refused."""
         return self._main.stop()
 
     def observe(self) -> Observation | None:
-        """The robot's newest observation, with what its parts told by then; never blocks."""
+        """Return the robot's newest observation with the values of its parts at that time; never blocks."""
         source = self._main.observe()
         if source is not self._source:
             self._source = source
-            self._newest = None if source is None else self._joined(source)
+            self._newest = None if source is None else self._merge_parts(source)
         return self._newest
 
     def subscribe(self, seen: Callable[[Observation], None]) -> Callable[[], None]:
-        """Call ``seen`` at each observation of the robot; call what is returned to end that."""
+        """Call ``seen`` with each observation of the robot; return a function that ends the subscription."""
         return self._seen.add(seen)
 
     def invoke(self, name: str, **arguments: float | str) -> Deferred[Mapping[str, Value]]:
-        """Have whoever knows the skill do it, the robot first."""
+        """Run the skill on the robot, or on the first part that has it."""
         for driver in (self._main, *self._parts.values()):
             if name in driver.description.skills:
                 return driver.invoke(name, **arguments)
         known = ", ".join(self._description.skills) or "none"
-        return fail(Unsupported(f"{self._name} has no skill {name!r}; it knows {known}"))
+        return fail(Unsupported(f"{self._name} has no skill {name!r}; its skills are {known}"))
 
     def diagnostics(self) -> dict[str, float]:
-        """The robot's counters, and each part's behind its kind and a dot, as in ``camera.age``.
+        """Return the robot's counters, and each part's prefixed with its kind and a dot, as in ``camera.age``.
 
-        A second part of a kind has its number behind the kind: ``camera2.age``.
+        The second part of a kind has its number after the kind: ``camera2.age``.
         """
         counts = dict(self._main.diagnostics())
         for kind, part in self._parts.items():
@@ -161,8 +161,8 @@ class Joined:
             return
         self._seen.tell(observation)
 
-    def _joined(self, source: Observation) -> Observation:
-        self._told.update(source.values)
+    def _merge_parts(self, source: Observation) -> Observation:
+        self._robot_keys.update(source.values)
         values: dict[str, Value] = {}
         frame = source.frame if self._camera is self._main else None
         for part in self._parts.values():
@@ -170,47 +170,47 @@ class Joined:
             if sensed is None or part.state != "ready":
                 continue
             for key, value in sensed.values.items():
-                if key not in self._told:
+                if key not in self._robot_keys:
                     values.setdefault(key, value)
             if part is self._camera and sensed.frame is not None:
-                frame = self._dated(sensed.frame, sensed, source)
+                frame = self._convert_frame_time(sensed.frame, sensed, source)
         return replace(source, values={**values, **source.values}, frame=frame)
 
-    def _dated(self, frame: Frame, sensed: Observation, source: Observation) -> Frame:
-        """``frame`` with its moment on the robot's clock: a part counts from another beginning."""
+    def _convert_frame_time(self, frame: Frame, sensed: Observation, source: Observation) -> Frame:
+        """Return ``frame`` with its time converted to the robot's clock; the clock of a part has another origin."""
         age = max(0.0, sensed.t_robot - frame.t_robot) + max(0.0, source.t_host - sensed.t_host)
         return replace(frame, t_robot=source.t_robot - age)
 
-    def _on_no_part(self, failure: Failure, kind: str) -> None:
-        # A part that never came ends with an error when it is left; that is no news.
-        if not self._is_left:
+    def _on_part_failed(self, failure: Failure, kind: str) -> None:
+        # Disconnecting a part that never connected makes its connect fail; that is expected.
+        if not self._is_leaving_parts:
             self.log.error(
-                "{robot}: its part {part} is given up: {error}",
+                "{robot}: cannot connect to its part {part}: {error}",
                 robot=self._name,
                 part=kind,
                 error=failure.getErrorMessage(),
             )
 
-    def _on_no_main(self, failure: Failure) -> Failure:
-        self._leave_parts()
+    def _on_robot_failed(self, failure: Failure) -> Failure:
+        self._disconnect_parts()
         return failure
 
-    def _leave_parts(self) -> None:
-        if not self._is_left:
-            self._is_left = True
-            self._leaving = [part.disconnect() for part in self._parts.values()]
+    def _disconnect_parts(self) -> None:
+        if not self._is_leaving_parts:
+            self._is_leaving_parts = True
+            self._parts_closing = [part.disconnect() for part in self._parts.values()]
 
 
 class FilmingJoined(Joined):
-    """One whose camera takes as many pictures a second as it is asked for."""
+    """A combined device with an adjustable camera frame rate."""
 
     @property
     def camera_fps(self) -> float:
-        """So many it takes."""
+        """The frame rate in pictures per second."""
         return self._filming.camera_fps
 
     def set_camera_fps(self, fps: float) -> None:
-        """Have it take ``fps``, 0: none."""
+        """Set the frame rate in pictures per second; 0 switches the camera off."""
         self._filming.set_camera_fps(fps)
 
     @property
@@ -220,11 +220,11 @@ class FilmingJoined(Joined):
         return camera
 
 
-def _seeing(drivers: Sequence[Driver]) -> Driver | None:
+def _camera_driver(drivers: Sequence[Driver]) -> Driver | None:
     return next((driver for driver in drivers if CAMERA in driver.description.capabilities), None)
 
 
-def _named(parts: Sequence[Driver]) -> list[str]:
+def _part_names(parts: Sequence[Driver]) -> list[str]:
     kinds = [part.description.kind for part in parts]
     before = [kinds[:place].count(kind) for place, kind in enumerate(kinds)]
     return [f"{kind}{count + 1}" if count else kind for kind, count in zip(kinds, before, strict=True)]

@@ -1,7 +1,7 @@
-"""Link: the way between a client and the yard, over TCP or through memory; it carries bytes and knows no message.
+"""Byte streams between a driver and its robot or simulator, over TCP or in memory.
 
-``TcpConnector`` is the edge to the world; ``MemoryConnector`` its twin for whole teams in one process on one turned
-clock.
+``TcpConnector`` opens TCP connections; ``MemoryConnector`` has the same interface, for whole teams in one process in
+virtual time.
 """
 
 from __future__ import annotations
@@ -23,72 +23,72 @@ LAST_RETRY_S = 2
 RETRY_FACTOR = 1.6
 CALL_S = 2.0
 NEWS = 5
-"""So many calls have to fail, one after another, before the log tells of it."""
-HUNG_UP = "it hangs up as soon as it is called; does it serve another client already, and is the port right?"
+"""Number of consecutive failed calls before the log reports it."""
+HUNG_UP = "it closes each new connection at once; does it already serve another client, and is the port right?"
 PROBLEMS: Sequence[tuple[type[Exception], str]] = (
-    (error.ConnectionRefusedError, "it is there, but nothing listens at this port; is the port right, and free?"),
+    (error.ConnectionRefusedError, "nothing listens at this port; is the port right, and is its server running?"),
     (error.TCPTimedOutError, "it does not answer; is it switched on, and in this network?"),
     (error.TimeoutError, "it does not answer; is it switched on, and in this network?"),
-    (error.NoRouteError, "there is no way to it; is this machine in its network?"),
-    (error.DNSLookupError, "no address is known for this name; mend it, or write the address in figures"),
+    (error.NoRouteError, "no route to it; is this machine in its network?"),
+    (error.DNSLookupError, "this host name has no address; correct the name, or write a numeric address"),
 )
-"""Why a call fails, and the remedy."""
+"""Reasons why a connection fails, with the remedy."""
 
 
 class Link(Protocol):
-    """One open connection, as its user sees it."""
+    """One open connection."""
 
     @property
     def is_busy(self) -> bool:
-        """Whether what was sent before has not left yet; what can be dropped, should be."""
+        """Whether earlier data is still unsent; the sender should drop data that it can omit."""
 
     def send(self, data: bytes) -> None:
         """Send bytes; does nothing on a closed link."""
 
     def close(self) -> None:
-        """Close now, and throw away what has not left yet."""
+        """Close now and discard unsent data."""
 
 
 class Receiver(Protocol):
-    """Who is told what happens on a link."""
+    """Receives the data and the close of a link."""
 
     def received(self, data: bytes) -> None:
-        """Take bytes as they come, cut anyhow."""
+        """Take bytes from the stream, in pieces of any size."""
 
     def link_down(self) -> None:
-        """Learn that the link is gone, whoever closed it."""
+        """Handle the close of the link, by either side."""
 
 
 class Caller(Receiver, Protocol):
-    """A receiver that calls: it is given a new link each time that one opens."""
+    """A receiver on the side that connects; it is given each new link."""
 
     def link_up(self, link: Link) -> None:
-        """Take the link that has just opened."""
+        """Use the link that has just opened."""
 
 
 class Line(Protocol):
-    """A standing wish to be connected."""
+    """A connection that is reopened whenever it is lost."""
 
     def hang_up(self) -> Deferred[None]:
-        """Close the link and stop trying; fires when it is closed."""
+        """Close the link and stop reconnecting; fires when it is closed."""
 
 
 class Connector(Protocol):
-    """What opens links."""
+    """Opens links."""
 
     def call(self, host: str, port: int, caller: Caller) -> Line:
-        """Keep ``caller`` connected to the yard at this address, with back-off, until the line hangs up."""
+        """Keep ``caller`` connected to this address, with back-off, until ``hang_up`` is called."""
 
 
 Accept = Callable[[Link], Receiver]
-"""What the yard does with a new link: it returns who shall hear what arrives."""
+"""Handles a new link on the serving side; returns the receiver of its data."""
 
 
 class StreamLink(protocol.Protocol):
-    """A link over one open transport of Twisted."""
+    """A link over one open Twisted transport."""
 
     def fileno(self) -> int:
-        """The open descriptor, for another process to share; -1 on a closed link."""
+        """Return the open descriptor, to share it with another process; -1 on a closed link."""
         transport: Any = self.transport
         return int(transport.fileno()) if self.connected and transport is not None else -1
 
@@ -100,7 +100,7 @@ class StreamLink(protocol.Protocol):
 
 @implementer(IPushProducer)
 class TcpLink(StreamLink):
-    """A link over one TCP connection; both sides use it."""
+    """A link over one TCP connection, for both sides."""
 
     def __init__(self, accept: Accept) -> None:
         self._accept = accept
@@ -110,7 +110,7 @@ class TcpLink(StreamLink):
 
     @property
     def is_busy(self) -> bool:
-        """Whether the transport asked to wait."""
+        """Whether the transport asked to pause."""
         return self._is_busy
 
     @property
@@ -123,7 +123,7 @@ class TcpLink(StreamLink):
         return there.host, there.port
 
     def close(self) -> None:
-        """Close now, and throw away what has not left yet."""
+        """Close now and discard unsent data."""
         transport: Any = self.transport
         if self.connected and transport is not None:
             transport.abortConnection()
@@ -147,22 +147,22 @@ class TcpLink(StreamLink):
             receiver.link_down()
 
     def pauseProducing(self) -> None:
-        """Learn from the transport that its buffer is full."""
+        """Mark the link busy: the transport's buffer is full."""
         self._is_busy = True
 
     def resumeProducing(self) -> None:
-        """Learn from the transport that its buffer has emptied."""
+        """Mark the link free: the transport's buffer is empty again."""
         self._is_busy = False
 
     def stopProducing(self) -> None:
-        """Learn from the transport that it will never send again."""
+        """Mark the link busy: the transport sends no more."""
         self._is_busy = True
 
 
 def reactor_or_running(reactor: Any) -> Any:
-    """``reactor``, or the running one where it is None."""
+    """Return ``reactor``, or the running one if it is None."""
     if reactor is None:
-        # Importing it installs it: that is the business of whoever runs a process, not of this module.
+        # The import installs the reactor, so it must not happen when this module is imported.
         from twisted.internet import reactor as running
 
         return running
@@ -182,10 +182,10 @@ class TcpLinkFactory(protocol.Factory):
 
 
 class TcpConnector:
-    """Opens links over TCP on ``reactor`` (the running one where none is given).
+    """Opens links over TCP on ``reactor`` (None: the running one).
 
-    ``waits`` are the seconds before each new try, the last of them for all that follow; growing ones where not given.
-    With ``says``, what keeps a link from being opened is said in the log, once until there is one.
+    ``waits`` are the seconds before each retry, the last one repeats; without ``waits`` they grow exponentially.  With
+    ``says`` the reason why a link cannot be opened is logged, once until it opens.
     """
 
     def __init__(self, reactor: Any = None, waits: Sequence[float] = (), says: bool = False) -> None:
@@ -194,7 +194,7 @@ class TcpConnector:
         self._says = says
 
     def call(self, host: str, port: int, caller: Caller) -> Line:
-        """Keep ``caller`` connected to the yard at this address, with back-off, until the line hangs up."""
+        """Keep ``caller`` connected to this address, with back-off, until ``hang_up`` is called."""
         reactor = reactor_or_running(self._reactor)
 
         def accept(link: Link) -> Receiver:
@@ -207,11 +207,11 @@ class TcpConnector:
 
 
 class _TcpLine(protocol.ReconnectingClientFactory):
-    """Twisted's older way to stay connected: ``ClientService`` would cost a node 0.6 MiB, and does no more here.
+    """Reconnect with Twisted's older factory; ``ClientService`` has no advantage here and takes 0.6 MiB more per node.
 
-    ``problem`` says in one line why there is no link; it is empty while there is one, and before the first try ends.
-    Only a link that has brought something, or lasted, ends the growth of the waits: whoever takes each call and hangs
-    up at once is not called more often than one who takes none.
+    ``problem`` says in one line why there is no link; it is empty while the link is open and before the first attempt
+    ends.  The delay is reset only by a link that received data or lasted ``LAST_RETRY_S``: a server that accepts and
+    closes at once is retried no more often than one that refuses.
     """
 
     noisy = False
@@ -222,23 +222,23 @@ class _TcpLine(protocol.ReconnectingClientFactory):
 
     log = Logger()
 
-    def __init__(self, accept: Accept, clock: Any, waits: Sequence[float] = (), where: str = "") -> None:
+    def __init__(self, accept: Accept, clock: Any, waits: Sequence[float] = (), address: str = "") -> None:
         self.clock: Any = clock
         self.problem = ""
-        self._where = where
+        self._address = address
         self._failures = 0
-        self._said = ""
+        self._logged_problem = ""
         self.delay = self.initialDelay
         self._waits = waits
         self._tries = 0
         self.connector: Any = None
         self._accept = accept
-        self._gone: Deferred[None] | None = None
+        self._closed: Deferred[None] | None = None
         self._link: TcpLink | None = None
-        self._taken_at = 0.0
+        self._opened_at = 0.0
 
     def buildProtocol(self, addr: IAddress | None) -> TcpLink:
-        self._taken_at = self.clock.seconds()
+        self._opened_at = self.clock.seconds()
         self.problem = ""
         self._link = TcpLink(self._accept)
         return self._link
@@ -256,36 +256,36 @@ class _TcpLine(protocol.ReconnectingClientFactory):
 
     def clientConnectionLost(self, connector: Any, unused_reason: Failure) -> None:  # noqa: N802 (Twisted's)
         link, self._link = self._link, None
-        if (link is not None and link.has_heard) or self.clock.seconds() - self._taken_at >= LAST_RETRY_S:
+        if (link is not None and link.has_heard) or self.clock.seconds() - self._opened_at >= LAST_RETRY_S:
             self.delay, self._tries = self.initialDelay, 0
-            self._failures, self._said = 0, ""
-        elif self._gone is None:
+            self._failures, self._logged_problem = 0, ""
+        elif self._closed is None:
             self._on_problem(HUNG_UP)
         super().clientConnectionLost(connector, unused_reason)
-        gone, self._gone = self._gone, None
-        if gone is not None:
-            gone.callback(None)
+        closed, self._closed = self._closed, None
+        if closed is not None:
+            closed.callback(None)
 
     def _on_problem(self, problem: str) -> None:
         self.problem = problem
         self._failures += 1
-        # Who is just being started, or started again, is no news.
-        if self._where and self._failures >= NEWS and problem != self._said:
-            self._said = problem
-            self.log.warn("{where}: {problem}", where=self._where, problem=problem)
+        # A few failures are normal while the robot starts or restarts.
+        if self._address and self._failures >= NEWS and problem != self._logged_problem:
+            self._logged_problem = problem
+            self.log.warn("{address}: {problem}", address=self._address, problem=problem)
 
     def hang_up(self) -> Deferred[None]:
         self.stopTrying()
         if self.connector.state == "disconnected":
             return succeed(None)
         is_open = self.connector.state == "connected"
-        self._gone = Deferred() if is_open else None
+        self._closed = Deferred() if is_open else None
         self.connector.disconnect()
-        return self._gone or succeed(None)
+        return self._closed or succeed(None)
 
 
 class MemoryLink:
-    """One end of a pair in memory: what one end sends, the other receives ``delay`` seconds later, in order."""
+    """One end of a pair in memory: data sent at one end arrives at the other ``delay`` seconds later, in order."""
 
     def __init__(self, clock: IReactorTime, delay: float) -> None:
         self.is_busy = self.is_silent = False
@@ -300,7 +300,7 @@ class MemoryLink:
             self._clock.callLater(self._delay, self.other._deliver, data)
 
     def close(self) -> None:
-        """Close both ends; the other learns it after the delay; what is on its way there still arrives."""
+        """Close both ends; the other end is notified after the delay; data sent before still arrives."""
         other, self.other = self.other, None
         if other is not None:
             self._clock.callLater(self._delay, other._drop)
@@ -318,10 +318,9 @@ class MemoryLink:
 
 
 class MemoryConnector:
-    """Opens links to ``accept`` through ``clock``; host and port mean nothing.
+    """Opens links to ``accept`` through ``clock``; host and port are ignored.
 
-    ``is_open`` False turns new calls away, as a dead yard would, ``cut`` breaks what is open, and ``silence`` leaves it
-    open for nothing.
+    ``is_open`` False refuses new links, ``cut`` breaks the open ones, and ``silence`` leaves them open without data.
     """
 
     def __init__(self, clock: IReactorTime, accept: Accept, delay: float = 0.0005) -> None:
@@ -332,17 +331,17 @@ class MemoryConnector:
         self._delay = delay
 
     def call(self, host: str, port: int, caller: Caller) -> Line:
-        """Keep ``caller`` connected, with back-off, until the line hangs up."""
+        """Keep ``caller`` connected, with back-off, until ``hang_up`` is called."""
         return _MemoryLine(self, self._clock, caller)
 
     def cut(self) -> None:
-        """Break every open link, as a lost network does."""
+        """Break every open link."""
         links, self.links = self.links, []
         for link in links:
             link.close()
 
     def silence(self) -> None:
-        """Let nothing pass any more over the links that are open now, and open no other, as a lost radio does."""
+        """Drop all data on open links and refuse new ones, as a lost radio connection does."""
         self.is_open = False
         for link in self.links:
             for end in (link, link.other):
@@ -350,7 +349,7 @@ class MemoryConnector:
                     end.is_silent = True
 
     def opened(self, caller: Receiver) -> MemoryLink | None:
-        """The caller's end of a new pair, or None while turned away."""
+        """Open a new pair and return the caller's end; None if refused."""
         if not self.is_open:
             return None
         near, far = MemoryLink(self._clock, self._delay), MemoryLink(self._clock, self._delay)
@@ -362,7 +361,7 @@ class MemoryConnector:
 
 
 class _MemoryLine:
-    """The memory twin of ``_TcpLine``; it stands between link and caller to see the link go down."""
+    """The counterpart of ``_TcpLine`` in memory; it stands between link and caller to notice when the link closes."""
 
     def __init__(self, connector: MemoryConnector, clock: IReactorTime, caller: Caller) -> None:
         self._connector = connector
@@ -371,7 +370,7 @@ class _MemoryLine:
         self._link: MemoryLink | None = None
         self._is_wanted = True
         self._pending = Timer(clock)
-        self._pending.set(0.0, self._try)
+        self._pending.set(0.0, self._try_open)
 
     def hang_up(self) -> Deferred[None]:
         self._is_wanted = False
@@ -386,13 +385,13 @@ class _MemoryLine:
     def link_down(self) -> None:
         self._link = None
         if self._is_wanted:
-            self._pending.set(FIRST_RETRY_S, self._try)
+            self._pending.set(FIRST_RETRY_S, self._try_open)
         self._caller.link_down()
 
-    def _try(self) -> None:
+    def _try_open(self) -> None:
         self._link = self._connector.opened(self)
         if self._link is None:
-            self._pending.set(self._retry_s, self._try)
+            self._pending.set(self._retry_s, self._try_open)
             self._retry_s = min(self._retry_s * RETRY_FACTOR, LAST_RETRY_S)
             return
         self._retry_s = FIRST_RETRY_S

@@ -1,4 +1,4 @@
-"""Option: what tools know of a kind of robot before one is there: its manifest, and the types of its options."""
+"""Manifests and option types: the facts that tools need about a kind of robot without importing its driver."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ Device = Annotated[str, Meta(min_length=1, description="a serial device", exampl
 class Manifest:
     """One kind of robot; the constant ``MANIFEST`` of its module ``driver``.
 
-    ``library`` is the module that it needs beyond those of every node, ``extra`` the extra of this distribution that
-    installs it, and ``when`` the case in which it is needed, empty for always.  ``example`` are options that describe
-    such a robot; a kind that needs no option has none.  ``is_on_cable`` says that ``port`` may be a serial device.
+    ``library`` is the additional module that the kind needs, ``extra`` the extra of this distribution that installs it,
+    ``when`` the case in which it is needed (empty for always).  ``example`` contains options of such a robot, empty if
+    none are required.  ``is_on_cable`` says that ``port`` may be a serial device.
     """
 
     library: str = ""
@@ -36,7 +36,7 @@ class Manifest:
 
 
 def convert_options(kind: str, table: object, cls: type[T]) -> T:
-    """The options in ``table`` as a ``cls``; raises ``UsageError`` that names the key and what to write instead."""
+    """Convert ``table`` to the options class ``cls``; raise ``UsageError`` that names the key and the remedy."""
     try:
         return convert_table(table, cls)
     except Invalid as error:
@@ -44,5 +44,5 @@ def convert_options(kind: str, table: object, cls: type[T]) -> T:
 
 
 def fault_of(kind: str, key: str, problem: str, remedy: str) -> UsageError:
-    """The error about one option."""
+    """Return the error about one option."""
     return UsageError(f'driver "{kind}": option {key} {problem}; {remedy}')

@@ -1,7 +1,7 @@
-"""What goes through a driver: observations up, actions down, and the description of both.
+"""Values that pass through a driver: observations, actions, and the description of both.
 
 Units are SI, x forward, y left, counter-clockwise positive.  Keys are flat (``base.vx``, ``range.near``,
-``imu.az``); ``Description`` says which a robot has and within which limits, before it is connected.
+``imu.az``); ``Description`` lists the keys that a robot has and their limits, before a connection exists.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 Value = float | bool | str
 Action = Mapping[str, float]
-"""What a robot shall do: keys of ``Description.limits`` to values; a missing key means "unchanged"."""
+"""A command to a robot: keys of ``Description.limits`` to values; a missing key means "unchanged"."""
 
 
 @dataclass(frozen=True)
@@ -31,11 +31,11 @@ class Frame:
 
 @dataclass(frozen=True)
 class Observation:
-    """The newest that is known of a robot.
+    """The newest known state of a robot.
 
     ``values`` maps flat keys to SI values (NaN: nothing in range); ``samples`` maps a key to the samples since the
-    frame before, oldest first (the ERS-7 delivers 4 each 32 ms).  ``t_host`` is the moment of arrival on the
-    driver's clock.
+    previous frame, oldest first (the ERS-7 delivers 4 each 32 ms).  ``t_host`` is the time of arrival on the driver's
+    clock, ``t_robot`` the time on the robot's clock, both in seconds.
     """
 
     t_host: float
@@ -47,11 +47,12 @@ class Observation:
 
 @dataclass(frozen=True)
 class Description:
-    """What a robot is and can do, known without connecting to it.
+    """The properties and abilities of a robot, known without a connection.
 
     ``capabilities`` maps a capability name (``base2d``, ``ranger``, ``camera``, ``imu``, ``odometry``, ``power``) to
     its properties (numbers or text; ``ranger`` has ``max`` in metres, ``camera`` has ``width``, ``height``, ``fps``);
-    ``limits`` maps each action key to its lowest and highest value; ``skills`` are the names that ``invoke`` knows.
+    ``limits`` maps each action key to its lowest and highest value; ``radius`` is in metres, ``rates`` in Hz;
+    ``skills`` are the names that ``invoke`` accepts.
     """
 
     kind: str

@@ -1,8 +1,8 @@
-"""Registry: the kind of a robot to its driver, imported only when that kind is asked for.
+"""Find the driver of a kind of robot; a driver is imported only when its kind is used.
 
-A kind is built in, an entry point of ``swarm_node.drivers``, or the place of a class, ``module:name``.  What is not
-built in is a class, or whatever else can be called with (options, name, clock, connector).  It is foreign code, and
-may fail in any way: that is told in one line which names it, and touches no other driver.
+A kind is built in, an entry point of ``swarm_node.drivers``, or a class given as ``module:name``.  A driver that is
+not built in is a class or another callable with the arguments (options, name, clock, connector).  It is third-party
+code and may fail in any way: such an error is reported in one line that names the driver, and affects no other.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ NEEDED = ("description", "state", "connect", "disconnect", "enable", "disable", 
 Factory = Callable[[Mapping[str, object], str, IReactorTime, "Connector | None"], Driver]
 Describe = Callable[[Mapping[str, object], str], Description]
 Parts = Sequence[tuple[str, Mapping[str, object]]]
-"""Kind and options of each part that rides on a robot and only senses."""
+"""Kind and options of each sensing part that is mounted on a robot."""
 
 
 def built_in_kinds() -> list[str]:
-    """Return the kinds in the tree: the packages of ``drivers`` that have a ``driver`` module; none is imported.
+    """Return the built-in kinds: the packages of ``drivers`` that have a ``driver`` module; none is imported.
 
-    It has ``MANIFEST``, ``make_driver(options, name, clock, connector)`` and ``describe(options, name)``.
+    Such a module has ``MANIFEST``, ``make_driver(options, name, clock, connector)`` and ``describe(options, name)``.
     """
     packages = [module.name for module in iter_modules(drivers.__path__) if module.ispkg]
     return [name for name in packages if find_spec(f"drivers.{name}.driver") is not None]
@@ -46,35 +46,35 @@ def built_in_kinds() -> list[str]:
 
 def manifest_of(kind: str) -> Manifest:
     """Return the manifest of a built-in kind; an empty one for any other."""
-    return cast(Manifest, _found(kind, "MANIFEST")) if kind in built_in_kinds() else Manifest()
+    return cast(Manifest, _load_attribute(kind, "MANIFEST")) if kind in built_in_kinds() else Manifest()
 
 
 def kinds() -> list[str]:
-    """The kinds of robot that there are drivers for, those of other distributions as well; none is imported."""
+    """Return the kinds of robot that have drivers, including other distributions; none is imported."""
     return sorted({*built_in_kinds(), *places()})
 
 
 def places() -> dict[str, str]:
-    """Each kind that other distributions bring, and its place, ``module:name``; none of them is imported."""
-    from importlib.metadata import entry_points  # heavy, and most nodes never come here
+    """Return each kind that another distribution provides, and its ``module:name``; none is imported."""
+    from importlib.metadata import entry_points  # expensive to import, and most nodes do not need it
 
     return {point.name: point.value for point in entry_points(group=ENTRY_POINTS)}
 
 
 def maker(kind: str, place: str) -> Factory:
-    """What makes drivers of ``kind``, out of ``place``; raises ``UsageError`` where it cannot be loaded."""
+    """Load the factory of drivers of ``kind`` from ``place`` (``module:name``); raise ``UsageError`` if that fails."""
     module, _, attribute = place.partition(":")
     try:
         make = getattr(import_module(module), attribute)
-    except Exception as error:  # a module of somebody else may fail in any way
-        raise UsageError(f"driver {kind!r} cannot be loaded: {_told(error)}") from error
+    except Exception as error:  # a third-party module may fail in any way
+        raise UsageError(f"driver {kind!r} cannot be loaded: {_one_line(error)}") from error
     if not callable(make):
         raise UsageError(f"driver {kind!r} cannot be loaded: {place} cannot be called")
-    return partial(_made, kind, make)
+    return partial(_make_checked, kind, make)
 
 
 def description_of(make: Factory, options: Mapping[str, object], name: str) -> Description:
-    """What such a robot is: a driver is made for that and thrown away, as making one opens nothing."""
+    """Return the description of such a robot; this creates a temporary driver, which opens nothing."""
     return make(options, name, Clock(), None).description
 
 
@@ -86,70 +86,72 @@ def driver_for(
     connector: Connector | None = None,
     parts: Parts = (),
 ) -> Driver:
-    """A driver of ``kind`` that is not connected yet, with the senses of ``parts``.
+    """Return an unconnected driver of ``kind``, combined with the sensors of ``parts``.
 
-    ``name`` is the device's and says which robot is meant where the options do not; ``connector`` opens the
-    links, real TCP on the running reactor where it is None.  Raises ``UsageError`` with one line for an unknown
-    kind or a wrong option.
+    ``name`` is the name of the device and selects the robot if the options do not; ``connector`` opens the links; None
+    means TCP on the running reactor.  Raises ``UsageError`` with one line for an unknown kind or a wrong option.
     """
-    main = cast(Factory, _found(kind, "make_driver"))(options, name, clock, connector)
+    main = cast(Factory, _load_attribute(kind, "make_driver"))(options, name, clock, connector)
     if not parts:
         return main
-    from drivers.joined import joined  # a robot without parts is spared it
+    from drivers.joined import joined  # not needed for a robot without parts
 
-    made = []
+    part_drivers = []
     for number, (part, table) in enumerate(parts, 1):
-        with _naming(number):
-            made.append(cast(Factory, _found(part, "make_driver"))(table, f"{name}'s {part}", clock, connector))
-    return joined(main, made, name)
+        with _prefix_part_number(number):
+            make_part = cast(Factory, _load_attribute(part, "make_driver"))
+            part_drivers.append(make_part(table, f"{name}'s {part}", clock, connector))
+    return joined(main, part_drivers, name)
 
 
 def describe(kind: str, options: Mapping[str, object], name: str = "robot", parts: Parts = ()) -> Description:
-    """What a robot of ``kind`` with ``parts`` is, without making a driver; raises as ``driver_for`` does."""
-    main = cast(Describe, _found(kind, "describe"))(options, name)
+    """Return the description of a robot of ``kind`` with ``parts`` without a driver; raises as ``driver_for`` does."""
+    main = cast(Describe, _load_attribute(kind, "describe"))(options, name)
     if not parts:
         return main
     from drivers.joined import described
 
-    made = []
+    descriptions = []
     for number, (part, table) in enumerate(parts, 1):
-        with _naming(number):
-            made.append(cast(Describe, _found(part, "describe"))(table, name))
-    return described(main, made)
+        with _prefix_part_number(number):
+            descriptions.append(cast(Describe, _load_attribute(part, "describe"))(table, name))
+    return described(main, descriptions)
 
 
 @contextmanager
-def _naming(number: int) -> Iterator[None]:
-    """What is wrong with a part says with which."""
+def _prefix_part_number(number: int) -> Iterator[None]:
+    """Prefix errors with the number of the part."""
     try:
         yield
     except UsageError as error:
         raise UsageError(f"part {number}: {error}") from None
 
 
-def _found(kind: str, attribute: str) -> object:
+def _load_attribute(kind: str, attribute: str) -> object:
     if kind in built_in_kinds():
         return getattr(import_module(f"drivers.{kind}.driver"), attribute)
     place = kind if ":" in kind else places().get(kind)
     if place is None:
-        remedy = "of your own: module:Class"
+        remedy = "for another driver write module:Class"
         raise UsageError(f"no driver for robots of kind {kind!r}; known are {', '.join(kinds())}; {remedy}")
     make = maker(kind, place)
     return make if attribute == "make_driver" else partial(description_of, make)
 
 
-def _made(kind: str, make: Factory, options: Mapping[str, object], name: str, clock: Any, connector: Any) -> Driver:
+def _make_checked(
+    kind: str, make: Factory, options: Mapping[str, object], name: str, clock: Any, connector: Any
+) -> Driver:
     try:
         driver = make(options, name, clock, connector)
         missing = [each for each in NEEDED if not hasattr(driver, each)]
         if missing or not isinstance(driver.description, Description):
-            raise TypeError(f"it is no Driver: it lacks {', '.join(missing) or 'a Description'}")
+            raise TypeError(f"it is not a Driver: it lacks {', '.join(missing) or 'a Description'}")
     except DriverError:
         raise
-    except Exception as error:  # foreign code
-        raise UsageError(f"driver {kind!r} cannot be made with these options: {_told(error)}") from error
+    except Exception as error:  # third-party code
+        raise UsageError(f"driver {kind!r} cannot be made with these options: {_one_line(error)}") from error
     return driver
 
 
-def _told(error: Exception) -> str:
+def _one_line(error: Exception) -> str:
     return " ".join(f"{type(error).__name__}: {error}".split())[:300]

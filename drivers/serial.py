@@ -1,7 +1,7 @@
-"""Serial: links over serial devices, for drivers whose robot hangs on a cable.
+"""Links over serial devices, for robots on a cable.
 
-``SerialConnector`` is the edge to the world; it keeps the seam of ``drivers.link``, so that ``MemoryConnector`` is its
-twin: the host is the device, the port the baud rate.  pyserial (the extra ``serial``) is loaded when a line is called.
+``SerialConnector`` has the interface of ``drivers.link.Connector``, so ``MemoryConnector`` can replace it: the host
+is the device, the port the baud rate.  pyserial (the extra ``serial``) is imported by the first ``call``.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from drivers.link import (
 from drivers.timer import Timer
 
 FLUSH_S = 1.0
-"""What was sent before hanging up has so long to leave."""
+"""Seconds that data sent before ``hang_up`` may take to be written."""
 BACKLOG = 4096
-"""Above so many bytes that have not left, a link is busy."""
+"""Number of unsent bytes above which a link is busy."""
 PROBLEMS = {
     errno.ENOENT: "there is no such device; plug the robot in, or correct the option port",
-    errno.EACCES: "no permission; add this user to the device's group (often dialout), and sign in anew",
-    errno.EPERM: "no permission; add this user to the device's group (often dialout), and sign in anew",
+    errno.EACCES: "no permission; add this user to the device's group (often dialout), and log in again",
+    errno.EPERM: "no permission; add this user to the device's group (often dialout), and log in again",
     errno.EBUSY: "the port is busy: another program has it open; end that",
     errno.EAGAIN: "the port is busy: another program has it open; end that",
     errno.EIO: "the device does not answer; plug it in again",
@@ -46,13 +46,13 @@ PROBLEMS = {
 }
 
 Opener = Callable[[protocol.Protocol, str, int, Any], Any]
-"""Opens a device at a baud rate on a reactor and joins a protocol to it; raises ``OSError`` or ``ValueError``."""
+"""Opens a device at a baud rate on a reactor and attaches a protocol; raises ``OSError`` or ``ValueError``."""
 
 
 def problem_of(error: Exception) -> str:
-    """What keeps a device from being opened, and the remedy, in one line."""
+    """Return the reason why a device cannot be opened, and the remedy, in one line."""
     number = getattr(error, "errno", None)
-    # pyserial wraps what the system and the terminal say into errors of its own, some without their number.
+    # pyserial wraps errors of the system into its own exceptions, some of them without the errno.
     if number is None and error.__context__ is not None and error.__context__.args:
         number = error.__context__.args[0]
     return PROBLEMS.get(
@@ -61,23 +61,23 @@ def problem_of(error: Exception) -> str:
 
 
 class SerialConnector:
-    """Opens links over serial devices on ``reactor`` (the running one where none is given)."""
+    """Opens links over serial devices on ``reactor`` (None: the running one)."""
 
     def __init__(self, reactor: Any = None, opener: Opener | None = None) -> None:
         self._reactor = reactor
         self._opener = opener
 
     def call(self, host: str, port: int, caller: Caller) -> Line:
-        """Keep ``caller`` connected to the device ``host`` at ``port`` baud, with back-off, until the line hangs up.
+        """Keep ``caller`` connected to the device ``host`` at ``port`` baud, with back-off, until ``hang_up``.
 
-        Raises ``UsageError`` where pyserial is missing.
+        Raises ``UsageError`` if pyserial is missing.
         """
         reactor = reactor_or_running(self._reactor)
-        return SerialLine(host, port, caller, reactor, _opener() if self._opener is None else self._opener)
+        return SerialLine(host, port, caller, reactor, _load_opener() if self._opener is None else self._opener)
 
 
 class SerialLine:
-    """A standing wish to have a device open; ``problem`` says in one line why it is not, and is logged once."""
+    """Keeps a device open; ``problem`` says in one line why it is not, and is logged once."""
 
     log = Logger()
 
@@ -90,39 +90,39 @@ class SerialLine:
         self._opener = opener
         self._link: _SerialLink | None = None
         self._retry_s = FIRST_RETRY_S
-        self._gone: Deferred[None] | None = None
+        self._closed: Deferred[None] | None = None
         self._pending = Timer(reactor)
-        self._pending.set(0.0, self._try)
+        self._pending.set(0.0, self._try_open)
 
     def hang_up(self) -> Deferred[None]:
-        """Let what was sent leave, close the device, stop trying; fires when it is closed."""
+        """Write pending data, close the device, stop retrying; fires when the device is closed."""
         if self._link is None:
             self._pending.cancel()
             return succeed(None)
-        if self._gone is None:
-            self._gone = Deferred()
+        if self._closed is None:
+            self._closed = Deferred()
             self._pending.set(FLUSH_S, self._link.close)
             self._link.leave()
-        return self._gone
+        return self._closed
 
     def link_lost(self) -> None:
-        """Learn from the link that the device is closed."""
+        """Handle the close of the device; called by the link."""
         self._link = None
-        gone, self._gone = self._gone, None
+        closed, self._closed = self._closed, None
         self._pending.cancel()
-        if gone is None:
-            self._pending.set(FIRST_RETRY_S, self._try)
+        if closed is None:
+            self._pending.set(FIRST_RETRY_S, self._try_open)
         self._caller.link_down()
-        if gone is not None:
-            gone.callback(None)
+        if closed is not None:
+            closed.callback(None)
 
-    def _try(self) -> None:
+    def _try_open(self) -> None:
         link = _SerialLink(self, self._caller)
         try:
             self._opener(link, self._device, self._baud, self._reactor)
         except (OSError, ValueError) as error:
-            self._name(problem_of(error))
-            self._pending.set(self._retry_s, self._try)
+            self._log_problem(problem_of(error))
+            self._pending.set(self._retry_s, self._try_open)
             self._retry_s = min(self._retry_s * RETRY_FACTOR, LAST_RETRY_S)
             return
         self._retry_s = FIRST_RETRY_S
@@ -130,15 +130,13 @@ class SerialLine:
         self._link = link
         self._caller.link_up(link)
 
-    def _name(self, problem: str) -> None:
+    def _log_problem(self, problem: str) -> None:
         if problem != self.problem:
             self.log.warn("{device}: {problem}", device=self._device, problem=problem)
         self.problem = problem
 
 
 class _SerialLink(StreamLink):
-    """A link over one open device."""
-
     def __init__(self, line: SerialLine, caller: Caller) -> None:
         self._line = line
         self._caller = caller
@@ -151,13 +149,13 @@ class _SerialLink(StreamLink):
     def close(self) -> None:
         transport: Any = self.transport
         if self.connected and transport is not None:
-            # A serial port has no abort: it is closed as if it had been lost.
+            # Twisted's serial port has no abort: report a lost connection instead.
             transport.stopReading()
             transport.stopWriting()
             transport.connectionLost(Failure(protocol.connectionDone.value))
 
     def leave(self) -> None:
-        """Close as soon as everything has left."""
+        """Close after all pending data is written."""
         if self.transport is not None:
             self.transport.loseConnection()
 
@@ -170,8 +168,8 @@ class _SerialLink(StreamLink):
             self._line.link_lost()
 
 
-def _opener() -> Opener:
-    """What opens real devices, each for one program alone."""
+def _load_opener() -> Opener:
+    """Return the function that opens real devices for exclusive use."""
     try:
         from serial import Serial
         from twisted.internet.serialport import SerialPort
@@ -180,10 +178,10 @@ def _opener() -> Opener:
             "serial devices need pyserial; install swarm-node with its extra: swarm-node[serial]"
         ) from None
 
-    # Twisted opens ports that others have open as well; of two programs, neither would understand the robot.
+    # Twisted does not lock ports; two programs on one port would each receive parts of the data.
     port: Any = type("Port", (SerialPort,), {"_serialFactory": partial(Serial, exclusive=True)})
 
-    def opened(link: protocol.Protocol, device: str, baud: int, reactor: Any) -> Any:
+    def open_device(link: protocol.Protocol, device: str, baud: int, reactor: Any) -> Any:
         return port(link, device, reactor, baudrate=baud)
 
-    return opened
+    return open_device

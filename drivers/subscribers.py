@@ -1,4 +1,4 @@
-"""Subscribers: those who are told of each new thing, in the order in which they came; none harms another."""
+"""Call subscribers in order of subscription; an error in one does not affect the others."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ T = TypeVar("T")
 
 
 class Subscribers(Generic[T]):
-    """The subscribers of ``robot``; what one of them raises goes to ``log``."""
+    """The subscribers of ``robot``; their exceptions are logged to ``log``."""
 
     def __init__(self, robot: str, log: Logger) -> None:
         self._robot = robot
@@ -19,7 +19,7 @@ class Subscribers(Generic[T]):
         self._all: list[Callable[[T], None]] = []
 
     def add(self, seen: Callable[[T], None]) -> Callable[[], None]:
-        """Call ``seen`` at each new thing; call what is returned to end that."""
+        """Call ``seen`` with each new item; return a function that ends the subscription."""
         self._all.append(seen)
 
         def end() -> None:
@@ -29,7 +29,7 @@ class Subscribers(Generic[T]):
         return end
 
     def tell(self, newest: T) -> None:
-        """Call those who are there now; who comes or goes meanwhile changes nothing of this round."""
+        """Call the current subscribers; changes made during the calls take effect with the next item."""
         for seen in list(self._all):
             try:
                 seen(newest)

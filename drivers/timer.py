@@ -1,4 +1,4 @@
-"""Timer: one call that is due on a clock, or none."""
+"""A timer with at most one pending call."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from twisted.internet.interfaces import IReactorTime
 
 
 class Timer:
-    """A call on ``clock``; setting it again cancels the one before."""
+    """A call on ``clock``; setting it again cancels the pending call."""
 
     def __init__(self, clock: IReactorTime) -> None:
         self._clock = clock
@@ -17,16 +17,16 @@ class Timer:
 
     @property
     def is_set(self) -> bool:
-        """Whether a call is due."""
+        """Whether a call is pending."""
         return self._call is not None and bool(self._call.active())
 
     def set(self, seconds: float, call: Callable[..., object], *arguments: object) -> None:
-        """Call after so many seconds."""
+        """Call ``call`` after ``seconds``."""
         self.cancel()
         self._call = self._clock.callLater(seconds, call, *arguments)
 
     def cancel(self) -> None:
-        """Call nothing; does nothing where no call is due."""
+        """Cancel the pending call, if there is one."""
         call, self._call = self._call, None
         if call is not None and call.active():
             call.cancel()

@@ -1,4 +1,4 @@
-"""Chat over the tuple space: a line is a tuple in the box of each who is there, and each takes from its own box.
+"""Chat over the tuple space: a line is one tuple for each participant, and each participant takes its own tuples.
 
 ``python examples/chat.py --port 7000 ann``, and in another terminal ``... --port 7001 --known 127.0.0.1:7000 bob``.
 Type lines; end with Ctrl-C or Ctrl-D.
@@ -17,12 +17,12 @@ from twisted.protocols.basic import LineReceiver
 from middleware.entangled.control.word import printable
 from middleware.entangled.space.tuplespace import TupleSpace
 
-KEPT = 60.0
-"""Seconds for which a line waits for somebody who is slow, or gone."""
+LINE_TTL_S = 60.0
+"""Seconds after which an undelivered line expires."""
 
 
 class Keyboard(LineReceiver):
-    """Puts what is typed into everybody's box."""
+    """Sends typed lines to all other participants."""
 
     delimiter = b"\n"
 
@@ -31,17 +31,17 @@ class Keyboard(LineReceiver):
 
     def lineReceived(self, line: bytes) -> None:
         """Send a line."""
-        defer.ensureDeferred(self._say(line.decode(errors="replace")))
+        defer.ensureDeferred(self._send_line(line.decode(errors="replace")))
 
     def connectionLost(self, reason: object = None) -> None:
-        """Leave when the keyboard does."""
+        """End the program when the input ends."""
         if not self._ended.called:
             self._ended.callback(None)
 
-    async def _say(self, text: str) -> None:
+    async def _send_line(self, text: str) -> None:
         for _, other in await self._space.read_all(("here", str)):
             if other != self._name:
-                await self._space.put(("line", other, self._name, text[:400]), ttl=KEPT)
+                await self._space.put(("line", other, self._name, text[:400]), ttl=LINE_TTL_S)
 
 
 async def _listen(space: TupleSpace, name: str) -> None:
@@ -51,7 +51,7 @@ async def _listen(space: TupleSpace, name: str) -> None:
 
 
 async def main(reactor: Any, port: int, known: str, name: str) -> None:
-    """Chat until the keyboard ends."""
+    """Chat until the input ends."""
     node = await joined(reactor, port, known)
     space = TupleSpace(node, reactor, random.SystemRandom())
     await space.put(("here", name))
@@ -71,5 +71,5 @@ if __name__ == "__main__":
     parser.add_argument("--port", type=int, default=0)
     parser.add_argument("--known", default="", metavar="HOST:PORT")
     parser.add_argument("name")
-    given = parser.parse_args()
-    task.react(lambda reactor: defer.ensureDeferred(main(reactor, given.port, given.known, given.name)))
+    args = parser.parse_args()
+    task.react(lambda reactor: defer.ensureDeferred(main(reactor, args.port, args.known, args.name)))

@@ -1,7 +1,7 @@
-"""Key-value in ten lines.
+"""A key-value store in ten lines.
 
-``python examples/keyvalue.py 7000`` begins a network, ``... 7001 127.0.0.1:7000 colour red`` joins it, stores and
-stays, ``... 7002 127.0.0.1:7000 colour`` reads.
+``python examples/keyvalue.py 7000`` starts a network, ``... 7001 127.0.0.1:7000 colour red`` joins it, stores a value
+and stays, ``... 7002 127.0.0.1:7000 colour`` reads it.
 """
 
 import sys
@@ -13,7 +13,7 @@ from middleware.entangled.record import hashed_key
 
 
 async def main(reactor, port, known="", key="", value=""):
-    """Store, read, or only be there."""
+    """Store a value, read one, or only run a node."""
     node = await joined(reactor, int(port), known)
     if value:
         print("stored on", await node.put(hashed_key(key), "value", value.encode()), "nodes", flush=True)

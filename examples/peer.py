@@ -1,4 +1,4 @@
-"""A node of the examples: over UDP on this machine, with a key of its own that it forgets when it ends."""
+"""A node for the examples: over UDP on this machine, with a new key for each run."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from middleware.entangled.network.udp import UdpNetwork
 from middleware.entangled.node import EntangledNode
 
 TEAM_KEY = b"everybody who runs the examples."
-"""A real team has 32 secret bytes here: who lacks them can neither read nor write."""
+"""A real team has 32 secret bytes here: a node without them can neither read nor write."""
 
 
 async def joined(reactor: Any, port: int, known: str = "") -> EntangledNode:
-    """A node on ``port`` that has entered the network of ``known`` (HOST:PORT), or has begun one of its own."""
+    """Start a node on ``port`` that joins the network of ``known`` (HOST:PORT), or starts a new one."""
     use_monotonic_time()
-    dice = random.SystemRandom()
+    rng = random.SystemRandom()
     network = UdpNetwork(reactor, "127.0.0.1", port)
-    node = EntangledNode(Identity(dice.randbytes(32)), TEAM_KEY, network, MemoryStore(), reactor, dice)
+    node = EntangledNode(Identity(rng.randbytes(32)), TEAM_KEY, network, MemoryStore(), reactor, rng)
     node.start()
     reactor.addSystemEventTrigger("before", "shutdown", node.stop)
     host, _, number = known.rpartition(":")

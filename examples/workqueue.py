@@ -1,4 +1,4 @@
-"""A work queue whose workers die: a job that a dead worker held comes back, and is done by another.
+"""A work queue that survives its workers: the job of a dead worker returns to the queue.
 
 ``python examples/workqueue.py --port 7000 boss 20`` puts twenty jobs and waits for their results.  In other terminals
 ``... --port 7001 --known 127.0.0.1:7000 worker ann --dies 0.2``: each job kills the worker with that probability.
@@ -18,7 +18,7 @@ from middleware.entangled.space.tuplespace import TupleSpace
 
 WORK_S = 0.2
 LEASE_S = 1.5
-"""Longer than a job may take; a dead worker's job is missing for that long."""
+"""Longest duration of a job in seconds; the job of a dead worker returns after this time."""
 
 
 async def boss(space: TupleSpace, jobs: int) -> None:
@@ -29,31 +29,31 @@ async def boss(space: TupleSpace, jobs: int) -> None:
     done: dict[object, object] = {}
     while len(done) < jobs:
         _, number, worker, result = await space.get(("done", int, str, int))
-        # A worker that dies after its result and before its word that the job is taken lets it be done twice.
+        # A worker that dies between its result and confirm() causes a second result.
         if number not in done:
             done[number] = result
             print(f"{number} squared is {result}, says {worker} ({len(done)} of {jobs})", flush=True)
 
 
 async def work(reactor: Any, space: TupleSpace, name: str, dies: float) -> None:
-    """Do jobs for ever, or until death."""
-    dice = random.SystemRandom()
+    """Do jobs until the worker dies."""
+    rng = random.SystemRandom()
     while True:
         claim = await space.claim(("job", int), lease=LEASE_S)
         number: Any = claim.fields[1]
         await task.deferLater(reactor, WORK_S)
-        if dice.random() < dies:
+        if rng.random() < dies:
             print(f"{name} dies over {number}", flush=True)
             os._exit(1)
         await space.put(("done", number, name, number * number))
         await claim.confirm()
 
 
-async def main(reactor: Any, given: argparse.Namespace) -> None:
-    """Be a boss or a worker."""
-    node = await joined(reactor, given.port, given.known)
+async def main(reactor: Any, args: argparse.Namespace) -> None:
+    """Run a boss or a worker."""
+    node = await joined(reactor, args.port, args.known)
     space = TupleSpace(node, reactor, random.SystemRandom())
-    await (boss(space, given.jobs) if given.role == "boss" else work(reactor, space, given.name, given.dies))
+    await (boss(space, args.jobs) if args.role == "boss" else work(reactor, space, args.name, args.dies))
     space.stop()
 
 
@@ -66,5 +66,5 @@ if __name__ == "__main__":
     worker = roles.add_parser("worker")
     worker.add_argument("name")
     worker.add_argument("--dies", type=float, default=0.0)
-    given = parser.parse_args()
-    task.react(lambda reactor: defer.ensureDeferred(main(reactor, given)))
+    args = parser.parse_args()
+    task.react(lambda reactor: defer.ensureDeferred(main(reactor, args)))

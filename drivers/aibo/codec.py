@@ -1,8 +1,8 @@
-"""Codec of the dog's own ports: walk, head, joints, e-stop, world state and gains; pure.
+"""Codec of the AIBO's ports for walk, head, joints, emergency stop, world state and gains; pure.
 
-All numbers are little-endian, 32 bits wide.  The world state comes in two dialects, which the reader tells apart by
-its first bytes: ``T4`` (Tekkotsu 4.0 and 5.x: model, counts of everything) and ``T2`` (2.x: no model, no frame
-number).  Counts are taken from the stream, so other models than the ERS-7 are read as well.
+All numbers are little-endian, 32 bits wide.  The world state has two dialects, distinguished by their first bytes:
+``T4`` (Tekkotsu 4.0 and 5.x: model, counts of everything) and ``T2`` (2.x: no model, no frame number).  Counts are
+read from the stream, so models other than the ERS-7 can be read as well.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ MAX_MODEL = 32
 MODEL_START = b"ERS-"
 PID_JOINTS = 18
 COMMAND = 5
-"""Every walk and head command is so many bytes: a letter and a float."""
+"""Bytes of each walk and head command: a letter and a float."""
 
 
 @dataclass(frozen=True)
 class WorldState:
-    """What the dog feels at ``t`` ms after it was switched on (it wraps after 49.7 days)."""
+    """The sensor data at ``t`` ms after the dog was switched on (wraps after 49.7 days)."""
 
     dialect: str
     model: str
@@ -38,12 +38,12 @@ class WorldState:
 
 
 def command(letter: str, value: float) -> bytes:
-    """A walk command (``f s r`` and the digits) or a head command (``t p r``), -1 to 1."""
+    """Return a walk command (``f s r`` and the digits) or a head command (``t p r``) with a value from -1 to 1."""
     return struct.pack("<cf", letter.encode("ascii"), value)
 
 
 class Short(Exception):
-    """A packet goes on beyond the bytes at hand: it has at least ``need`` bytes."""
+    """A packet is incomplete: it has at least ``need`` bytes."""
 
     def __init__(self, need: int) -> None:
         super().__init__(need)
@@ -51,20 +51,20 @@ class Short(Exception):
 
 
 def string(text: str) -> bytes:
-    """A string as the dog saves one: its length, its bytes and a NUL."""
+    """Encode a string as the dog does: its length, its bytes and a NUL."""
     data = text.encode("latin-1")
     return struct.pack("<I", len(data)) + data + b"\0"
 
 
 class Cursor:
-    """Takes fields from the front of ``data``; raises ``Short`` at its end, ``BadFrame`` for what cannot be."""
+    """Reads fields from ``data`` in order; raises ``Short`` at its end and ``BadFrame`` for invalid values."""
 
     def __init__(self, data: bytes) -> None:
         self.at = 0
         self._data = data
 
     def take(self, size: int) -> bytes:
-        """So many bytes."""
+        """Read ``size`` bytes."""
         piece = self._data[self.at : self.at + size]
         if len(piece) < size:
             raise Short(self.at + size)
@@ -72,48 +72,48 @@ class Cursor:
         return piece
 
     def words(self, count: int) -> tuple[int, ...]:
-        """So many unsigned numbers."""
+        """Read ``count`` unsigned numbers."""
         return struct.unpack(f"<{count}I", self.take(4 * count))
 
     def floats(self, count: int) -> tuple[float, ...]:
-        """So many floats."""
+        """Read ``count`` floats."""
         return struct.unpack(f"<{count}f", self.take(4 * count))
 
     def count(self) -> int:
-        """How many follow."""
+        """Read the number of values that follow."""
         (count,) = self.words(1)
         if count > MAX_COUNT:
-            raise BadFrame(f"{count} values in a row are more than any dog has")
+            raise BadFrame(f"a count of {count} values exceeds the maximum of {MAX_COUNT}")
         return count
 
     def row(self) -> tuple[float, ...]:
-        """A count, and so many floats."""
+        """Read a count and that many floats."""
         return self.floats(self.count())
 
     def until_nul(self) -> str:
-        """A short name that ends with a NUL."""
+        """Read a short name that ends with a NUL."""
         end = self._data.find(b"\0", self.at, self.at + MAX_MODEL)
         if end < 0:
             if len(self._data) - self.at >= MAX_MODEL:
-                raise BadFrame("a name without its end")
+                raise BadFrame("name without terminating NUL")
             raise Short(len(self._data) + 1)
         text = self._data[self.at : end]
         self.at = end + 1
         return text.decode("latin-1")
 
     def string(self, limit: int) -> str:
-        """A string of at most ``limit`` bytes, as ``string`` makes them."""
+        """Read a string of at most ``limit`` bytes, in the encoding of ``string``."""
         (length,) = self.words(1)
         if length > limit:
-            raise BadFrame(f"a name of {length} bytes")
+            raise BadFrame(f"string of {length} bytes exceeds the maximum of {limit}")
         data = self.take(length + 1)
         if data[-1]:
-            raise BadFrame("a name without its end")
+            raise BadFrame("string without terminating NUL")
         return data[:-1].decode("latin-1")
 
 
 class CommandReader:
-    """The dog's side of walk and head: cuts a stream into commands, however it is cut."""
+    """The dog's side of walk and head: splits a stream into commands."""
 
     def __init__(self) -> None:
         self._rest = bytearray()
@@ -128,14 +128,14 @@ class CommandReader:
 
 
 class LineReader:
-    """Cuts a stream into lines; a line that never ends is thrown away and counted."""
+    """Splits a stream into lines; overlong lines are discarded and counted."""
 
     def __init__(self) -> None:
         self.bad_lines = 0
         self._rest = b""
 
     def read(self, data: bytes) -> Iterator[str]:
-        """Yield the lines that ``data`` completes, without their ends."""
+        """Yield the lines that ``data`` completes, without their line ends."""
         *lines, self._rest = (self._rest + data).split(b"\n")
         if len(self._rest) > MAX_LINE:
             self._rest = b""
@@ -148,31 +148,31 @@ class LineReader:
 
 
 def encoded(state: WorldState) -> bytes:
-    """The packet of ``state`` in its own dialect; T2 knows joints only, which are the first of the outputs."""
+    """Encode ``state`` in its dialect; T2 contains joints only, which are the first of the outputs."""
     if state.dialect == T2:
         rows = (state.outputs[: len(state.duties)], state.sensors, state.buttons)
-        return struct.pack("<I", state.t) + b"".join(_counted(row) for row in rows) + _floats(state.duties)
+        return struct.pack("<I", state.t) + b"".join(_encode_row(row) for row in rows) + _encode_floats(state.duties)
     head = state.model.encode("ascii") + b"\0" + struct.pack("<II", state.t, state.frame)
-    return head + b"".join(_counted(row) for row in (state.outputs, state.sensors, state.buttons, state.duties))
+    return head + b"".join(_encode_row(row) for row in (state.outputs, state.sensors, state.buttons, state.duties))
 
 
 def encoded_gains(t: int, pids: Sequence[tuple[float, float, float]]) -> bytes:
-    """The packet of port 10032: the gains P, I and D of each joint at ``t`` ms."""
-    return struct.pack("<II", t, len(pids)) + _floats([value for row in pids for value in row])
+    """Encode the packet of port 10032: the gains P, I and D of each joint at ``t`` ms."""
+    return struct.pack("<II", t, len(pids)) + _encode_floats([value for row in pids for value in row])
 
 
-def _floats(row: Sequence[float]) -> bytes:
+def _encode_floats(row: Sequence[float]) -> bytes:
     return struct.pack(f"<{len(row)}f", *row)
 
 
-def _counted(row: Sequence[float]) -> bytes:
-    return struct.pack("<I", len(row)) + _floats(row)
+def _encode_row(row: Sequence[float]) -> bytes:
+    return struct.pack("<I", len(row)) + _encode_floats(row)
 
 
 class StateReader:
-    """Cuts a stream into world states of whichever dialect; raises ``BadFrame`` where it is neither.
+    """Splits a stream into world states of either dialect; raises ``BadFrame`` for other data.
 
-    There is no mark to find the next packet by: after ``BadFrame`` the link has to be opened again, with a new reader.
+    Packets have no start marker, so after ``BadFrame`` the link has to be reopened with a new reader.
     """
 
     def __init__(self) -> None:
@@ -185,7 +185,7 @@ class StateReader:
         while len(self._rest) >= self._need:
             cursor = Cursor(bytes(self._rest))
             try:
-                state = _state(cursor, self._rest.startswith(MODEL_START))
+                state = _read_state(cursor, self._rest.startswith(MODEL_START))
             except Short as short:
                 self._need = short.need
                 continue
@@ -194,7 +194,7 @@ class StateReader:
             yield state
 
 
-def _state(cursor: Cursor, has_model: bool) -> WorldState:
+def _read_state(cursor: Cursor, has_model: bool) -> WorldState:
     if has_model:
         model = cursor.until_nul()
         t, frame = cursor.words(2)
@@ -202,5 +202,5 @@ def _state(cursor: Cursor, has_model: bool) -> WorldState:
     (t,) = cursor.words(1)
     joints = cursor.count()
     if joints != PID_JOINTS:
-        raise BadFrame(f"neither dialect begins so: no model, and {joints} joints")
+        raise BadFrame(f"neither dialect: no model, and {joints} joints")
     return WorldState(T2, "", t, 0, cursor.floats(joints), cursor.row(), cursor.row(), cursor.floats(joints))

@@ -1,4 +1,4 @@
-"""Link: the ports of the dog as the driver sees them, over TCP or, for the camera's pictures, over datagrams."""
+"""The dog's ports: commands over TCP, camera pictures over TCP or UDP."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from drivers.link import Connector, Line, Link
 from drivers.timer import Timer
 
 WAITS = (0.5, 1.0, 2.0, 5.0)
-"""A port that was just closed does not accept at once; so long the dog's own clients wait as well."""
+"""Delays before reconnecting, as in the dog's own clients: a port that was just closed does not accept at once."""
 FLUSH_S = 1.0
 ASK_S = 0.5
-"""The request for datagrams is sent so often until the first arrives, and again when they cease."""
+"""Interval at which datagrams are requested until the first arrives, and again after they stop."""
 SILENT_S = 2.0
 
 
 class Port:
-    """One port that is called until it answers, and again when it is lost; it knows no message."""
+    """One TCP port that is kept connected; it does not interpret the data."""
 
     def __init__(
         self,
@@ -46,21 +46,21 @@ class Port:
 
     @property
     def number(self) -> int:
-        """The port's number."""
+        """The port number."""
         return self._address[1]
 
     @property
     def link(self) -> Link | None:
-        """The link there is now."""
+        """The current link, None without one."""
         return self._link
 
     @property
     def is_up(self) -> bool:
-        """Whether there is a link now."""
+        """Whether the link is open."""
         return self._link is not None
 
     def open(self) -> None:
-        """Call now, and go on calling; where there is a link already, it stays."""
+        """Connect now, and keep connecting; an open link stays open."""
         if self._link is not None:
             return
         if self._line is not None:
@@ -75,55 +75,55 @@ class Port:
             self._link.send(data)
 
     def drop(self) -> None:
-        """Break the link; it is opened again after a wait."""
+        """Close the link; it is reopened after a delay."""
         if self._link is not None:
             self._link.close()
 
     def close(self) -> Deferred[None]:
-        """Close for good: what was sent leaves first, but nobody waits long for a link that is dead."""
+        """Close for good after pending data is written, but wait at most ``FLUSH_S`` for a dead link."""
         line, self._line = self._line, None
         if line is None:
             return succeed(None)
         link, self.opened_at = self._link, None
         closed = line.hang_up()
         if link is not None and not closed.called:
-            patience = Timer(self._clock)
-            patience.set(FLUSH_S, link.close)
-            closed.addCallback(lambda _: patience.cancel())
+            timer = Timer(self._clock)
+            timer.set(FLUSH_S, link.close)
+            closed.addCallback(lambda _: timer.cancel())
         return closed
 
     def link_up(self, link: Link) -> None:
-        """Take the link; called by the line."""
+        """Use the new link; called by the link."""
         self._link = link
         self._on_up()
 
     def link_down(self) -> None:
-        """Forget the link; called by the line."""
+        """Drop the link; called by the link."""
         self._link = None
         self.opened_at = None if self._line is None else self._clock.seconds()
         self._on_down()
 
     def received(self, data: bytes) -> None:
-        """Take bytes; called by the line."""
+        """Take bytes; called by the link."""
         if self._line is not None:
             self._on_bytes(data)
 
 
 class Datagrams(Protocol):
-    """What opens the way for datagrams."""
+    """Opens links for datagrams."""
 
     def open(self, host: str, port: int, received: Callable[[bytes], None]) -> Link:
-        """A way to ``host``, whose datagrams go to ``received``."""
+        """Return a link to ``host``; datagrams from it are passed to ``received``."""
 
 
 class UdpDatagrams:
-    """Datagrams over UDP on ``reactor``, from a port that the machine chooses."""
+    """Opens UDP links on ``reactor``, from a port that the system chooses."""
 
     def __init__(self, reactor: Any) -> None:
         self._reactor = reactor
 
     def open(self, host: str, port: int, received: Callable[[bytes], None]) -> Link:
-        """A way to ``host``, whose datagrams go to ``received``."""
+        """Return a link to ``host``; datagrams from it are passed to ``received``."""
         link = _UdpLink(host, port, received)
         self._reactor.listenUDP(0, link, maxPacketSize=65536)
         return link
@@ -145,7 +145,7 @@ class _UdpLink(DatagramProtocol):
         self._received(datagram)
 
     def connectionRefused(self) -> None:
-        """Nothing listens there yet; the request is sent again."""
+        """Ignore the error: the server does not listen yet, and the request is sent again."""
 
     def send(self, data: bytes) -> None:
         transport: Any = self.transport
@@ -158,7 +158,7 @@ class _UdpLink(DatagramProtocol):
 
 
 class Camera:
-    """Hands each whole picture to ``seen``; what is none is counted in ``bad_frames``."""
+    """Receives pictures and passes each to ``seen``; invalid data is counted in ``bad_frames``."""
 
     def __init__(
         self,
@@ -177,16 +177,16 @@ class Camera:
         self._datagrams = datagrams
         self._reader = PictureReader()
         self._link: Link | None = None
-        self._ask = Timer(clock)
+        self._ask_timer = Timer(clock)
         self._heard_at = -SILENT_S
 
     @property
     def is_silent(self) -> bool:
-        """Whether datagrams are asked for, and none has come for a while."""
+        """Whether datagrams were requested and none has arrived for ``SILENT_S``."""
         return self._link is not None and self._clock.seconds() - self._heard_at >= SILENT_S
 
     def open(self) -> None:
-        """Begin to fetch pictures; does nothing where it has begun."""
+        """Start receiving pictures; does nothing if already started."""
         if self._datagrams is None:
             self.port.open()
         elif self._link is None:
@@ -194,8 +194,8 @@ class Camera:
             self._keep_asking()
 
     def close(self) -> Deferred[None]:
-        """Fetch no more; it can be opened again."""
-        self._ask.cancel()
+        """Stop receiving pictures; the camera can be opened again."""
+        self._ask_timer.cancel()
         link, self._link = self._link, None
         if link is not None:
             link.close()
@@ -232,6 +232,6 @@ class Camera:
             self.port.drop()
 
     def _keep_asking(self) -> None:
-        self._ask.set(ASK_S, self._keep_asking)
+        self._ask_timer.set(ASK_S, self._keep_asking)
         if self._link is not None and self.is_silent:
             self._link.send(REQUEST)

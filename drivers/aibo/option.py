@@ -1,4 +1,4 @@
-"""Options of the AIBO's driver: read from a free table and checked, each fault with its remedy."""
+"""Options of the kind "aibo"; each error names the remedy."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from drivers.reading import Description
 from formats.convert import Then
 
 PORTS: dict[str, int] = {"main": 10020, "estop": 10053, "state": 10031, "walk": 10050, "head": 10052, "camera": 10011}
-"""What the driver connects to, and where Tekkotsu serves it."""
+"""Servers that the driver connects to, with Tekkotsu's port numbers."""
 FORWARD, BACKWARD, ASIDE, TURN = 0.160, 0.156, 0.103, 2.03
-"""How fast the stock walk is, in m/s and rad/s."""
+"""Top speeds of the stock walk, in m/s and rad/s."""
 SOUNDS = {"howl": "5", "yap": "6", "whimper": "7", "growl": "8", "bark": "9"}
-"""What the walk server plays, and the letter that has it do so."""
+"""Sounds of the walk server, and the letters of their commands."""
 Transport = Literal["tcp", "udp"]
 Speed = Annotated[float, Meta(gt=0, le=10)]
 HEIGHTS = {104: 80, 208: 160}
-"""The height of a picture of each width that the camera gives."""
+"""Width of a camera picture to its height, in pixels."""
 
 
 def _all_ports(given: Mapping[str, int]) -> dict[str, int]:
@@ -35,7 +35,7 @@ def _all_ports(given: Mapping[str, int]) -> dict[str, int]:
 
 @dataclass(frozen=True)
 class Options:
-    """Where the dog is, how its camera is brought here, how fast its walk is, and which port serves what."""
+    """The dog's address, the transport of its camera, the speed of its walk, and its ports."""
 
     host: Host
     camera: bool = True
@@ -48,18 +48,18 @@ class Options:
     ] = (FORWARD, BACKWARD, ASIDE, TURN)
     ports: Annotated[
         Mapping[str, int],
-        Meta(description=f"a table of ports, such as {{walk = 10050}}; it knows {', '.join(PORTS)}"),
+        Meta(description=f"a table of ports, such as {{walk = 10050}}; its keys are {', '.join(PORTS)}"),
         Then(_all_ports, raw=dict[str, Port]),
     ] = field(default_factory=lambda: dict(PORTS))
 
     @property
     def wanted_fps(self) -> float:
-        """Pictures a second to ask for."""
+        """The requested frame rate in pictures per second."""
         return self.camera_fps if self.camera else 0.0
 
 
 def checked(table: Mapping[str, object]) -> Options:
-    """The options in ``table``; raises ``UsageError`` that names the key and what to write instead."""
+    """Convert and check ``table``; raise ``UsageError`` that names the key and the remedy."""
     options = convert_options("aibo", table, Options)
     if options.camera_transport == "udp" and not _is_address(options.host):
         problem = f'is {options.host!r}, which camera_transport = "udp" does not allow'
@@ -68,7 +68,7 @@ def checked(table: Mapping[str, object]) -> Options:
 
 
 def described(options: Options) -> Description:
-    """What an ERS-7 is, known without a connection."""
+    """Return the description of an ERS-7."""
     forward, backward, aside, turn = options.speed
     capabilities: dict[str, Mapping[str, float | str]] = {
         "base2d": {},

@@ -1,8 +1,8 @@
-"""Picture: the packets of the raw camera (port 10011), both ways; pure.
+"""Packets of the raw camera (port 10011), in both directions; pure.
 
-A packet is a header and one block of channels, or three; a JPEG passes through as it is, bare channels become
-``yuv444`` (three planes of the same size) or ``mono8``.  Over UDP each datagram is one packet; over TCP nothing marks
-the next, but every header begins with the same 18 bytes, by which the reader finds its way after bytes that are none.
+A packet is a header and one or three blocks of channels; a JPEG is passed on unchanged, raw channels become
+``yuv444`` (three planes of the same size) or ``mono8``.  Over UDP each datagram is one packet.  Over TCP packets have
+no delimiter, but every header begins with the same 18 bytes, by which the reader resynchronizes after invalid data.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Closing:
 
 @dataclass(frozen=True)
 class Posture:
-    """Text about the joints that another client of the camera asked for."""
+    """Text about the joints that another client of the camera requested."""
 
     text: str
 
@@ -66,12 +66,12 @@ POSTURE = b"#POS"
 
 
 def header(encoding: int, compression: int, width: int, height: int, t: int, number: int) -> bytes:
-    """The header of a packet."""
+    """Encode the header of a packet."""
     return START + struct.pack("<6I", encoding, compression, width, height, t, number)
 
 
 def block(one: Block, size: int | None = None) -> bytes:
-    """The bytes of one block; ``size`` is what it says of the length of its JPEG, where that is not the truth."""
+    """Encode one block; ``size`` replaces the length of its JPEG, to create invalid packets."""
     head = string("FbkImage") + struct.pack("<4I", one.width, one.height, one.layer, one.channel) + string(one.form)
     if one.form.startswith("JPEG"):
         head += struct.pack("<I", len(one.data) if size is None else size)
@@ -79,19 +79,19 @@ def block(one: Block, size: int | None = None) -> bytes:
 
 
 def decoded(data: bytes) -> Message:
-    """The message in one datagram; raises ``BadFrame`` for anything else."""
+    """Decode the message in one datagram; raise ``BadFrame`` if it is invalid."""
     cursor = Cursor(data)
     try:
-        message = _message(cursor)
+        message = _read_message(cursor)
     except Short as short:
-        raise BadFrame(f"{len(data)} bytes are less than a packet of {short.need}") from short
+        raise BadFrame(f"packet is cut off: {len(data)} of at least {short.need} bytes") from short
     if cursor.at != len(data):
-        raise BadFrame(f"{len(data) - cursor.at} bytes are left after the packet")
+        raise BadFrame(f"{len(data) - cursor.at} extra bytes after the packet")
     return message
 
 
 class PictureReader:
-    """Cuts a stream into messages, however it is cut; counts what is none, and goes on at the next header."""
+    """Splits a stream into messages; counts invalid data and continues at the next header."""
 
     def __init__(self) -> None:
         self.bad_frames = 0
@@ -105,7 +105,7 @@ class PictureReader:
             cursor = Cursor(bytes(self._rest))
             try:
                 _check_start(self._rest)
-                message = _message(cursor)
+                message = _read_message(cursor)
             except Short as short:
                 self._need = short.need
                 continue
@@ -119,72 +119,72 @@ class PictureReader:
 
     def _skip(self) -> None:
         at = self._rest.find(START, 1)
-        # The last bytes may be the beginning of a header whose rest is still on the way.
+        # The last bytes may be the start of a header that is not complete yet.
         del self._rest[: at if at > 0 else max(1, len(self._rest) - len(START) + 1)]
         self._need = 8 if at > 0 else len(START)
 
 
 def _check_start(data: bytearray) -> None:
-    """Refuse at once what begins no packet: its first bytes, read as a length, could have one wait for long."""
+    """Reject invalid data early: its first bytes, read as a length, could make the reader wait for long."""
     for start in (START, CLOSING):
         if start.startswith(data[: len(start)]):
             return
     if not POSTURE.startswith(data[4 : 4 + len(POSTURE)]):
-        raise BadFrame("no packet of the camera begins so")
+        raise BadFrame("not the start of a camera packet")
 
 
-def _message(cursor: Cursor) -> Message:
+def _read_message(cursor: Cursor) -> Message:
     kind = cursor.string(MAX_TEXT)
     if kind == "CloseConnection":
         return Closing()
     if kind.startswith("#POS"):
         return Posture(kind)
     if kind != "TekkotsuImage":
-        raise BadFrame("no packet of the camera begins so")
+        raise BadFrame(f"unknown camera packet {kind!r}")
     encoding, _, width, height, t, number = cursor.words(6)
     if encoding not in (COLOUR, SINGLE) or not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
-        raise BadFrame(f"a picture of {width} x {height} pixels in encoding {encoding}")
-    first = _block(cursor)
+        raise BadFrame(f"unsupported picture: {width} x {height} pixels, encoding {encoding}")
+    first = _read_block(cursor)
     is_whole = first.form == "JPEGColor" or encoding == SINGLE
-    blocks = [first] if is_whole else [first, _block(cursor), _block(cursor)]
-    return Picture(width, height, t, number, *_put_together(blocks, width, height))
+    blocks = [first] if is_whole else [first, _read_block(cursor), _read_block(cursor)]
+    return Picture(width, height, t, number, *_join_blocks(blocks, width, height))
 
 
-def _block(cursor: Cursor) -> Block:
+def _read_block(cursor: Cursor) -> Block:
     if cursor.string(32) != "FbkImage":
-        raise BadFrame("no block of channels begins so")
+        raise BadFrame("not the start of a block of channels")
     width, height, layer, channel = cursor.words(4)
     form = cursor.string(32)
     if form in ("JPEGColor", "JPEGGrayscale"):
         (size,) = cursor.words(1)
         if size > MAX_JPEG:
-            raise BadFrame(f"a JPEG of {size} bytes")
+            raise BadFrame(f"JPEG of {size} bytes exceeds the maximum of {MAX_JPEG}")
         data = cursor.take(size)
         if size_of(data) is None:
-            raise BadFrame("a JPEG that is cut off, or too large to be decoded")
+            raise BadFrame("JPEG is cut off, or too large to decode")
     elif form == "RawImage":
         if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
-            raise BadFrame(f"a channel of {width} x {height} pixels")
+            raise BadFrame(f"unsupported channel size: {width} x {height} pixels")
         data = cursor.take(width * height)
     elif form == "blank":
         data = b""
     else:
-        raise BadFrame(f"a block in the format {form!r}")
+        raise BadFrame(f"unsupported block format {form!r}")
     return Block(width, height, form, data, channel, layer)
 
 
-def _put_together(blocks: Sequence[Block], width: int, height: int) -> tuple[str, bytes]:
-    """Encoding and bytes; of three JPEGs, one a channel, the brightness alone, which is a picture by itself."""
+def _join_blocks(blocks: Sequence[Block], width: int, height: int) -> tuple[str, bytes]:
+    """Return encoding and bytes; of three JPEGs, one per channel, only the brightness, which is a picture by itself."""
     if blocks[0].form.startswith("JPEG"):
         return "jpeg", blocks[0].data
     if any(one.form.startswith("JPEG") for one in blocks):
-        raise BadFrame("bare channels and JPEGs in one picture")
-    planes = [_grown(one, width, height) for one in blocks]
+        raise BadFrame("raw channels and JPEGs in one picture")
+    planes = [_scale_up(one, width, height) for one in blocks]
     return ("yuv444" if len(planes) == 3 else "mono8"), b"".join(planes)
 
 
-def _grown(one: Block, width: int, height: int) -> bytes:
-    """The channel at full size: each pixel again as often as the full picture has more."""
+def _scale_up(one: Block, width: int, height: int) -> bytes:
+    """Scale a channel to full size by repeating pixels."""
     if one.form == "blank":
         return bytes([BLANK]) * (width * height)
     if (one.width, one.height) == (width, height):

@@ -1,6 +1,6 @@
-"""Sense: what the numbers of a world state mean: names, units and bounds of an ERS-7, and where it should be; pure.
+"""Names, units and bounds of the numbers in an ERS-7's world state, and its odometry; pure.
 
-Names are Tekkotsu's.  The signs of the accelerometers are as its headers say; nobody has checked them on a dog.
+Names are Tekkotsu's.  The signs of the accelerometers follow its headers; they are not verified on a real dog.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ JOINTS = (
     *("NECK:tilt", "NECK:pan", "NECK:nod", "TAIL:tilt", "TAIL:pan", "MOUTH"),
 )
 RANGES = {"near": (0.05, 0.5), "far": (0.2, 1.5), "chest": (0.1, 0.9)}
-"""The infrared rangers in the order of the packet, each with what it can measure in metres."""
+"""The infrared rangers in the order of the packet, each with its range in metres."""
 BUTTONS = ("LFrPaw", "RFrPaw", "LBkPaw", "RBkPaw", "chin", "head", "frontback", "middleback", "rearback", "wireless")
 PAN, TILT, NOD = (-1.536, 1.536), (-1.309, 0.0), (-0.262, 0.785)
 OUTPUTS = 47
 TAKEN_MM = 10_000.0
-"""Beyond this no infrared says anything that can be believed."""
+"""Largest plausible reading of an infrared ranger, in mm."""
 
 _SENSOR_BOUNDS = (
     *((-1.0, TAKEN_MM),) * 3,
@@ -33,19 +33,19 @@ _SENSOR_BOUNDS = (
 _CAPACITY_MAH = 2200.0
 WRAP_MS = 2**32
 LONGEST_MS = 1000
-"""After a longer gap nobody knows what the dog did in it."""
+"""Longest gap in ms that odometry bridges; after a longer one the movement is unknown."""
 
 
 def is_known(state: WorldState) -> bool:
-    """Whether it comes from a dog whose numbers have names here; old Tekkotsu does not name its model."""
+    """Return whether the sensors of this model are known; old versions of Tekkotsu do not send the model."""
     counts = (len(state.sensors), len(state.buttons), len(state.duties))
     return state.model in (MODEL, "") and counts == (len(_SENSOR_BOUNDS), len(BUTTONS), len(JOINTS))
 
 
 def values(state: WorldState) -> dict[str, Value]:
-    """What a dog feels under the keys of an observation; raises ``BadFrame`` where any of it cannot be.
+    """Return the sensor data under the keys of an observation; raise ``BadFrame`` if any value is out of bounds.
 
-    A range is NaN where the sensor sees as far as it can: then nothing is there.
+    A range is NaN if the sensor reads its maximum: nothing is in range.
     """
     joints = state.outputs[: len(JOINTS)]
     if len(joints) != len(JOINTS):
@@ -75,7 +75,7 @@ def values(state: WorldState) -> dict[str, Value]:
 
 
 def state(values: Mapping[str, Value], joints: Sequence[float], dialect: str, t: int, frame: int) -> WorldState:
-    """The packet of an ERS-7 that feels ``values`` and holds its joints so; what is missing is as at rest."""
+    """Return the world state of an ERS-7 with ``values`` and ``joints``; missing values are as at rest."""
 
     def number(key: str, default: float) -> float:
         return float(values.get(key, default))
@@ -96,42 +96,42 @@ def state(values: Mapping[str, Value], joints: Sequence[float], dialect: str, t:
 def _check(row: Sequence[float], bounds: Sequence[tuple[float, float]]) -> None:
     for value, (low, high) in zip(row, bounds, strict=True):
         if not low <= value <= high:  # NaN is in no bounds
-            raise BadFrame(f"{value} lies outside {low} to {high}")
+            raise BadFrame(f"{value} is not from {low} to {high}")
 
 
 class Odometry:
-    """Counts the robot's time on, past its wrap, and adds up the commanded velocity over it."""
+    """Extends the robot's time past its wrap, and integrates the commanded velocity over it."""
 
     def __init__(self) -> None:
         self.t = 0.0
-        self._place = [0.0, 0.0, 0.0]
+        self._pose = [0.0, 0.0, 0.0]
         self._newest: int | None = None
 
     def forget(self) -> None:
-        """The link was lost: the next time stamp follows on none."""
+        """Handle a lost link: the next time stamp starts a new interval."""
         self._newest = None
 
     def moment(self, t_ms: int) -> float:
-        """A time stamp near the newest one as seconds of ``t``."""
+        """Convert a time stamp near the newest one to seconds of ``t``."""
         if self._newest is None:
             return self.t
         return self.t + ((t_ms - self._newest + WRAP_MS // 2) % WRAP_MS - WRAP_MS // 2) / 1000.0
 
     def step(self, t_ms: int, vx: float, vy: float, wz: float) -> None:
-        """So the dog moved until ``t_ms``."""
-        gone = 0 if self._newest is None else (t_ms - self._newest) % WRAP_MS
+        """Add the movement up to ``t_ms`` at these velocities."""
+        elapsed = 0 if self._newest is None else (t_ms - self._newest) % WRAP_MS
         if self._newest is None and self.t == 0.0:
             self.t = t_ms / 1000.0
         self._newest = t_ms
-        if gone > LONGEST_MS:
+        if elapsed > LONGEST_MS:
             return
-        dt = gone / 1000.0
+        dt = elapsed / 1000.0
         self.t += dt
-        x, y, yaw = self._place
+        x, y, yaw = self._pose
         cos, sin = math.cos(yaw), math.sin(yaw)
-        self._place = [x + (vx * cos - vy * sin) * dt, y + (vx * sin + vy * cos) * dt, yaw + wz * dt]
+        self._pose = [x + (vx * cos - vy * sin) * dt, y + (vx * sin + vy * cos) * dt, yaw + wz * dt]
 
     def values(self) -> dict[str, Value]:
-        """The place under the keys of an observation."""
-        x, y, yaw = self._place
+        """Return the pose under the keys of an observation."""
+        x, y, yaw = self._pose
         return {"odom.x": x, "odom.y": y, "odom.yaw": math.remainder(yaw, math.tau)}

@@ -1,6 +1,7 @@
-"""Dialogue: commands matched to the lines that the robot answers with; it knows no link.
+"""Match commands to the lines of the robot's answers.
 
-The robot does commands in their order, so a command may leave before the one before it is answered: a stop never waits.
+The robot executes commands in order, so a command can be sent before the previous one is answered: a stop never
+waits.
 """
 
 from __future__ import annotations
@@ -16,87 +17,91 @@ from drivers.bittle.codec import is_end, unknown_of
 from drivers.errors import NoReply, RobotError, Unsupported
 
 OVERFLOW = "OVF"
-"""What the robot says of a command that is longer than it can take."""
+"""The robot's reply to a command that is too long."""
 MAX_LINES = 40
-"""No command has more lines for an answer; further ones are dropped."""
+"""Most lines stored of one answer; further ones are dropped."""
 
 
 @dataclass(eq=False)
-class _Question:
+class _PendingCommand:
     command: bytes
     token: str
-    answered: Deferred[list[str]] = field(default_factory=Deferred)
+    done: Deferred[list[str]] = field(default_factory=Deferred)
     lines: list[str] = field(default_factory=list)
     timer: Any = None
 
 
 class Dialogue:
-    """Asks with ``send``; each answer, or ``NoReply``, comes by the Deferred of its question."""
+    """Sends commands with ``send``; the Deferred of each command fires with its answer or fails with ``NoReply``."""
 
     def __init__(self, clock: IReactorTime, send: Callable[[bytes], None]) -> None:
         self._clock = clock
         self._send = send
-        self._open: list[_Question] = []
+        self._pending: list[_PendingCommand] = []
 
     def ask(self, command: bytes, patience: float) -> Deferred[list[str]]:
-        """Send ``command``; fires with the lines before its token, or fails with ``NoReply`` or ``Unsupported``."""
-        question = _Question(command, chr(command[0]))
-        question.timer = self._clock.callLater(patience, self._on_late, question)
-        self._open.append(question)
+        """Send ``command``; fires with the lines before its token, or fails with ``NoReply`` or ``Unsupported``.
+
+        ``patience`` is the longest wait in seconds.
+        """
+        pending = _PendingCommand(command, chr(command[0]))
+        pending.timer = self._clock.callLater(patience, self._on_late, pending)
+        self._pending.append(pending)
         self._send(command)
-        return question.answered
+        return pending.done
 
     def heard(self, line: str) -> None:
-        """Take one line from the robot."""
-        if not self._open:
+        """Process one line from the robot."""
+        if not self._pending:
             return
         if line == OVERFLOW:
-            self._fail(self._open[0], RobotError(f"the robot takes no command so long: {self._open[0].command!r}"))
+            first = self._pending[0]
+            self._fail(first, RobotError(f"the command is too long for the robot: {first.command!r}"))
             return
         name = unknown_of(line)
         if name is not None:
-            for question in self._open:
-                if question.command[1:].strip() == name.encode():
-                    self._fail(question, Unsupported(f"the robot knows no skill {name!r}"))
+            for pending in self._pending:
+                if pending.command[1:].strip() == name.encode():
+                    self._fail(pending, Unsupported(f"the robot knows no skill {name!r}"))
                     return
-        for place, question in enumerate(self._open):
-            # A skill is answered with its name first, which tells those apart whose token is the same.
-            if place and question.token == "k" and question.command[1:].strip() == line.encode():
-                self._pass(place)
+        for place, pending in enumerate(self._pending):
+            # The answer to a skill starts with its name, which distinguishes commands with the same token.
+            if place and pending.token == "k" and pending.command[1:].strip() == line.encode():
+                self._skip_to(place)
                 break
-        # Before the end of a rest, the robot says that its gyroscope is off, with the token of that.
-        is_aside = self._open[0].token == "d" and is_end(line, "g")
-        if not is_aside:
-            for place, question in enumerate(self._open):
-                if is_end(line, question.token):
-                    self._pass(place)
-                    if self._take(question):
-                        question.answered.callback(question.lines)
+        # Before the end of a rest, the robot reports that its gyroscope is off, with the gyroscope's token.
+        is_gyroscope_report = self._pending[0].token == "d" and is_end(line, "g")
+        if not is_gyroscope_report:
+            for place, pending in enumerate(self._pending):
+                if is_end(line, pending.token):
+                    self._skip_to(place)
+                    if self._remove(pending):
+                        pending.done.callback(pending.lines)
                     return
-        if self._open and len(self._open[0].lines) < MAX_LINES:
-            self._open[0].lines.append(line)
+        if self._pending and len(self._pending[0].lines) < MAX_LINES:
+            self._pending[0].lines.append(line)
 
     def end(self, error: Exception) -> None:
-        """Fail what has not been answered."""
-        for question in list(self._open):
-            self._fail(question, error)
+        """Fail all unanswered commands with ``error``."""
+        for pending in list(self._pending):
+            self._fail(pending, error)
 
-    def _pass(self, place: int) -> None:
-        for passed in self._open[:place]:
-            self._fail(passed, NoReply("the robot has gone on without an answer"))
+    def _skip_to(self, place: int) -> None:
+        for skipped in self._pending[:place]:
+            self._fail(skipped, NoReply("the robot answered a later command first"))
 
-    def _on_late(self, question: _Question) -> None:
-        self._fail(question, NoReply(f"no answer to {question.command!r}"))
+    def _on_late(self, pending: _PendingCommand) -> None:
+        self._fail(pending, NoReply(f"no answer to {pending.command!r}"))
 
-    def _fail(self, question: _Question, error: Exception) -> None:
-        if self._take(question):
-            question.answered.errback(error)
+    def _fail(self, pending: _PendingCommand, error: Exception) -> None:
+        if self._remove(pending):
+            pending.done.errback(error)
 
-    def _take(self, question: _Question) -> bool:
-        """Whether it was open still: who is told of one failure may end all others."""
-        if question not in self._open:
+    def _remove(self, pending: _PendingCommand) -> bool:
+        """Remove a pending command; return False if it was already removed by the errback of another one."""
+        if pending not in self._pending:
             return False
-        self._open.remove(question)
-        if question.timer.active():
-            question.timer.cancel()
+        self._pending.remove(pending)
+        if pending.timer.active():
+            pending.timer.cancel()
         return True

@@ -1,7 +1,8 @@
-"""BittleDriver: Petoi's robot dog on a cable or over Wi-Fi.
+"""Driver of Petoi's robot dog Bittle, on a cable or over Wi-Fi.
 
-A gait goes on until another skill is asked for: the robot has no time-out of its own.  So the driver ends each motion
-at its deadline, and a process beside it where this one stands still; a dog whose link is lost while it walks walks on.
+A gait continues until the next skill, because the robot has no time-out.  The driver therefore ends each motion at
+its deadline, and a dead man's switch does so if this process freezes.  A dog that loses its link while it walks
+keeps walking.
 """
 
 from __future__ import annotations
@@ -31,28 +32,28 @@ from drivers.serial import SerialConnector
 MANIFEST = Manifest("serial", "serial", "on a cable", {"port": "/dev/ttyUSB0"}, is_on_cable=True)
 
 GREET_S = 1.0
-"""A robot that has not told its version after so long is asked again: it may be booting."""
+"""Seconds to wait for the robot's version before asking again: it may be booting."""
 POLL_S, HTTP_POLL_S = 0.05, 0.2
 POLL_PATIENCE_S = 1.0
 GAIT_S = 1.0
-"""A gait that the robot has not taken after so long is asked for again."""
+"""Seconds after which an unanswered gait command is repeated."""
 REST_S = 2.0
-"""And so long to lie down."""
+"""Seconds after which an unanswered command to lie down is repeated."""
 SKILL_S = 15.0
-"""A behaviour is over after so long; the longest take about eight seconds."""
+"""Longest duration of a behaviour; the longest known ones take about eight seconds."""
 MISSES = 3
-"""After so many missing answers what the robot told before is no longer told; and when all fail, it is greeted anew."""
+"""Missing answers after which old values are dropped; if all polls fail, the driver greets the robot again."""
 SLOW_EVERY = 20
-"""The battery is asked for once in so many questions."""
+"""One poll in this many asks for the battery."""
 EMPTY_V, FULL_V = 6.8, 8.4
-"""Two lithium cells."""
+"""Voltages of two lithium cells."""
 
 
 class BittleDriver(LinkedDriver):
     """One dog.
 
-    ``enable`` has it stand, ``disable`` lie down with its servos off, as it does after ``connect``.  ``act`` returns
-    the velocity of the gait that comes nearest to what is wished for, and where the dog is, is reckoned from that.
+    ``enable`` makes it stand, ``disable`` makes it lie down with its servos off, its state after ``connect``.  ``act``
+    returns the velocity of the nearest gait, which odometry integrates.
     """
 
     SWITCH_S = 4.0
@@ -70,49 +71,49 @@ class BittleDriver(LinkedDriver):
         self.STALE_S = 2.0 if options.host else 1.0
         self._options = options
         self._gaits = dict(options.gaits)
-        self._moving = {codec.skill(name) for name, velocity in options.gaits if velocity != REST}
+        self._moving_commands = {codec.skill(name) for name, velocity in options.gaits if velocity != REST}
         self._dialogue = Dialogue(clock, self._send)
         self._board = ""
         self._greet_s = GREET_S
-        self._wish = ""
-        self._is_sure = True
-        self._walk = REST
-        self._walk_since = clock.seconds()
+        self._requested_gait = ""
+        self._is_gait_certain = True
+        self._velocity = REST
+        self._velocity_since = clock.seconds()
         self._pose = (0.0, 0.0, 0.0)
         self._is_lying = True
-        self._running = ""
-        self._turn = 0
-        self._missed: dict[str, int] = {}
+        self._running_skill = ""
+        self._poll_count = 0
+        self._missed_polls: dict[str, int] = {}
         self._values: dict[str, dict[str, Value]] = {}
 
     def invoke(self, name: str, **arguments: float | str) -> Deferred[Mapping[str, Value]]:
-        """A posture or behaviour by its name, until it is done; ``joint``: turn joints, by their names, to radians."""
+        """Run a posture or behaviour until it is done; ``joint`` turns joints, given by name, to angles in radians."""
         if name not in self._description.skills:
             return super().invoke(name, **arguments)
         if not self._is_up or self.state in ("stale", "closed"):
             return fail(LinkLost(f"{self._name} is {self.state}; connect first, or wait for the link"))
         if self._is_lying or self._wants_motors is not True:
             return fail(NotEnabled(f"{self._name}'s motors are off; call enable() first"))
-        if self._running:
-            return fail(NotEnabled(f"{self._name} is busy with {self._running}; wait until it is done"))
+        if self._running_skill:
+            return fail(NotEnabled(f"{self._name} is busy with {self._running_skill}; wait until it is done"))
         try:
             command = self._joint_command(arguments) if name == "joint" else codec.skill(name)
             if name != "joint" and arguments:
                 raise Unsupported(f"{name} takes no arguments")
         except Unsupported as error:
             return fail(error)
-        # The skill takes the place of any gait.
+        # The skill replaces any gait.
         self._rest()
-        self._reckon()
-        self._walk, self._wish, self._running = REST, "", name
-        # It answers nothing else meanwhile.
+        self._update_odometry()
+        self._velocity, self._requested_gait, self._running_skill = REST, "", name
+        # The robot answers no poll while the skill runs.
         self.STALE_S += SKILL_S
         return self._dialogue.ask(command, SKILL_S).addBoth(self._on_skill_done, name)
 
     def act(self, action: Action, permit: Permit) -> Action:
-        """As every driver does; ``NotEnabled`` while a skill runs: what comes then would be done after it."""
-        if self._running:
-            raise NotEnabled(f"{self._name} is busy with {self._running}; wait until it is done")
+        """As for every driver; raises ``NotEnabled`` while a skill runs, because the robot would act only after it."""
+        if self._running_skill:
+            raise NotEnabled(f"{self._name} is busy with {self._running_skill}; wait until it is done")
         return super().act(action, permit)
 
     # -- to the robot -----------------------------------------------------------------------------------------------
@@ -135,12 +136,12 @@ class BittleDriver(LinkedDriver):
 
     def _drive(self, motion: Action, permit: Permit) -> Action:
         name, velocity = chosen(motion.get("base.vx", 0.0), motion.get("base.wz", 0.0), self._gaits)
-        if name != self._wish or not self._is_sure:
+        if name != self._requested_gait or not self._is_gait_certain:
             self._ask_gait(name, velocity)
         return {key: getattr(velocity, key.removeprefix("base.")) for key in motion}
 
     def _halt(self) -> None:
-        # A dog whose servos are off would stand up.
+        # With its servos off the dog would stand up.
         if self._wants_motors is True:
             self._ask_gait(STAND, REST)
 
@@ -151,40 +152,40 @@ class BittleDriver(LinkedDriver):
         return LastWord(self._line.asked_of(halt), self._link, self._line.address)
 
     def _ask_gait(self, name: str, velocity: Velocity) -> None:
-        self._wish, self._is_sure = name, True
-        patience = GAIT_S + (SKILL_S if self._running else 0.0)
+        self._requested_gait, self._is_gait_certain = name, True
+        patience = GAIT_S + (SKILL_S if self._running_skill else 0.0)
         self._dialogue.ask(codec.skill(name), patience).addCallbacks(
             lambda _: self._on_gait(name, velocity), lambda failure: self._on_no_gait(name, velocity, failure)
         )
 
     def _on_gait(self, name: str, velocity: Velocity) -> None:
         self._is_lying = False
-        self._reckon()
-        self._walk = velocity
-        self._tell("base", {})
+        self._update_odometry()
+        self._velocity = velocity
+        self._publish("base", {})
 
     def _on_no_gait(self, name: str, velocity: Velocity, failure: Failure) -> None:
         if failure.check(Unsupported):
             self._counts["refused"] += 1
-            self.log.error("{robot}: {error}; take it out of gaits", robot=self._name, error=failure.value)
-        elif self._is_up and self._wish == name and not self._is_closed:
+            self.log.error("{robot}: {error}; remove it from the option gaits", robot=self._name, error=failure.value)
+        elif self._is_up and self._requested_gait == name and not self._is_closed:
             if velocity == REST or self._may_move:
                 self._ask_gait(name, velocity)
             else:
                 self.stop()
 
     def _lie_down(self) -> None:
-        self._wish = ""
+        self._requested_gait = ""
         self._dialogue.ask(codec.REST, REST_S).addCallbacks(self._on_lying, self._on_not_lying)
 
     def _on_lying(self, _lines: list[str]) -> None:
         self._is_lying = True
-        self._reckon()
-        self._walk = REST
-        self._tell("base", {})
+        self._update_odometry()
+        self._velocity = REST
+        self._publish("base", {})
 
     def _on_not_lying(self, _failure: Failure) -> None:
-        if self._is_up and not self._is_closed and not self._wish and not self._running:
+        if self._is_up and not self._is_closed and not self._requested_gait and not self._running_skill:
             self._lie_down()
 
     def _joint_command(self, arguments: Mapping[str, float | str]) -> bytes:
@@ -202,41 +203,40 @@ class BittleDriver(LinkedDriver):
         return codec.text("i", *wanted)
 
     def _on_skill_done(self, result: list[str] | Failure, name: str) -> Mapping[str, Value] | Failure:
-        self._running = ""
+        self._running_skill = ""
         self.STALE_S -= SKILL_S
         return result if isinstance(result, Failure) else {"skill.done": name}
 
     def _may_leave(self, command: bytes) -> bool:
-        """Whether a command that waited is wanted still."""
-        return self._may_move or command not in self._moving
+        return self._may_move or command not in self._moving_commands
 
     # -- from the robot ---------------------------------------------------------------------------------------------
 
     def link_up(self, link: Link) -> None:
-        """Greet; called by the line."""
+        """Ask for the version; called by the link."""
         self._link = link
         self._greet_s = GREET_S
         self._reader = codec.LineReader()
         self._greet()
 
     def link_down(self) -> None:
-        """Bring the motion to rest here; the dog goes on until it is told, if it can be; called by the line."""
+        """Reset the motion here; the dog continues until it is reachable again; called by the link."""
         self._link = None
-        self._lose(LinkLost(f"the link to {self._name} went away"))
+        self._on_lost(LinkLost(f"the link to {self._name} was lost"))
 
     def _heard(self, line: str) -> None:
         if codec.is_banner(line) and self._is_up:
-            self._lose(LinkLost(f"{self._name} was started anew"))
+            self._on_lost(LinkLost(f"{self._name} restarted"))
             self._greet()
         else:
             self._dialogue.heard(line)
 
-    def _lose(self, error: Exception) -> None:
+    def _on_lost(self, error: Exception) -> None:
         self._timer.cancel()
         is_up, self._is_up = self._is_up, False
-        self._wish = ""
-        self._reckon()
-        self._walk = REST
+        self._requested_gait = ""
+        self._update_odometry()
+        self._velocity = REST
         self._is_lying = True
         self._dialogue.end(error)
         if is_up or self._link is None:
@@ -247,42 +247,42 @@ class BittleDriver(LinkedDriver):
         self._dialogue.ask(codec.VERSION, self._greet_s).addCallbacks(self._on_greeted, self._on_no_greeting)
 
     def _on_greeted(self, lines: list[str]) -> None:
-        told = codec.board_of(lines)
-        self._board = self._options.board if self._options.board != "auto" else told or "biboard"
-        if told and told != self._board:
-            self._name_problem(f"this robot has a {told}, the option board says {self._board}; correct it")
+        board = codec.board_of(lines)
+        self._board = self._options.board if self._options.board != "auto" else board or "biboard"
+        if board and board != self._board:
+            self._name_problem(f"this robot has a {board}, the option board says {self._board}; correct the option")
         else:
             self._problem = ""
         self._values = {"mode": {"mode": self._board}}
-        self._missed = {}
-        # Nobody knows what it did before: it lies down, with its servos off, before it is told anything else.
+        self._missed_polls = {}
+        # Its state is unknown, so it lies down, with its servos off, before any other command.
         self._lie_down()
         self._up()
-        self._poll()
+        self._schedule_poll()
 
     def _on_no_greeting(self, failure: Failure) -> None:
         if self._link is None or self._is_closed:
             return
         self._name_problem(
-            f"it does not tell its version; is it switched on, and {self._options.baud} baud right?"
+            f"it does not report its version; is it switched on, and {self._options.baud} baud right?"
             if self._options.port
-            else "it does not tell its version; is it switched on, and its web server part of the firmware?"
+            else "it does not report its version; is it switched on, and its web server part of the firmware?"
         )
         self._greet_s = min(self._greet_s * 1.5, 5.0)
         if not failure.check(LinkLost):
             self._greet()
 
-    def _poll(self) -> None:
-        self._timer.set(HTTP_POLL_S if self._options.host else POLL_S, self._poll_next)
+    def _schedule_poll(self) -> None:
+        self._timer.set(HTTP_POLL_S if self._options.host else POLL_S, self._send_poll)
 
-    def _poll_next(self) -> None:
-        if self._running:
-            self._poll()
+    def _send_poll(self) -> None:
+        if self._running_skill:
+            self._schedule_poll()
             return
         polls = self._polls()
-        self._turn += 1
-        is_slow = self._turn % SLOW_EVERY == 0 and self._board != "nyboard"
-        key = "power" if is_slow else list(polls)[self._turn % len(polls)]
+        self._poll_count += 1
+        is_slow = self._poll_count % SLOW_EVERY == 0 and self._board != "nyboard"
+        key = "power" if is_slow else list(polls)[self._poll_count % len(polls)]
         command, read = (codec.VOLTAGE, _power) if is_slow else polls[key]
         answered = self._dialogue.ask(command, POLL_PATIENCE_S)
         answered.addCallback(self._on_answer, key, read).addErrback(self._on_no_answer, key)
@@ -297,55 +297,55 @@ class BittleDriver(LinkedDriver):
         return polls
 
     def _on_answer(self, lines: list[str], key: str, read: Callable[[list[str]], dict[str, Value]]) -> None:
-        self._missed[key] = 0
+        self._missed_polls[key] = 0
         try:
             values = read(lines)
         except BadFrame:
             self._counts["bad_frames"] += 1
         else:
             self._counts["frames"] += 1
-            self._tell(key, values)
+            self._publish(key, values)
         if self._is_up and not self._is_closed:
-            self._poll()
+            self._schedule_poll()
 
     def _on_no_answer(self, failure: Failure, key: str) -> None:
         failure.trap(DriverError)
         if not self._is_up or self._is_closed:
             return
-        self._missed[key] = self._missed.get(key, 0) + 1
-        # It may have started anew meanwhile, and lie: the next action tells it its gait again.
-        self._is_sure = False
-        if self._missed[key] >= MISSES:
+        self._missed_polls[key] = self._missed_polls.get(key, 0) + 1
+        # It may have restarted and lie down: the next action sends its gait again.
+        self._is_gait_certain = False
+        if self._missed_polls[key] >= MISSES:
             self._values.pop(key, None)
         polls = self._polls()
-        if all(self._missed.get(one, 0) >= MISSES for one in polls):
-            self._name_problem("it answers nothing; is it switched on, and in reach?")
-            self._lose(LinkLost(f"{self._name} fell silent"))
+        if all(self._missed_polls.get(one, 0) >= MISSES for one in polls):
+            self._name_problem("it answers nothing; is it switched on, and in range?")
+            self._on_lost(LinkLost(f"{self._name} does not answer"))
             self._greet()
         else:
-            self._poll()
+            self._schedule_poll()
 
-    def _tell(self, key: str, values: dict[str, Value]) -> None:
+    def _publish(self, key: str, values: dict[str, Value]) -> None:
         self._values[key] = values
-        self._reckon()
+        self._update_odometry()
         x, y, yaw = self._pose
-        vx, wz = self._walk
-        told: dict[str, Value] = {"odom.x": x, "odom.y": y, "odom.yaw": yaw, ENGAGED: self._is_lying}
-        told |= {"base.vx": vx, "base.vy": 0.0, "base.wz": wz, "base.moving": self._walk != REST}
-        told["skill.running"] = self._running or (self._wish if self._walk != REST else "")
+        vx, wz = self._velocity
+        observed: dict[str, Value] = {"odom.x": x, "odom.y": y, "odom.yaw": yaw, ENGAGED: self._is_lying}
+        observed |= {"base.vx": vx, "base.vy": 0.0, "base.wz": wz, "base.moving": self._velocity != REST}
+        observed["skill.running"] = self._running_skill or (self._requested_gait if self._velocity != REST else "")
         for group in self._values.values():
-            told |= group
-        # The robot has no clock that it tells.
-        self._observed(told, self._clock.seconds())
+            observed |= group
+        # The robot sends no time.
+        self._observed(observed, self._clock.seconds())
 
-    def _reckon(self) -> None:
+    def _update_odometry(self) -> None:
         now = self._clock.seconds()
-        span, self._walk_since = now - self._walk_since, now
+        span, self._velocity_since = now - self._velocity_since, now
         x, y, yaw = self._pose
-        middle = yaw + self._walk.wz * span / 2.0
-        x += self._walk.vx * span * math.cos(middle)
-        y += self._walk.vx * span * math.sin(middle)
-        self._pose = (x, y, math.remainder(yaw + self._walk.wz * span, math.tau))
+        middle = yaw + self._velocity.wz * span / 2.0
+        x += self._velocity.vx * span * math.cos(middle)
+        y += self._velocity.vx * span * math.sin(middle)
+        self._pose = (x, y, math.remainder(yaw + self._velocity.wz * span, math.tau))
 
 
 def _imu(lines: list[str]) -> dict[str, Value]:
@@ -373,7 +373,7 @@ def _power(lines: list[str]) -> dict[str, Value]:
 def make_driver(
     options: Mapping[str, object], name: str, clock: IReactorTime, connector: Connector | None
 ) -> BittleDriver:
-    """A driver of the dog at the serial device or the address that ``options`` name."""
+    """Return a driver of the dog at the serial device or the address in ``options``."""
     checked_options = checked(options)
     dead_man = kept(name) if connector is None else None
     if checked_options.host:
@@ -383,5 +383,5 @@ def make_driver(
 
 
 def describe(options: Mapping[str, object], name: str) -> Description:
-    """What that dog is."""
+    """Return the description of that dog."""
     return described(checked(options))

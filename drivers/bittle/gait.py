@@ -1,4 +1,4 @@
-"""Gait: the few velocities that a Bittle has; which of them is nearest to one that is wished for."""
+"""The few velocities that a Bittle has, and the choice of the one nearest to a requested velocity."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from typing import NamedTuple
 
 STAND = "up"
 LEAST_SPEED, LEAST_TURN = 0.02, 0.1
-"""Whoever wishes for less, in m/s and rad/s, wishes to stand."""
+"""Requested speeds below these, in m/s and rad/s, mean standing."""
 
 
 class Velocity(NamedTuple):
-    """Metres a second ahead, radians a second to the left."""
+    """Forward speed in m/s and turn rate to the left in rad/s."""
 
     vx: float
     wz: float
@@ -28,17 +28,18 @@ GAITS: Mapping[str, Velocity] = {
     "vtL": Velocity(0.0, 0.5),
     "vtR": Velocity(0.0, -0.5),
 }
-"""Skill to what it does on a smooth floor, roughly; each robot's own are measured, and written into its options."""
+"""Approximate velocity of each skill on a smooth floor; measured values of a robot go into its options."""
 
 
 def chosen(vx: float, wz: float, gaits: Mapping[str, Velocity]) -> tuple[str, Velocity]:
-    """The skill that comes nearest, and what it does.
+    """Return the skill nearest to the requested velocity, and its real velocity.
 
-    A robot that shall move does move, however slowly it shall; but none goes where it shall not: to stand is better.
+    A slow request still selects a moving gait.  A gait that moves in an unrequested direction is never selected;
+    if no other fits, the robot stands.
     """
     vx = 0.0 if abs(vx) < LEAST_SPEED else vx
     wz = 0.0 if abs(wz) < LEAST_TURN else wz
-    fitting = {name: one for name, one in gaits.items() if one != REST and _agree(one.vx, vx) and _agree(one.wz, wz)}
+    fitting = {name: one for name, one in gaits.items() if one != REST and _fits(one.vx, vx) and _fits(one.wz, wz)}
     if not fitting:
         return STAND, REST
     speed = max(abs(one.vx) for one in gaits.values()) or 1.0
@@ -47,5 +48,5 @@ def chosen(vx: float, wz: float, gaits: Mapping[str, Velocity]) -> tuple[str, Ve
     return name, gaits[name]
 
 
-def _agree(real: float, wished: float) -> bool:
-    return real == 0.0 or real * wished > 0.0
+def _fits(real: float, requested: float) -> bool:
+    return real == 0.0 or real * requested > 0.0

@@ -1,4 +1,4 @@
-"""Link: commands and lines over the robot's web server, so that its driver sees what it would see on a cable."""
+"""Links over the robot's web server, which behave towards the driver like a serial link."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from drivers.link import Caller, Connector, Line, Link
 from drivers.timer import Timer
 
 ANSWER_S = 3.0
-"""A request without a response after so long has failed."""
+"""Seconds after which an unanswered request has failed."""
 STATUS_S = 0.05
-"""A BiBoard is asked so often whether a task is done, for at most ``TASK_S``."""
+"""Interval at which a BiBoard's task is polled, for at most ``TASK_S``."""
 TASK_S = 16.0
 MISSES = 3
-"""After so many failures, one after another, the link counts as lost."""
+"""Consecutive failures after which the link counts as lost."""
 RETRY_S = 1.0
 MAX_WAITING = 8
 
 
 class HttpConnector:
-    """Opens links to robots with a ``biboard`` or ``nyboard``, a connection for each request by ``connector``."""
+    """Opens links to robots with a ``biboard`` or ``nyboard``; ``connector`` opens a connection for each request."""
 
     def __init__(self, connector: Connector, clock: IReactorTime, board: str) -> None:
         self._connector = connector
@@ -34,14 +34,14 @@ class HttpConnector:
         self._board = board
 
     def call(self, host: str, port: int, caller: Caller) -> Line:
-        """Keep ``caller`` connected to the robot at this address until the line hangs up."""
+        """Keep ``caller`` connected to the robot at this address until ``hang_up``."""
         return HttpLine(self._connector, self._clock, self._board, host, port, caller)
 
 
 class HttpLine:
-    """A line, and its one link; ``problem`` says why the robot cannot be reached.
+    """A persistent connection and its one link; ``problem`` says why the robot cannot be reached.
 
-    ``may_leave`` is asked when a command that waited can leave: what is no longer wanted then never does.
+    ``may_leave`` is called when a queued command can be sent; if it returns False, the command is dropped.
     """
 
     log = Logger()
@@ -58,86 +58,86 @@ class HttpLine:
         self._port = port
         self._peer: tuple[str, int] | None = None
         self._caller = caller
-        self._waiting: deque[bytes] = deque()
+        self._queue: deque[bytes] = deque()
         self._request: _Request | None = None
         self._is_up = False
         self._is_wanted = True
         self._misses = 0
-        self._gone: Deferred[None] | None = None
+        self._closed: Deferred[None] | None = None
         self._timer = Timer(clock)
-        self._timer.set(0.0, self._rise)
+        self._timer.set(0.0, self._open)
 
-    # -- the line ---------------------------------------------------------------------------------------------------
+    # -- Line -------------------------------------------------------------------------------------------------------
 
     def hang_up(self) -> Deferred[None]:
-        """Ask no more, but for what was sent last: that is what makes the robot lie down; fires when it was asked."""
+        """Send only the last queued command, which makes the robot lie down; fires when its request has ended."""
         self._is_wanted = False
         if self._is_up:
             self._is_up = False
             self._caller.link_down()
-        last = self._waiting.pop() if self._waiting else None
-        self._waiting.clear()
+        last = self._queue.pop() if self._queue else None
+        self._queue.clear()
         self._timer.cancel()
         if last is not None:
             self._drop()
             self._request = _Request(self, codec.command_path(self._board, last), lambda _: None)
         if self._request is None:
             return succeed(None)
-        self._gone = self._gone or Deferred()
-        return self._gone
+        self._closed = self._closed or Deferred()
+        return self._closed
 
     @property
     def address(self) -> tuple[str, int]:
-        """Where the robot is; as numbers, once it has taken a connection over a real network."""
+        """The address of the robot; numeric after its first connection over a real network."""
         return self._peer or (self._host, self._port)
 
-    # -- the link ---------------------------------------------------------------------------------------------------
+    # -- Link -------------------------------------------------------------------------------------------------------
 
     @property
     def is_busy(self) -> bool:
-        """Whether commands wait for those before them."""
-        return bool(self._waiting)
+        """Whether commands are queued."""
+        return bool(self._queue)
 
     def send(self, data: bytes) -> None:
         """Send one command; does nothing on a closed link."""
         if not self._is_up:
             return
-        if len(self._waiting) >= MAX_WAITING:
-            self._waiting.popleft()
-        self._waiting.append(data)
+        if len(self._queue) >= MAX_WAITING:
+            self._queue.popleft()
+        self._queue.append(data)
         if self._request is None and not self._timer.is_set:
-            self._next()
+            self._send_next()
 
     def close(self) -> None:
         """Close now."""
-        self._fall("closed")
+        self._lose("closed")
 
-    def _rise(self) -> None:
+    def _open(self) -> None:
         self._is_up = True
         self._misses = 0
         link: Link = self
         self._caller.link_up(link)
 
-    def _fall(self, problem: str) -> None:
+    def _lose(self, problem: str) -> None:
         if not self._is_up:
             return
         if problem != self.problem:
             self.log.warn("{host}: {problem}", host=self._host, problem=problem)
         self.problem = problem
         self._is_up = False
-        self._waiting.clear()
+        self._queue.clear()
         self._drop()
         self._timer.cancel()
         self._caller.link_down()
         if self._is_wanted:
-            self._timer.set(RETRY_S, self._rise)
+            self._timer.set(RETRY_S, self._open)
 
-    def _next(self) -> None:
-        while self._waiting and not self.may_leave(self._waiting[0]):
-            self._waiting.popleft()
-        if not self._waiting or not self._is_up:
+    def _send_next(self) -> None:
+        while self._queue and not self.may_leave(self._queue[0]):
+            self._queue.popleft()
+        if not self._queue or not self._is_up:
             return
-        command = self._waiting.popleft()
+        command = self._queue.popleft()
         path = codec.command_path(self._board, command)
         if self._board == "nyboard":
             end = self.clock.seconds() + TASK_S
@@ -148,15 +148,15 @@ class HttpLine:
     def _on_text(self, body: bytes, command: bytes, end: float) -> None:
         if not self._is_wanted:
             return
-        # What the robot says after the dongle has answered waits there for the next request, if only for nothing.
+        # Output that follows the dongle's response stays in the dongle until the next request, even an empty one.
         is_done = _has_end(body, command)
-        if not is_done and self.clock.seconds() < end and not self._waiting:
-            self._timer.set(STATUS_S, self._ask_rest, command, end)
-        self._answer(body + b"\n")
+        if not is_done and self.clock.seconds() < end and not self._queue:
+            self._timer.set(STATUS_S, self._request_more, command, end)
+        self._deliver(body + b"\n")
 
-    def _ask_rest(self, command: bytes, end: float) -> None:
-        if self._waiting:
-            self._next()
+    def _request_more(self, command: bytes, end: float) -> None:
+        if self._queue:
+            self._send_next()
         else:
             path = codec.command_path(self._board, b"")
             self._request = _Request(self, path, lambda body: self._on_text(body, command, end))
@@ -176,34 +176,34 @@ class HttpLine:
             self._timer.set(STATUS_S, self._ask_status, task, command, end)
             return
         lines = (result or b"") + b"\n"
-        # That the task is done is what the token says on a cable.
+        # On a cable the token ends the answer; here the status of the task does.
         if result is not None and not _has_end(lines, command):
             lines += command[:1] + b"\n"
-        self._answer(lines)
+        self._deliver(lines)
 
-    def _answer(self, lines: bytes) -> None:
+    def _deliver(self, lines: bytes) -> None:
         self._misses = 0
         self.problem = ""
         self._caller.received(lines)
         if self._request is None and not self._timer.is_set:
-            self._next()
+            self._send_next()
 
     def failed(self, problem: str) -> None:
-        """Learn from a request that it came to nothing."""
+        """Handle a failed request."""
         self._end_request()
         self._misses += 1
         if self._misses >= MISSES:
-            self._fall(problem)
+            self._lose(problem)
         else:
-            self._next()
+            self._send_next()
 
     def passed_over(self) -> None:
-        """Learn from a request that its command was no longer wanted when it could leave."""
+        """Handle a request with a command that ``may_leave`` dropped."""
         self._end_request()
-        self._next()
+        self._send_next()
 
     def fetched(self, body: bytes, take: Callable[[bytes], None]) -> None:
-        """Learn from a request what it brought."""
+        """Handle the body of a request's response."""
         self._end_request()
         try:
             take(body)
@@ -215,22 +215,22 @@ class HttpLine:
         return self._connector.call(self._host, self._port, request)
 
     def met(self, link: Link) -> None:
-        """Learn from a request who has taken its connection."""
+        """Store the peer's address of a request's connection."""
         self._peer = getattr(link, "peer", None) or self._peer
 
     def asked_of(self, command: bytes) -> bytes:
-        """The bytes of a request that has the robot do ``command``."""
+        """Return the bytes of the request that makes the robot perform ``command``."""
         return self.asked(codec.command_path(self._board, command))
 
     def asked(self, path: str) -> bytes:
-        """The bytes of a request for ``path``."""
+        """Return the bytes of a request for ``path``."""
         return codec.request(self._host, path)
 
     def _end_request(self) -> None:
         self._request = None
-        gone, self._gone = self._gone, None
-        if gone is not None:
-            gone.callback(None)
+        closed, self._closed = self._closed, None
+        if closed is not None:
+            closed.callback(None)
 
     def _drop(self) -> None:
         request, self._request = self._request, None
@@ -243,12 +243,12 @@ def _has_end(lines: bytes, command: bytes) -> bool:
 
 
 class _Request:
-    """One request over a connection of its own; ``command`` is what it has the robot do, if anything."""
+    """One request over its own connection; ``command`` is the command that it carries, if any."""
 
     def __init__(self, line: HttpLine, path: str, take: Callable[[bytes], None], command: bytes = b"") -> None:
         self._line = line
         self._path = path
-        self._take = take
+        self._on_body = take
         self._command = command
         self._reader = codec.ResponseReader()
         self._is_over = self._is_sent = False
@@ -258,7 +258,7 @@ class _Request:
 
     def link_up(self, link: Link) -> None:
         if self._is_sent:
-            # A second connection, where the first was lost: the robot may have done it already.
+            # The first connection was lost, and the robot may already have performed the command.
             self._fail("the robot closes without an answer; is its web server part of the firmware?")
             return
         if self._command and not self._line.may_leave(self._command):
@@ -291,7 +291,6 @@ class _Request:
         self._finish(body)
 
     def drop(self) -> None:
-        """Forget it."""
         self._is_over = True
         self._timer.cancel()
         self._call.hang_up()
@@ -301,7 +300,7 @@ class _Request:
 
     def _finish(self, body: bytes) -> None:
         self.drop()
-        self._line.fetched(body, self._take)
+        self._line.fetched(body, self._on_body)
 
     def _fail(self, problem: str) -> None:
         if not self._is_over:

@@ -1,4 +1,4 @@
-"""Options of the kind "bittle": read from a free table and checked, each fault with its remedy."""
+"""Options of the kind "bittle"; each error names the remedy."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ JOINT_NAMES = {
     14: "rb_knee",
     15: "lb_knee",
 }
-"""The joints that a Bittle has, by the number that the firmware gives them."""
+"""The joints of a Bittle, by their number in the firmware."""
 JOINT_LIMITS = {
     "head_pan": (-120, 120),
     **dict.fromkeys(("lf_shoulder", "rf_shoulder"), (-200, 80)),
@@ -75,19 +75,17 @@ class Options:
 
 
 def checked(table: Mapping[str, object]) -> Options:
-    """The options in ``table``; raises ``UsageError`` that names the key and what to write instead."""
+    """Convert and check ``table``; raise ``UsageError`` that names the key and the remedy."""
     options = convert_options("bittle", table, Options)
     if bool(options.port) == bool(options.host):
-        raise UsageError(
-            'driver "bittle": one of the options port = "/dev/ttyUSB0" and host = "192.168.1.40" is needed'
-        )
+        raise UsageError('driver "bittle": write one of the options port = "/dev/ttyUSB0" and host = "192.168.1.40"')
     if options.host and options.board == "auto":
-        raise fault_of("bittle", "board", "is auto, which a robot at a host cannot be", 'write "biboard" or "nyboard"')
+        raise fault_of("bittle", "board", "is auto, which is not possible with host", 'write "biboard" or "nyboard"')
     return options
 
 
 def described(options: Options) -> Description:
-    """What a Bittle is, known without a connection."""
+    """Return the description of a Bittle."""
     speeds = [one.vx for _, one in options.gaits] + [0.0]
     turns = [one.wz for _, one in options.gaits] + [0.0]
     limits = {"base.vx": (min(speeds), max(speeds)), "base.wz": (min(turns), max(turns))}

@@ -1,1 +1,1 @@
-"""A camera of this machine, or pictures in its place: a device that sees and cannot move."""
+"""A camera of this machine or a substitute source of pictures: a device that sees and cannot move."""

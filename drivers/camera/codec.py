@@ -1,8 +1,8 @@
-"""Codec of cameras that serve pictures over HTTP: ``multipart/x-mixed-replace``, one part a picture (MJPEG).
+"""Codec of cameras that serve MJPEG over HTTP: ``multipart/x-mixed-replace``, one part per picture.
 
-There is no standard beside RFC 2046; this takes what is met: a boundary with its dashes or without, parts with a
-``Content-Length`` or ended by the next boundary alone, lines ended by CR LF or LF, and chunks around it all (as an
-ESP32-CAM sends).  Bytes may come cut anywhere.
+No standard exists apart from RFC 2046; this accepts the variants in use: a boundary with or without its dashes, parts
+with a ``Content-Length`` or ended by the next boundary only, lines ended by CR LF or LF, and chunked encoding (as an
+ESP32-CAM sends).
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from collections.abc import Callable, Mapping
 from drivers.errors import BadFrame
 
 MOST_BYTES = 1024 * 1024
-"""Of a picture."""
+"""Largest picture in bytes."""
 MOST_HEAD = 8192
-"""Bytes of the fields before the stream, or before one picture."""
-TOO_LARGE = f"a picture has more than {MOST_BYTES} bytes; have it send smaller ones"
+"""Largest header in bytes, of the stream or of one picture."""
+TOO_LARGE = f"a picture has more than {MOST_BYTES} bytes; set a smaller size in the camera"
 KIND = "multipart/x-mixed-replace"
 BOUNDARY = "frame"
 
@@ -24,12 +24,12 @@ _REMEDIES = {
     401: 'it asks for a name and password: write url = "http://NAME:PASSWORD@..."',
     403: 'it asks for a name and password: write url = "http://NAME:PASSWORD@..."',
     404: "correct the path of url",
-    503: "it serves others already; end those",
+    503: "it already serves other clients; close them",
 }
 
 
 def request(host: str, path: str, login: str = "") -> bytes:
-    """What asks ``host`` for the stream at ``path``; ``login`` is ``NAME:PASSWORD``, or empty."""
+    """Return the request to ``host`` for the stream at ``path``; ``login`` is ``NAME:PASSWORD``, or empty."""
     lines = [f"GET {path} HTTP/1.1", f"Host: {host}", f"Accept: {KIND}", "Connection: close"]
     if login:
         lines.append("Authorization: Basic " + base64.b64encode(login.encode()).decode())
@@ -37,30 +37,30 @@ def request(host: str, path: str, login: str = "") -> bytes:
 
 
 class StreamReader:
-    """The pictures in the answer to one request; not looked into, so that one may be none.
+    """Extracts the pictures from the answer to one request; their content is not checked.
 
-    ``read`` raises ``BadFrame`` with the reason and the remedy where the answer is no stream of pictures, or cannot be
-    followed any more; nothing may be read after that.  ``is_over`` says whether the stream has come to its own end.
+    ``read`` raises ``BadFrame`` with reason and remedy if the answer is not a stream of pictures or becomes invalid;
+    after that the reader cannot be used.  ``is_over`` is true after the regular end of the stream.
     """
 
     def __init__(self) -> None:
         self.is_over = False
         self._rest = bytearray()
-        self._found: list[bytes] = []
-        self._step: Callable[[], bool] = self._read_head
+        self._pictures: list[bytes] = []
+        self._parse_step: Callable[[], bool] = self._read_head
         self._chunks: _Chunks | None = None
         self._delimiter = b""
         self._length = 0
         self._fields = 0
-        self._searched = 0
+        self._search_start = 0
 
     def read(self, data: bytes) -> list[bytes]:
-        """The pictures that ``data`` completes."""
+        """Return the pictures that ``data`` completes."""
         self._rest += data if self._chunks is None else self._chunks.read(data)
-        while not self.is_over and self._step():
+        while not self.is_over and self._parse_step():
             pass
         self.is_over = self.is_over or (self._chunks is not None and self._chunks.is_over)
-        found, self._found = self._found, []
+        found, self._pictures = self._pictures, []
         return found
 
     def _read_head(self) -> bool:
@@ -78,11 +78,11 @@ class StreamReader:
             self._chunks = _Chunks()
             rest = self._chunks.read(rest)
         self._rest[:] = rest
-        self._step = self._seek
+        self._parse_step = self._skip_boundary
         return True
 
-    def _seek(self) -> bool:
-        """Throw away what stands before the next boundary, and that."""
+    def _skip_boundary(self) -> bool:
+        """Discard data up to and including the next boundary."""
         at = self._rest.find(self._delimiter)
         if at < 0:
             del self._rest[: max(0, len(self._rest) - len(self._delimiter) + 1)]
@@ -99,7 +99,7 @@ class StreamReader:
         del self._rest[: end + 1 if is_one else after]
         if is_one:
             self._length = self._fields = 0
-            self._step = self._read_fields
+            self._parse_step = self._read_fields
         return True
 
     def _read_fields(self) -> bool:
@@ -113,43 +113,43 @@ class StreamReader:
         self._fields += end + 1
         name, _, value = line.partition(b":")
         if name.strip().lower() == b"content-length" and value.strip().isdigit():
-            # Of more digits the value does not matter: it is too many in any case.
+            # Twelve digits are enough to exceed the limit.
             self._length = int(value.strip()[:12])
             if self._length > MOST_BYTES:
                 raise BadFrame(TOO_LARGE)
         if not line:
-            self._searched = 0
-            self._step = self._read_sized if self._length else self._read_open
+            self._search_start = 0
+            self._parse_step = self._read_sized if self._length else self._read_open
         return True
 
     def _read_sized(self) -> bool:
         if len(self._rest) < self._length:
             return False
-        self._found.append(bytes(self._rest[: self._length]))
+        self._pictures.append(bytes(self._rest[: self._length]))
         del self._rest[: self._length]
-        self._step = self._seek
+        self._parse_step = self._skip_boundary
         return True
 
     def _read_open(self) -> bool:
-        at = self._rest.find(self._delimiter, self._searched)
+        at = self._rest.find(self._delimiter, self._search_start)
         if at < 0:
-            # What may still turn out to be the line's end and the boundary does not count.
+            # The last bytes may be a line end and the start of the boundary; they do not count.
             if len(self._rest) - len(self._delimiter) - 4 > MOST_BYTES:
                 raise BadFrame(TOO_LARGE)
-            self._searched = max(0, len(self._rest) - len(self._delimiter) + 1)
+            self._search_start = max(0, len(self._rest) - len(self._delimiter) + 1)
             return False
-        # A line's end stands before the boundary, and the boundary may have more dashes than it was told with.
+        # A line end precedes the boundary, and the boundary may have more dashes than announced.
         picture = bytes(self._rest[:at]).rstrip(b"-").removesuffix(b"\n").removesuffix(b"\r")
         if len(picture) > MOST_BYTES:
             raise BadFrame(TOO_LARGE)
-        self._found.append(picture)
+        self._pictures.append(picture)
         del self._rest[:at]
-        self._step = self._seek
+        self._parse_step = self._skip_boundary
         return True
 
 
 class _Chunks:
-    """What is inside of chunks, which may be cut anywhere themselves."""
+    """Decodes chunked transfer encoding."""
 
     def __init__(self) -> None:
         self.is_over = False
@@ -157,7 +157,6 @@ class _Chunks:
         self._left = 0
 
     def read(self, data: bytes) -> bytes:
-        """What ``data`` brings."""
         data, self._rest = self._rest + data, b""
         found = bytearray()
         while data and not self.is_over:
@@ -166,7 +165,7 @@ class _Chunks:
                 took = min(self._left, len(data))
                 data, self._left = data[took:], self._left - took
                 continue
-            # The end of the chunk before stands in front of the size of the next.
+            # The line end of the previous chunk precedes the size of the next.
             line, end, after = data.removeprefix(b"\r").removeprefix(b"\n").partition(b"\n")
             if not end:
                 if len(data) > 100:
@@ -175,7 +174,7 @@ class _Chunks:
                 break
             size = line.partition(b";")[0].strip()
             if not 0 < len(size) <= 8 or size.strip(b"0123456789abcdefABCDEF"):
-                raise BadFrame(f"a chunk has the size {_shown(size)}; is it a camera?")
+                raise BadFrame(f"a chunk has the size {_printable(size)}; is it a camera?")
             self._left = int(size, 16)
             self.is_over = self._left == 0
             data = after
@@ -183,7 +182,7 @@ class _Chunks:
 
 
 def answer(kind: str = f"{KIND}; boundary={BOUNDARY}", status: str = "200 OK", is_chunked: bool = False) -> bytes:
-    """The head of a camera's answer."""
+    """Return the header of a camera's answer."""
     lines = [f"HTTP/1.1 {status}", f"Content-Type: {kind}", "Cache-Control: no-store", "Connection: close"]
     if is_chunked:
         lines.append("Transfer-Encoding: chunked")
@@ -191,23 +190,23 @@ def answer(kind: str = f"{KIND}; boundary={BOUNDARY}", status: str = "200 OK", i
 
 
 def part(jpeg: bytes, has_length: bool = True) -> bytes:
-    """One picture, behind its boundary."""
+    """Return one picture with its boundary."""
     length = f"Content-Length: {len(jpeg)}\r\n" if has_length else ""
     return f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\n{length}\r\n".encode() + jpeg + b"\r\n"
 
 
 def chunk(data: bytes) -> bytes:
-    """``data`` as one chunk."""
+    """Return ``data`` as one chunk."""
     return b"%x\r\n%b\r\n" % (len(data), data)
 
 
 def method_of(data: bytes) -> str | None:
-    """What the whole request ``data`` wants (``GET``); None while it is not whole."""
+    """Return the method of the request ``data``; None while the request is incomplete."""
     return None if _blank_line(data) < 0 else data.split(b" ", 1)[0].decode("latin-1")
 
 
 def _blank_line(data: bytes | bytearray) -> int:
-    """Where what follows the first blank line begins; -1 without one."""
+    """Return the offset after the first blank line; -1 without one."""
     ends = [at + len(end) for end in (b"\r\n\r\n", b"\n\n") if (at := data.find(end)) >= 0]
     return min(ends, default=-1)
 
@@ -220,32 +219,32 @@ def _fields(lines: list[str]) -> dict[str, str]:
 def _check_status(line: str, fields: Mapping[str, str]) -> None:
     words = line.split(None, 2)
     if len(words) < 2 or not words[0].startswith("HTTP/") or not (words[1].isdecimal() and len(words[1]) == 3):
-        raise BadFrame(f"it does not speak HTTP, it says {_shown(line)}; correct the port of url")
+        raise BadFrame(f"it does not speak HTTP, it sends {_printable(line)}; correct the port of url")
     status = int(words[1])
     if status == 200:
         return
     elsewhere = fields.get("location", "")
-    remedy = f"write url = {_shown(elsewhere)}" if elsewhere else _REMEDIES.get(status, "look at it in a browser")
-    raise BadFrame(f"it answers {_shown(' '.join(words[1:]))}; {remedy}")
+    remedy = f"write url = {_printable(elsewhere)}" if elsewhere else _REMEDIES.get(status, "look at it in a browser")
+    raise BadFrame(f"it answers {_printable(' '.join(words[1:]))}; {remedy}")
 
 
 def _delimiter(kind: str) -> bytes:
     name, *parameters = kind.split(";")
     if name.strip().lower() != KIND:
         raise BadFrame(
-            f"it sends {_shown(name) or 'nothing that is named'}, and no stream ({KIND}); correct the path of url"
+            f"it sends {_printable(name) or 'no content type'} instead of a stream ({KIND}); correct the path of url"
         )
     for parameter in parameters:
         key, _, value = parameter.partition("=")
         if key.strip().lower() == "boundary":
-            # Some name the boundary with its dashes, though RFC 2046 has them added.
+            # Some cameras include the dashes in the boundary, contrary to RFC 2046.
             boundary = value.strip().strip('"').lstrip("-").strip()
             if 0 < len(boundary) <= 70:
                 return b"--" + boundary.encode("latin-1")
     raise BadFrame("its stream names no boundary; is it a camera?")
 
 
-def _shown(text: str | bytes) -> str:
-    """What came over the wire as a log may show it."""
+def _printable(text: str | bytes) -> str:
+    """Return received text without control characters, for the log."""
     plain = text.decode("latin-1") if isinstance(text, bytes) else text
     return "".join(char if " " <= char <= "~" else "?" for char in plain.strip()[:60])

@@ -1,4 +1,4 @@
-"""Options of the kind "camera": which camera, or which pictures in its place; checked."""
+"""Options of the kind "camera": a camera, or a substitute source of pictures."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from drivers.reading import Description
 from formats.convert import LINE, Unit
 
 LEAST_SIDE, MOST_SIDE = 16, 1920
-"""Pixels of a side of a picture."""
+"""Smallest and largest side of a picture, in pixels."""
 Side = Annotated[int, Meta(ge=LEAST_SIDE, le=MOST_SIDE), Unit("pixels")]
 DEVICE = "/dev/video"
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where a camera on the network serves its pictures; ``login`` is ``NAME:PASSWORD``, or empty."""
+    """Address of the pictures of a camera on the network; ``login`` is ``NAME:PASSWORD``, or empty."""
 
     host: str
     port: int
@@ -32,19 +32,18 @@ class Place:
 
     @property
     def name(self) -> str:
-        """Host and port as people write them."""
+        """Host and port as text."""
         return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
 
 
 @dataclass(frozen=True)
 class Options:
-    """Where the pictures come from, and what they are.
+    """The source of the pictures and their properties.
 
-    ``source`` is the number of a camera or its device file, a video file, or a folder of JPEGs; instead of it,
-    ``url`` is where a camera on the network serves MJPEG.  Pictures of a camera are asked for in ``width`` and
-    ``height``, and reduced to that; those of a folder and of a ``url`` are taken as they are.
-    ``lens`` is across the picture in degrees, ``quality`` that of the JPEGs, ``ahead`` how far it sits before the
-    middle of the robot that carries it, in metres.
+    ``source`` is the number of a camera or its device file, a video file, or a folder of JPEGs; ``url`` is instead the
+    address of an MJPEG stream.  Pictures of a camera are requested in ``width`` and ``height``, and reduced to that
+    size; other pictures are used unchanged.  ``lens`` is the horizontal field of view in degrees,
+    ``quality`` the quality of the JPEGs, ``ahead`` the distance of the camera from the centre of its robot, in metres.
     """
 
     source: Annotated[
@@ -63,12 +62,12 @@ class Options:
 
     @property
     def is_device(self) -> bool:
-        """Whether it is a camera, and not files in its place."""
+        """Whether the source is a camera of this machine."""
         return not self.url and (isinstance(self.source, int) or self.source.startswith(DEVICE))
 
 
 def checked(table: Mapping[str, object]) -> Options:
-    """The options in ``table``; raises ``UsageError`` that names the key and what to write instead."""
+    """Convert and check ``table``; raise ``UsageError`` that names the key and the remedy."""
     if "url" in table and "source" in table:
         raise UsageError('driver "camera": options source and url exclude each other; leave one out')
     if "url" in table:
@@ -77,8 +76,8 @@ def checked(table: Mapping[str, object]) -> Options:
 
 
 def place_of(url: object) -> Place:
-    """Where ``url`` leads; raises ``UsageError`` with the remedy."""
-    # Nothing of it is shown: it may hold a password.
+    """Parse ``url``; raise ``UsageError`` with the remedy if it is invalid."""
+    # The error does not contain the url, which may include a password.
     fault = UsageError('driver "camera": option url must be as in url = "http://192.168.1.30:81/stream"')
     if not isinstance(url, str) or not url.isascii() or not url.isprintable() or " " in url or len(url) > 500:
         raise fault
@@ -88,7 +87,7 @@ def place_of(url: object) -> Place:
     except ValueError:
         raise fault from None
     if parts.scheme == "https":
-        raise UsageError('driver "camera": option url is https, which cameras\' streams are not taken from; use http')
+        raise UsageError('driver "camera": option url is https, which is not supported; use http')
     if parts.scheme != "http" or not parts.hostname or port == 0:
         raise fault
     login = f"{unquote(parts.username or '')}:{unquote(parts.password or '')}" if "@" in parts.netloc else ""
@@ -97,7 +96,7 @@ def place_of(url: object) -> Place:
 
 
 def described(options: Options) -> Description:
-    """What the camera is; it has no motor, so there is nothing that it can be told to do."""
+    """Return the description of the camera; it has no motor, so it has no actions."""
     camera = {"width": options.width, "height": options.height, "fps": options.fps, "fov_h_deg": options.lens}
     camera["ahead"] = options.ahead
     model = "a camera" if options.is_device else "pictures in place of a camera"

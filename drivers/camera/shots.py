@@ -1,6 +1,6 @@
-"""Shots: where pictures come from, one after another; what a camera, a video and a folder have in common.
+"""Sources of pictures: cameras, videos and folders with one interface.
 
-Nothing here waits and nothing knows a thread: ``shoot`` is called when the next picture is wanted.
+A source uses no threads; ``shoot`` is called when the next picture is wanted.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from formats.jpeg import size_of
 
 MOST_FILES = 10_000
 MOST_BYTES = 4 * 1024 * 1024
-"""Of a picture."""
+"""Largest picture in bytes."""
 
 
 @dataclass(frozen=True)
 class Shot:
-    """A whole JPEG."""
+    """One complete JPEG."""
 
     jpeg: bytes
     width: int
@@ -33,17 +33,17 @@ class Shots(Protocol):
     """A source of pictures."""
 
     def open(self) -> None:
-        """Make ready; raises ``LinkLost`` with the reason and the remedy."""
+        """Open the source; raise ``LinkLost`` with the reason and the remedy."""
 
     def shoot(self) -> Shot:
-        """The next picture; raises ``BadFrame`` for one that is none, ``LinkLost`` where there are no more."""
+        """Return the next picture; raise ``BadFrame`` for an invalid one, ``LinkLost`` after the last one."""
 
     def close(self) -> None:
-        """Let it go; may be called in any state."""
+        """Release the source; may be called in any state."""
 
 
 class FolderShots:
-    """The JPEGs of a folder in the order of their names, from the first again after the last; OpenCV is not needed."""
+    """The JPEGs of a folder, sorted by name, in an endless loop; OpenCV is not needed."""
 
     def __init__(self, folder: str) -> None:
         self._folder = Path(folder)
@@ -51,7 +51,7 @@ class FolderShots:
         self._next = 0
 
     def open(self) -> None:
-        """Look what there is."""
+        """List the files."""
         try:
             every = sorted(self._folder.iterdir())
         except OSError as error:
@@ -61,7 +61,7 @@ class FolderShots:
             raise LinkLost(f"{self._folder} has no .jpg files")
 
     def shoot(self) -> Shot:
-        """The next file."""
+        """Return the next file."""
         if not self._files:
             raise LinkLost(f"{self._folder} is not open")
         file = self._files[self._next % len(self._files)]
@@ -70,21 +70,21 @@ class FolderShots:
             with file.open("rb") as opened:
                 data = opened.read(MOST_BYTES + 1)
         except FileNotFoundError as error:
-            raise LinkLost(f"{file} has gone; looking again") from error
+            raise LinkLost(f"{file} was deleted; reading the folder again") from error
         except OSError as error:
             raise BadFrame(f"{file}: {error.strerror}") from error
         size = size_of(data)
         if size is None or len(data) > MOST_BYTES:
-            raise BadFrame(f"{file} is no whole JPEG of at most {MOST_BYTES} bytes")
+            raise BadFrame(f"{file} is not a complete JPEG of at most {MOST_BYTES} bytes")
         return Shot(data, *size)
 
     def close(self) -> None:
-        """Forget the files; the next time it goes on behind the last one shown."""
+        """Discard the list of files; after ``open`` the sequence continues."""
         self._files = []
 
 
 class CaptureShots:
-    """A camera or a video through OpenCV; ``cv2`` is that module, imported by whoever wants pictures."""
+    """A camera or a video through OpenCV; ``cv2`` imports and returns that module."""
 
     def __init__(self, options: Options, cv2: Callable[[], Any]) -> None:
         self._options = options
@@ -93,7 +93,7 @@ class CaptureShots:
         self._capture: Any = None
 
     def open(self) -> None:
-        """Open the camera, or the video from its beginning."""
+        """Open the camera, or the video from its start."""
         options, source = self._options, self._options.source
         if self._cv2 is None:
             try:
@@ -120,26 +120,26 @@ class CaptureShots:
         self._capture = capture
 
     def shoot(self) -> Shot:
-        """Wait for the camera's next picture, or take the video's; a video begins anew at its end."""
+        """Wait for the camera's next picture, or read the video's next one; a video restarts at its end."""
         if self._capture is None:
             raise LinkLost("it is not open")
-        is_there, picture = self._capture.read()
-        if not is_there and not self._options.is_device:
+        is_read, picture = self._capture.read()
+        if not is_read and not self._options.is_device:
             self._capture.set(self._cv2.CAP_PROP_POS_FRAMES, 0)
-            is_there, picture = self._capture.read()
-        if not is_there or picture is None:
+            is_read, picture = self._capture.read()
+        if not is_read or picture is None:
             raise LinkLost(f"{self._options.source}: no more pictures come; was it unplugged?")
         if picture.shape[1] > self._options.width or picture.shape[0] > self._options.height:
             scale = min(self._options.width / picture.shape[1], self._options.height / picture.shape[0])
             size = (max(1, round(picture.shape[1] * scale)), max(1, round(picture.shape[0] * scale)))
             picture = self._cv2.resize(picture, size, interpolation=self._cv2.INTER_AREA)
-        is_made, jpeg = self._cv2.imencode(".jpg", picture, [self._cv2.IMWRITE_JPEG_QUALITY, self._options.quality])
-        if not is_made:
-            raise BadFrame("a picture could not be made a JPEG")
+        is_encoded, jpeg = self._cv2.imencode(".jpg", picture, [self._cv2.IMWRITE_JPEG_QUALITY, self._options.quality])
+        if not is_encoded:
+            raise BadFrame("a picture could not be encoded as JPEG")
         return Shot(jpeg.tobytes(), picture.shape[1], picture.shape[0])
 
     def close(self) -> None:
-        """Let the camera go, so that others can have it."""
+        """Release the camera for other programs."""
         if self._capture is not None:
             self._capture.release()
         self._capture = None

@@ -1,4 +1,4 @@
-"""Stream: pictures of a camera that serves them over HTTP; it is called, and called again, through a ``Connector``."""
+"""Pictures of a camera that serves MJPEG over HTTP, with reconnects through a ``Connector``."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from drivers.timer import Timer
 from formats.jpeg import size_of
 
 SILENCE_S = 5.0
-"""Without a whole picture for so long the camera is hung up on, and called again."""
+"""Seconds without a complete picture after which the driver reconnects."""
 
 
 class StreamFilm:
-    """A wish for the pictures at ``place``; ``size`` is what they are described as.
+    """The pictures at ``place``; ``size`` is their width and height according to the options.
 
-    A camera sends as it likes: of pictures above the wanted rate each that is too early is dropped.  With none wanted
-    it is hung up on, but for the first one, which tells that the camera is there.
+    A camera sends at its own rate; pictures above the requested rate are dropped.  At rate 0 the connection is closed
+    after the first picture, which shows that the camera is present.
     """
 
     log = Logger()
 
     def __init__(self, place: Place, size: tuple[int, int], connector: Connector, clock: IReactorTime) -> None:
         self.dropped = 0
-        """Pictures above the wanted rate."""
+        """Pictures above the requested rate."""
         self._place = place
         self._size = size
         self._connector = connector
@@ -40,58 +40,58 @@ class StreamFilm:
         self._due = 0.0
         self._has_shown = False
         self._retry = Retry()
-        self._call: _Call | None = None
+        self._attempt: _Attempt | None = None
         self._timer = Timer(clock)
 
     def start(self, viewer: Viewer, fps: float) -> None:
-        """Begin."""
+        """Connect and start to deliver pictures."""
         self._viewer, self._fps = viewer, fps
-        self._ring()
+        self._connect()
 
     def set_fps(self, fps: float) -> None:
-        """So many a second from now on; 0: none."""
+        """Set the frame rate in pictures per second; 0 stops."""
         self._fps = fps
         self._due = 0.0
         if self._viewer is None:
             return
         if fps <= 0 and self._has_shown:
-            self._hang_up()
+            self._disconnect()
         elif fps > 0 and not self._timer.is_set:
-            self._ring()
+            self._connect()
 
     def stop(self) -> Deferred[None]:
-        """End; fires when the link is closed."""
+        """Stop; fires when the link is closed."""
         self._viewer = None
-        return self._hang_up()
+        return self._disconnect()
 
-    # -- told by a call ---------------------------------------------------------------------------------------------
+    # -- called by an attempt ---------------------------------------------------------------------------------------
 
-    def heard(self, call: _Call, data: bytes) -> None:
-        """Take bytes of the camera's answer."""
-        if call is not self._call:
+    def heard(self, attempt: _Attempt, data: bytes) -> None:
+        """Process bytes of the camera's answer."""
+        if attempt is not self._attempt:
             return
         try:
-            pictures = call.reader.read(data)
+            pictures = attempt.reader.read(data)
         except BadFrame as error:
-            self._give_up(str(error))
+            self._fail(str(error))
             return
         for jpeg in pictures:
             self._on_picture(jpeg)
-            if call is not self._call:
+            if attempt is not self._attempt:
                 return
-        if call.reader.is_over:
-            self._give_up("it has ended its stream")
+        if attempt.reader.is_over:
+            self._fail("it ended the stream")
 
-    def lost(self, call: _Call) -> None:
-        """Learn that the camera, or the network, has hung up."""
-        if call is self._call:
-            self._give_up("it has hung up")
+    def lost(self, attempt: _Attempt) -> None:
+        """Handle the loss of the connection."""
+        if attempt is self._attempt:
+            self._fail("it closed the connection")
 
-    def _ring(self) -> None:
+    def _connect(self) -> None:
         place = self._place
-        call = self._call = _Call(self, codec.request(place.name, place.path, place.login))
+        attempt = self._attempt = _Attempt(self, codec.request(place.name, place.path, place.login))
         self._timer.set(SILENCE_S, self._on_silence)
-        call.line = self._connector.call(place.host, place.port, call)
+        attempt.line = self._connector.call(place.host, place.port, attempt)
 
     def _on_picture(self, jpeg: bytes) -> None:
         viewer, size = self._viewer, size_of(jpeg)
@@ -106,38 +106,38 @@ class StreamFilm:
         if now < self._due:
             self.dropped += 1
             return
-        # Counted from when it was due: one that came late does not make the next one early.
+        # Add to the due time, so that a late picture does not change the rate.
         self._due = max(self._due + interval, now)
         self._has_shown = True
         if size != self._size:
             self._size = size
-            told = "{place}: its pictures are {width} x {height}: write width = {width}, height = {height}"
-            self.log.warn(told, place=self._place.name, width=size[0], height=size[1])
+            warning = "{place}: its pictures are {width} x {height}: write width = {width}, height = {height}"
+            self.log.warn(warning, place=self._place.name, width=size[0], height=size[1])
         viewer.shown(Shot(jpeg, *size))
         if self._fps <= 0:
-            self._hang_up()
+            self._disconnect()
 
     def _on_silence(self) -> None:
-        if self._call is not None and self._call.is_up:
-            self._give_up(f"{self._place.name} answers, but no pictures come; serves it another already?")
+        if self._attempt is not None and self._attempt.is_up:
+            self._fail(f"{self._place.name} answers, but no pictures come; does it already serve another client?")
         else:
-            self._give_up(f"nothing answers at {self._place.name}; is it on, and in this network?")
+            self._fail(f"nothing answers at {self._place.name}; is it on, and in this network?")
 
-    def _give_up(self, reason: str) -> None:
-        self._hang_up()
+    def _fail(self, reason: str) -> None:
+        self._disconnect()
         self._has_shown = False
-        self._timer.set(self._retry.fail(), self._ring)
+        self._timer.set(self._retry.fail(), self._connect)
         if self._viewer is not None:
             self._viewer.gone(reason)
 
-    def _hang_up(self) -> Deferred[None]:
-        call, self._call = self._call, None
+    def _disconnect(self) -> Deferred[None]:
+        attempt, self._attempt = self._attempt, None
         self._timer.cancel()
-        return succeed(None) if call is None or call.line is None else call.line.hang_up()
+        return succeed(None) if attempt is None or attempt.line is None else attempt.line.hang_up()
 
 
-class _Call:
-    """One try: what comes of an earlier one, which is still being closed, is not heard any more."""
+class _Attempt:
+    """One connection attempt; data of an earlier one, which is still being closed, is ignored."""
 
     def __init__(self, film: StreamFilm, request: bytes) -> None:
         self.reader = codec.StreamReader()
@@ -147,14 +147,11 @@ class _Call:
         self._request = request
 
     def link_up(self, link: Link) -> None:
-        """Ask for the stream; called by the line."""
         self.is_up = True
         link.send(self._request)
 
     def received(self, data: bytes) -> None:
-        """Take bytes; called by the line."""
         self._film.heard(self, data)
 
     def link_down(self) -> None:
-        """Learn that it is over; called by the line."""
         self._film.lost(self)

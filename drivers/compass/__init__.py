@@ -1,1 +1,1 @@
-"""A digital compass on a robot's back: a part that tells where north is, by NMEA 0183."""
+"""A digital compass mounted on a robot: a part that measures the heading, over NMEA 0183."""

@@ -1,8 +1,8 @@
-"""Codec of compasses: the sentences ``HDG``, ``HDM`` and ``HDT`` of NMEA 0183, of any talker, cut anywhere.
+"""Parse and write the NMEA 0183 sentences ``HDG``, ``HDM`` and ``HDT`` of any talker, from a stream cut at any byte.
 
 ::
 
-    $HCHDG,98.3,0.0,E,12.6,W*57     what the compass reads; its deviation; the variation of the place
+    $HCHDG,98.3,0.0,E,12.6,W*57     sensor reading; deviation; variation
     $HCHDM,98.3,M*hh                degrees from magnetic north
     $HCHDT,95.5,T*1B                degrees from true north
 
@@ -17,16 +17,16 @@ from dataclasses import dataclass
 from drivers.errors import BadFrame
 
 MOST_LINE = 120
-"""Bytes of a sentence; the standard has 82."""
+"""Longest sentence in bytes; the standard allows 82."""
 RANKS = {"HDM": 1, "HDG": 2, "HDT": 3}
-"""The sentences that tell a heading; of a compass that sends several, the highest is believed."""
+"""The sentences that contain a heading; if a compass sends several, the highest rank is used."""
 
 _DEGREES = re.compile(r"\d{1,3}(\.\d{0,6})?", re.ASCII)
 
 
 @dataclass(frozen=True)
 class Heading:
-    """``degrees`` clockwise from north, 0 to 360; from true north where ``is_true``, else from magnetic north."""
+    """``degrees`` clockwise from north, 0 to 360; from true north if ``is_true``, else from magnetic north."""
 
     degrees: float
     is_true: bool
@@ -34,9 +34,9 @@ class Heading:
 
 
 class SentenceReader:
-    """The headings in what a compass sends; ``sentences`` counts all that are whole, ``bad_frames`` what is none.
+    """Extracts headings from a stream; ``sentences`` counts valid sentences, ``bad_frames`` invalid lines.
 
-    A compass that has sent a checksum once sends no sentence without.
+    After the first sentence with a checksum, sentences without one are invalid.
     """
 
     def __init__(self) -> None:
@@ -47,7 +47,7 @@ class SentenceReader:
         self._has_checksums = False
 
     def read(self, data: bytes) -> list[Heading]:
-        """The headings that ``data`` completes."""
+        """Return the headings that ``data`` completes."""
         *lines, self._rest = (self._rest + data).replace(b"\r", b"\n").split(b"\n")
         found = []
         for line in filter(None, lines):
@@ -55,7 +55,7 @@ class SentenceReader:
             try:
                 heading = self._heading(line)
             except BadFrame:
-                # Whoever begins to listen hears the end of a sentence first.
+                # The first line of a stream is usually the end of a sentence.
                 self.bad_frames += not is_first
                 continue
             self.sentences += 1
@@ -69,19 +69,19 @@ class SentenceReader:
     def _heading(self, line: bytes) -> Heading | None:
         body, star, _ = line.partition(b"*")
         if self._has_checksums and not star:
-            raise BadFrame("a sentence without its checksum")
+            raise BadFrame("sentence without checksum")
         heading = heading_in(line)
         self._has_checksums = self._has_checksums or bool(star)
         return heading
 
 
 def heading_in(line: bytes) -> Heading | None:
-    """What a sentence tells, None for one of another kind; raises ``BadFrame`` for what is none, or tells nothing."""
-    body, star, told = line.strip().partition(b"*")
+    """Parse one sentence; return None for another kind; raise ``BadFrame`` if it is invalid or has no heading."""
+    body, star, checksum = line.strip().partition(b"*")
     if len(line) > MOST_LINE or not body.startswith((b"$", b"!")) or not body.isascii():
-        raise BadFrame("no sentence")
-    if star and (len(told) != 2 or told.upper() != _checksum(body[1:])):
-        raise BadFrame("a wrong checksum")
+        raise BadFrame("not an NMEA 0183 sentence")
+    if star and (len(checksum) != 2 or checksum.upper() != _checksum(body[1:])):
+        raise BadFrame("wrong checksum")
     address, *fields = (field.strip() for field in body[1:].decode().split(","))
     kind = address[2:]
     if len(address) != 5 or kind not in RANKS:
@@ -93,34 +93,34 @@ def heading_in(line: bytes) -> Heading | None:
         degrees += (deviation or 0.0) + (variation or 0.0)
         return Heading(degrees % 360.0, variation is not None, RANKS[kind])
     if fields[1] not in ("", kind[2]):
-        raise BadFrame(f"{kind} of another north")
+        raise BadFrame(f"{kind} with the reference {fields[1]!r}")
     return Heading(degrees % 360.0, kind == "HDT", RANKS[kind])
 
 
 def sentence(address: str, *fields: str) -> bytes:
-    """A sentence with its checksum and its end."""
+    """Return a sentence with its checksum and line end."""
     body = ",".join((address, *fields)).encode()
     return b"$" + body + b"*" + _checksum(body) + b"\r\n"
 
 
 def eastward(degrees: float) -> tuple[str, str]:
-    """Two fields for an angle that is positive to the east."""
+    """Return the two fields of an angle that is positive to the east."""
     return f"{abs(degrees):.1f}", "E" if degrees >= 0 else "W"
 
 
 def _degrees(field: str) -> float:
     if not _DEGREES.fullmatch(field) or float(field) > 360.0:
-        raise BadFrame("no degrees")
+        raise BadFrame(f"not an angle in degrees: {field!r}")
     return float(field)
 
 
 def _eastward(field: str, side: str) -> float | None:
-    """The angle of two fields, positive to the east; None where they are empty."""
+    """Return the angle of two fields, positive to the east; None if they are empty."""
     if not field and not side:
         return None
     degrees = _degrees(field)
     if degrees > 180.0 or side not in ("E", "W"):
-        raise BadFrame("neither east nor west")
+        raise BadFrame(f"not an angle east or west: {field!r}, {side!r}")
     return degrees if side == "E" else -degrees
 
 

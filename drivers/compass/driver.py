@@ -1,6 +1,6 @@
-"""CompassDriver: a digital compass that sends NMEA 0183, over the network or on a serial cable.
+"""Driver of a digital compass that sends NMEA 0183, over the network or on a serial cable.
 
-``compass.heading`` is where the robot's nose points: radians, counter-clockwise from the yard's x axis.
+``compass.heading`` is the heading of the robot in radians, counter-clockwise from the map's x axis.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ MANIFEST = Manifest("serial", "serial", "on a cable", {"device": "/dev/ttyUSB1"}
 
 HEADING = "compass.heading"
 SILENCE_S, LAST_SILENCE_S = 3.0, 24.0
-"""Without a heading for so long the link is opened anew; each time twice as long."""
+"""Seconds without a heading after which the link is reopened, at first and at most; the time doubles each time."""
 BELIEVED_S = 3.0
-"""While the best sentence of a compass is not older, its lesser ones are not believed."""
+"""Seconds for which sentences of a lower rank are ignored after one of the best rank."""
 
 
 class CompassDriver(SensingDriver, LinkedDriver):
@@ -48,14 +48,14 @@ class CompassDriver(SensingDriver, LinkedDriver):
     # -- from the compass -------------------------------------------------------------------------------------------
 
     def link_up(self, link: Link) -> None:
-        """Begin to listen; called by the line."""
+        """Start to read; called by the link."""
         self._link = link
         self._reader = SentenceReader()
         self._bytes_at_start = self._counts["bytes"]
         self._heard_at = self._clock.seconds()
 
     def link_down(self) -> None:
-        """Learn that nothing is heard any more; called by the line."""
+        """Handle the loss of the link; called by the link."""
         self._link = None
         if self._is_up:
             self._down()
@@ -71,11 +71,11 @@ class CompassDriver(SensingDriver, LinkedDriver):
         self._counts["frames"] += 1
         if not self._is_up:
             self._up()
-        # The compass has no clock of its own.
-        self._observed({HEADING: self._turned(heading)}, now)
+        # The compass sends no time.
+        self._observed({HEADING: self._convert_heading(heading)}, now)
 
-    def _turned(self, heading: Heading) -> float:
-        """Degrees clockwise from north as radians counter-clockwise from the x axis, of the robot and not its part."""
+    def _convert_heading(self, heading: Heading) -> float:
+        """Convert degrees clockwise from north to the robot's heading in radians counter-clockwise from the x axis."""
         options = self._options
         true = heading.degrees + (0.0 if heading.is_true else options.variation_deg)
         return math.remainder(math.radians(options.x_axis_deg - true - options.mounted_deg), math.tau)
@@ -88,11 +88,11 @@ class CompassDriver(SensingDriver, LinkedDriver):
         self._silence_s = min(2.0 * self._silence_s, max(LAST_SILENCE_S, self._silence_s))
         self._heard_at = self._clock.seconds()
         self._timer.set(self._silence_s, self._watch)
-        self._name_problem(self._why())
+        self._name_problem(self._describe_silence())
         if self._link is not None:
             self._link.close()
 
-    def _why(self) -> str:
+    def _describe_silence(self) -> str:
         place, scale = self._options.place
         if self._link is None:
             is_cable = bool(self._options.device)
@@ -113,15 +113,15 @@ class CompassDriver(SensingDriver, LinkedDriver):
 def make_driver(
     options: Mapping[str, object], name: str, clock: IReactorTime, connector: Connector | None
 ) -> CompassDriver:
-    """A driver of the compass that ``options`` name."""
+    """Return a driver of the compass that ``options`` name."""
     wanted = checked(options)
     if connector is None and wanted.device:
-        from drivers.serial import SerialConnector  # a compass on the network is spared it
+        from drivers.serial import SerialConnector  # not needed for a compass on the network
 
         connector = SerialConnector()
     return CompassDriver(wanted, name, TcpConnector(says=True) if connector is None else connector, clock)
 
 
 def describe(options: Mapping[str, object], name: str) -> Description:
-    """What that compass is."""
+    """Return the description of that compass."""
     return described(checked(options))

@@ -1,4 +1,4 @@
-"""Options of the kind "compass": where it is, and how it lies on its robot; checked."""
+"""Options of the kind "compass": its address and its mounting."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ Baud = Literal[4800, 9600, 19200, 38400, 57600, 115200]
 class Options:
     """A compass at ``host`` and ``port``, or at the serial ``device`` with ``baud``.
 
-    ``mounted_deg`` is how far its mark is turned to the left of the robot's nose; ``variation_deg`` is what a place's
-    magnetic north lies east of true north, for a compass that does not tell; ``x_axis_deg`` is where the yard's x axis
-    points, in degrees of a compass.  ``rate`` is how many headings it sends a second.
+    ``mounted_deg`` is the angle of its mark to the left of the robot's front; ``variation_deg`` the angle of magnetic
+    north east of true north, for a compass that does not send it; ``x_axis_deg`` the direction of the map's x axis in
+    degrees clockwise from north.  ``rate`` is the number of headings per second that it sends.
     """
 
     host: Annotated[str, Meta(min_length=1, examples=["192.168.1.31"]), LINE] = ""
@@ -38,12 +38,12 @@ class Options:
 
     @property
     def place(self) -> tuple[str, int]:
-        """What a connector of its sort calls: host and port, or device and baud."""
+        """The arguments of the connector: host and port, or device and baud rate."""
         return (self.device, self.baud) if self.device else (self.host, self.port)
 
 
 def checked(table: Mapping[str, object]) -> Options:
-    """The options in ``table``; raises ``UsageError`` that names the key and what to write instead."""
+    """Convert and check ``table``; raise ``UsageError`` that names the key and the remedy."""
     options = convert_options("compass", table, Options)
     if bool(options.host) == bool(options.device):
         raise UsageError('driver "compass": write either option host (over the network) or device (on a serial cable)')
@@ -51,5 +51,5 @@ def checked(table: Mapping[str, object]) -> Options:
 
 
 def described(options: Options) -> Description:
-    """What the compass is; it has no motor, so there is nothing that it can be told to do."""
+    """Return the description of the compass; it has no motor, so it has no actions."""
     return Description("compass", "a compass (NMEA 0183)", {"compass": {}}, {}, 0.05, {"compass": options.rate})

@@ -1,6 +1,7 @@
-"""Codec of iRobot's Open Interface: commands to the robot and sensor packets from it, and back; pure.
+"""Codec of iRobot's Open Interface: commands to the robot and sensor packets from it; pure.
 
-Numbers of two bytes are big-endian.  Both sides are here: ``stream_frame`` and ``CommandReader`` are the robot's.
+Numbers of two bytes are big-endian.  Both sides are implemented: ``stream_frame`` and ``CommandReader`` are for
+emulators of the robot.
 """
 
 from __future__ import annotations
@@ -25,18 +26,18 @@ RESET, START, SAFE, FULL, CLEAN, DRIVE, LEDS, SONG, PLAY, DOCK, DIRECT = (
 SENSORS, STREAM, QUERY, PAUSE, STOP = 142, 148, 149, 150, 173
 MODES = ("off", "passive", "safe", "full")
 FRAME_S = 0.015
-"""The robot refreshes and streams its packets so often."""
+"""Interval in seconds at which the robot refreshes and streams its packets."""
 TOP_SPEED = 500
-"""Of a wheel, mm/s."""
+"""Top speed of a wheel in mm/s."""
 STRAIGHT = -0x8000
 HEAD = 19
 MAX_FRAME = 172
-"""More bytes do not pass a line of 115200 baud in ``FRAME_S``."""
+"""Largest frame in bytes that a line of 115200 baud carries in ``FRAME_S``."""
 
 
 @dataclass(frozen=True)
 class Packet:
-    """One sensor packet: its name, how ``struct`` writes it, and what a robot can mean by it."""
+    """One sensor packet: its name, its ``struct`` format, and its range of valid values."""
 
     name: str
     form: str
@@ -45,15 +46,15 @@ class Packet:
 
     @property
     def size(self) -> int:
-        """Bytes of data."""
+        """Number of data bytes."""
         return struct.calcsize(">" + self.form)
 
 
-def _bits(name: str, high: int = 255) -> Packet:
+def _byte(name: str, high: int = 255) -> Packet:
     return Packet(name, "B", 0, high)
 
 
-def _word(name: str, high: int = 65535) -> Packet:
+def _unsigned(name: str, high: int = 65535) -> Packet:
     return Packet(name, "H", 0, high)
 
 
@@ -62,58 +63,58 @@ def _signed(name: str, low: int = -32768, high: int = 32767) -> Packet:
 
 
 PACKETS: dict[int, Packet] = {
-    7: _bits("bumps", 15),
-    8: _bits("wall", 1),
-    9: _bits("cliff_left", 1),
-    10: _bits("cliff_front_left", 1),
-    11: _bits("cliff_front_right", 1),
-    12: _bits("cliff_right", 1),
-    13: _bits("virtual_wall", 1),
-    14: _bits("overcurrent", 31),
-    15: _bits("dirt"),
-    16: _bits("unused_16"),
-    17: _bits("infrared"),
-    18: _bits("buttons"),
+    7: _byte("bumps", 15),
+    8: _byte("wall", 1),
+    9: _byte("cliff_left", 1),
+    10: _byte("cliff_front_left", 1),
+    11: _byte("cliff_front_right", 1),
+    12: _byte("cliff_right", 1),
+    13: _byte("virtual_wall", 1),
+    14: _byte("overcurrent", 31),
+    15: _byte("dirt"),
+    16: _byte("unused_16"),
+    17: _byte("infrared"),
+    18: _byte("buttons"),
     19: _signed("distance"),
     20: _signed("angle"),
-    21: _bits("charging_state", 5),
-    22: _word("voltage", 25_000),
+    21: _byte("charging_state", 5),
+    22: _unsigned("voltage", 25_000),
     23: _signed("current", -20_000, 20_000),
     24: Packet("temperature", "b", -40, 100),
-    25: _word("charge"),
-    26: _word("capacity"),
-    27: _word("wall_signal", 1023),
-    28: _word("cliff_left_signal", 4095),
-    29: _word("cliff_front_left_signal", 4095),
-    30: _word("cliff_front_right_signal", 4095),
-    31: _word("cliff_right_signal", 4095),
-    32: _bits("unused_32"),
-    33: _word("unused_33"),
-    34: _bits("charger", 3),
-    35: _bits("mode", 3),
-    36: _bits("song"),
-    37: _bits("playing", 1),
-    38: _bits("stream_packets"),
+    25: _unsigned("charge"),
+    26: _unsigned("capacity"),
+    27: _unsigned("wall_signal", 1023),
+    28: _unsigned("cliff_left_signal", 4095),
+    29: _unsigned("cliff_front_left_signal", 4095),
+    30: _unsigned("cliff_front_right_signal", 4095),
+    31: _unsigned("cliff_right_signal", 4095),
+    32: _byte("unused_32"),
+    33: _unsigned("unused_33"),
+    34: _byte("charger", 3),
+    35: _byte("mode", 3),
+    36: _byte("song"),
+    37: _byte("playing", 1),
+    38: _byte("stream_packets"),
     39: _signed("velocity"),
     40: _signed("radius"),
     41: _signed("right_velocity"),
     42: _signed("left_velocity"),
-    43: _word("left_encoder"),
-    44: _word("right_encoder"),
-    45: _bits("light_bumper", 63),
-    46: _word("light_left", 4095),
-    47: _word("light_front_left", 4095),
-    48: _word("light_center_left", 4095),
-    49: _word("light_center_right", 4095),
-    50: _word("light_front_right", 4095),
-    51: _word("light_right", 4095),
-    52: _bits("infrared_left"),
-    53: _bits("infrared_right"),
+    43: _unsigned("left_encoder"),
+    44: _unsigned("right_encoder"),
+    45: _byte("light_bumper", 63),
+    46: _unsigned("light_left", 4095),
+    47: _unsigned("light_front_left", 4095),
+    48: _unsigned("light_center_left", 4095),
+    49: _unsigned("light_center_right", 4095),
+    50: _unsigned("light_front_right", 4095),
+    51: _unsigned("light_right", 4095),
+    52: _byte("infrared_left"),
+    53: _byte("infrared_right"),
     54: _signed("left_current"),
     55: _signed("right_current"),
     56: _signed("main_current"),
     57: _signed("side_current"),
-    58: _bits("stasis", 3),
+    58: _byte("stasis", 3),
 }
 GROUPS: dict[int, range] = {
     0: range(7, 27),
@@ -128,31 +129,31 @@ GROUPS: dict[int, range] = {
     106: range(46, 52),
     107: range(54, 59),
 }
-"""Packets that stand for several, one after another."""
+"""Packet ids that stand for a sequence of packets."""
 
 _FIXED = {
     **dict.fromkeys((RESET, START, 130, SAFE, FULL, 133, 134, CLEAN, 136, DOCK, STOP), 0),
     **dict.fromkeys((129, 138, PLAY, SENSORS, PAUSE, 165), 1),
     **{DRIVE: 4, LEDS: 3, 144: 3, DIRECT: 4, 146: 4, 162: 2, 163: 4, 164: 4, 167: 15, 168: 3},
 }
-"""Opcode to its bytes of data; ``SONG``, ``STREAM`` and ``QUERY`` say their own length."""
+"""Number of data bytes of each opcode; ``SONG``, ``STREAM`` and ``QUERY`` contain their length."""
 
 
 # -- to the robot --------------------------------------------------------------------------------------------------
 
 
 def drive(velocity: int, radius: int) -> bytes:
-    """Go at ``velocity`` mm/s on an arc of ``radius`` mm, left positive; ``STRAIGHT``, 1 and -1 (spin) are special."""
+    """Drive at ``velocity`` mm/s on an arc of ``radius`` mm, left positive; or ``STRAIGHT``; 1 and -1 spin."""
     return struct.pack(">Bhh", DRIVE, velocity, radius)
 
 
 def drive_direct(right: int, left: int) -> bytes:
-    """Turn the wheels at so many mm/s each, until told otherwise: the robot has no time-out."""
+    """Turn the wheels at these speeds in mm/s until the next command: the robot has no time-out."""
     return struct.pack(">Bhh", DIRECT, right, left)
 
 
 def stream(ids: Sequence[int]) -> bytes:
-    """Send these packets each ``FRAME_S`` from now on."""
+    """Send these packets every ``FRAME_S`` from now on."""
     return bytes((STREAM, len(ids), *ids))
 
 
@@ -162,17 +163,17 @@ def query(ids: Sequence[int]) -> bytes:
 
 
 def pause(going: bool) -> bytes:
-    """Let the stream rest, or go on."""
+    """Pause the stream (False) or resume it (True)."""
     return bytes((PAUSE, int(going)))
 
 
 def song(number: int, notes: Sequence[tuple[int, int]]) -> bytes:
-    """Learn song ``number`` (0 to 3): pairs of a MIDI note (31 to 127) and 1/64 s."""
+    """Define song ``number`` (0 to 3): pairs of a MIDI note (31 to 127) and a duration in 1/64 s."""
     return bytes((SONG, number, len(notes), *(part for note in notes for part in note)))
 
 
 def play(number: int) -> bytes:
-    """Play a song that it has learnt."""
+    """Play a defined song."""
     return bytes((PLAY, number))
 
 
@@ -180,7 +181,7 @@ def play(number: int) -> bytes:
 
 
 def packed(packet_id: int, values: Mapping[str, int]) -> bytes:
-    """The data of one packet or group, as the robot writes it; what ``values`` lacks is 0."""
+    """Encode one packet or group as the robot does; values missing in ``values`` are 0."""
     if packet_id in GROUPS:
         return b"".join(packed(one, values) for one in GROUPS[packet_id])
     packet = PACKETS[packet_id]
@@ -188,49 +189,49 @@ def packed(packet_id: int, values: Mapping[str, int]) -> bytes:
 
 
 def stream_frame(ids: Sequence[int], values: Mapping[str, int]) -> bytes:
-    """One frame of the stream, as the robot writes it."""
+    """Encode one frame of the stream as the robot does."""
     body = b"".join(bytes((one,)) + packed(one, values) for one in ids)
     frame = bytes((HEAD, len(body))) + body
     return frame + bytes((-sum(frame) & 0xFF,))
 
 
 class StreamReader:
-    """Cuts the robot's bytes into frames of the packets ``ids``, however they are cut.
+    """Splits the robot's bytes into frames of the packets ``ids``.
 
-    What is no such frame is dropped and counted: text of a reboot, half frames, wrong checksums, and frames that say
-    what no robot can mean.
+    Other data is dropped and counted: boot messages, incomplete frames, wrong checksums, and frames with values out of
+    range.
     """
 
     def __init__(self, ids: Sequence[int]) -> None:
         self.frames = 0
         self.bad_frames = 0
-        self._places: list[tuple[int, int, Packet]] = []
+        self._layout: list[tuple[int, int, Packet]] = []
         at = 2
         for one in ids:
-            self._places.append((at, one, PACKETS[one]))
+            self._layout.append((at, one, PACKETS[one]))
             at += 1 + PACKETS[one].size
-        self._size = at + 1
+        self._command_size = at + 1
         self._head = bytes((HEAD, at - 2))
         self._rest = bytearray()
         self._is_lost = False
 
     def read(self, data: bytes) -> Iterator[dict[str, int]]:
-        """Yield, by packet names, the frames that ``data`` completes."""
+        """Yield the frames that ``data`` completes, as values by packet name."""
         rest = self._rest
         rest += data
         while True:
             self._skip_to_head()
-            if len(rest) < self._size:
+            if len(rest) < self._command_size:
                 return
-            # The head occurs within data, too: only the checksum and the ids tell a frame.
-            values = None if sum(rest[: self._size]) & 0xFF else self._values()
+            # The header bytes can occur within data: checksum and ids decide.
+            values = None if sum(rest[: self._command_size]) & 0xFF else self._read_values()
             if values is None:
-                self._lose()
+                self._count_loss()
                 del rest[0]
                 continue
-            del rest[: self._size]
+            del rest[: self._command_size]
             self._is_lost = False
-            if all(packet.low <= values[packet.name] <= packet.high for _, _, packet in self._places):
+            if all(packet.low <= values[packet.name] <= packet.high for _, _, packet in self._layout):
                 self.frames += 1
                 yield values
             else:
@@ -239,18 +240,18 @@ class StreamReader:
     def _skip_to_head(self) -> None:
         rest = self._rest
         while rest and not rest.startswith(self._head[: len(rest)]):
-            self._lose()
+            self._count_loss()
             at = rest.find(HEAD, 1)
             del rest[: at if at > 0 else len(rest)]
 
-    def _lose(self) -> None:
-        # Bytes that belong together are one loss, and counted once.
+    def _count_loss(self) -> None:
+        # Consecutive bad bytes count once.
         self.bad_frames += not self._is_lost
         self._is_lost = True
 
-    def _values(self) -> dict[str, int] | None:
+    def _read_values(self) -> dict[str, int] | None:
         values: dict[str, int] = {}
-        for at, one, packet in self._places:
+        for at, one, packet in self._layout:
             if self._rest[at] != one:
                 return None
             (values[packet.name],) = struct.unpack_from(">" + packet.form, self._rest, at + 1)
@@ -259,7 +260,7 @@ class StreamReader:
 
 @dataclass(frozen=True)
 class Command:
-    """What the robot was told: an opcode and its data."""
+    """A command to the robot: an opcode and its data."""
 
     opcode: int
     data: bytes = b""
@@ -271,18 +272,18 @@ class Command:
 
 
 class CommandReader:
-    """Cuts what the robot hears into commands, as the robot does: it waits for missing data for ever."""
+    """Splits a stream into commands as the robot does: it waits for missing data without a time-out."""
 
     def __init__(self) -> None:
         self.unknown = 0
         self._rest = bytearray()
 
     def read(self, data: bytes) -> Iterator[Command]:
-        """Yield the commands that ``data`` completes; bytes that begin none are counted as ``unknown``."""
+        """Yield the commands that ``data`` completes; bytes that start no command are counted as ``unknown``."""
         rest = self._rest
         rest += data
         while rest:
-            size = self._size()
+            size = self._command_size()
             if size is None:
                 self.unknown += 1
                 del rest[0]
@@ -293,8 +294,11 @@ class CommandReader:
             del rest[:size]
             yield command
 
-    def _size(self) -> int | None:
-        """How long the command at the front is; None for no command; one more than there is where it is not known."""
+    def _command_size(self) -> int | None:
+        """Return the size of the first command in bytes.
+
+        None means that it is not a command; more bytes than available means that the size is not known yet.
+        """
         rest = self._rest
         opcode = rest[0]
         if opcode in (STREAM, QUERY):

@@ -1,8 +1,8 @@
-"""Create2Driver: a Create 2 or Roomba on a serial cable.
+"""Driver of a Create 2 or Roomba on a serial cable.
 
-The robot has no time-out of its own: it drives on until it is told otherwise, or until its own guards stop it.  So
-the driver ends each motion at its deadline, and a process beside it where this one stands still; when the cable falls
-out while it moves, nobody can.
+The robot has no time-out: it drives until the next command, or until its own cliff and wheel-drop sensors stop it.
+The driver therefore ends each motion at its deadline, and a dead man's switch does so if this process freezes.  If
+the cable is unplugged during a motion, the robot cannot be stopped.
 """
 
 from __future__ import annotations
@@ -31,20 +31,20 @@ from drivers.timer import Timer
 MANIFEST = Manifest("serial", "serial", example={"port": "/dev/ttyUSB0"}, is_on_cable=True)
 
 SETTLE_S = 0.05
-"""The robot is given so long after ``START`` before the next command."""
+"""Seconds to wait after ``START`` before the next command."""
 SILENCE_S = 0.5
-"""Without a frame for so long the robot is started again: it was switched off, or rebooted."""
+"""Seconds without a frame after which the robot is started again: it was switched off, or rebooted."""
 LAST_SILENCE_S = 4.0
 DOCK_S = 120.0
-"""It has so long to find its home base."""
+"""Seconds within which the robot must find its home base."""
 
 
 class Create2Driver(LinkedDriver):
-    """One robot at the end of a serial device.
+    """One robot on a serial device.
 
-    ``enable`` takes the robot into safe (or full) mode, ``disable`` into passive mode.  When the robot leaves safe
-    mode by itself (a cliff, a lifted wheel, a charger) that is a safety event: ``safety.event`` names it, the motion
-    is at rest, and the motors stay off until ``enable`` is called again.
+    ``enable`` selects safe (or full) mode, ``disable`` passive mode.  If the robot leaves safe mode by itself (a cliff,
+    a lifted wheel, a charger), that is a safety event: ``safety.event`` names it, the motion is zero, and the motors
+    stay off until ``enable`` is called again.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class Create2Driver(LinkedDriver):
         self._counts |= {"safety_events": 0, "jumps": 0}
 
     def invoke(self, name: str, **arguments: float | str) -> Deferred[Mapping[str, Value]]:
-        """``dock``: seek the home base, until it charges; ``beep``: sound ``hz`` (32 to 12500) for ``s`` seconds."""
+        """Run ``dock``: seek the home base until it charges; or ``beep``: ``hz`` from 49 to 12544 for ``s`` seconds."""
         if name not in SKILLS:
             return super().invoke(name, **arguments)
         if not self._is_up or self.state in ("stale", "closed"):
@@ -83,12 +83,12 @@ class Create2Driver(LinkedDriver):
 
     def _close(self) -> Deferred[None]:
         self._end_docking(LinkLost(f"{self._name}: disconnected"))
-        # Without a stop at the end the robot stays awake and drains its battery.
+        # Without STOP the robot stays awake and drains its battery.
         self._send(codec.drive_direct(0, 0) + codec.pause(False) + bytes((codec.START, codec.STOP)))
         return super()._close()
 
     def _power(self, on: bool) -> None:
-        self._end_docking(NotEnabled("enable() or disable() came in between"))
+        self._end_docking(NotEnabled("enable() or disable() ended the search for the dock"))
         if on:
             self._event = ""
             self._send(bytes((codec.SAFE if self._options.mode == "safe" else codec.FULL,)))
@@ -104,7 +104,7 @@ class Create2Driver(LinkedDriver):
         return {"base.vx": (right + left) / 2000.0, "base.wz": (right - left) / WHEEL_BASE}
 
     def _halt(self) -> None:
-        if not self._end_docking(NotEnabled("stop() came in between")):
+        if not self._end_docking(NotEnabled("stop() ended the search for the dock")):
             self._send(codec.drive_direct(0, 0))
 
     def _last_word(self) -> LastWord | None:
@@ -114,19 +114,19 @@ class Create2Driver(LinkedDriver):
         if arguments:
             raise Unsupported("dock takes no arguments")
         if self._docking is not None:
-            raise UsageError("it seeks its dock already")
+            raise UsageError("it is already seeking its dock")
         if self._wants_motors is not True or self._mode not in ARMED:
             raise NotEnabled(f"{self._name}'s motors are off; call enable() first")
         self.stop()
-        # The robot drives itself now, in passive mode; that is no safety event.
+        # The robot drives itself in passive mode; this change of mode is not a safety event.
         self._wants_motors = False
-        self._docking = Deferred(self._on_cancelled)
+        self._docking = Deferred(self._on_docking_cancelled)
         late = NoReply(f"{self._name} did not find its dock within {DOCK_S:g} s")
         self._dock_timer.set(DOCK_S, self._end_docking, late)
         self._send(bytes((codec.DOCK,)))
         return self._docking
 
-    def _on_cancelled(self, _docking: object) -> None:
+    def _on_docking_cancelled(self, _docking: object) -> None:
         self._end_docking(None)
 
     def _on_docked(self) -> None:
@@ -136,12 +136,12 @@ class Create2Driver(LinkedDriver):
             docking.callback({"dock.on": True})
 
     def _end_docking(self, error: Exception | None) -> bool:
-        """Whether it was seeking its dock; it stands still now, in passive mode."""
+        """End the search for the dock, at rest and in passive mode; return whether a search was in progress."""
         docking, self._docking = self._docking, None
         if docking is None:
             return False
         self._dock_timer.cancel()
-        # While it docks it hears no wheel command: control is taken back, and given up at rest.
+        # The robot ignores wheel commands while it docks: switch to safe mode, stop, and return to passive mode.
         self._send(bytes((codec.SAFE,)) + codec.drive_direct(0, 0) + bytes((codec.START,)))
         if error is not None:
             docking.errback(error)
@@ -150,12 +150,12 @@ class Create2Driver(LinkedDriver):
     def _beep(self, arguments: Mapping[str, float | str]) -> Deferred[Mapping[str, Value]]:
         unknown = sorted(set(arguments) - {"hz", "s"})
         if unknown:
-            raise Unsupported(f"beep has no argument {unknown[0]!r}; it knows hz, s")
+            raise Unsupported(f"beep has no argument {unknown[0]!r}; its arguments are hz and s")
         hz, seconds = arguments.get("hz", 440.0), arguments.get("s", 0.5)
         if not _is_between(hz, 49.0, 12544.0) or not _is_between(seconds, 1 / 64, 3.98):
             raise Unsupported("beep needs hz from 49 to 12544 and s from 0.016 to 3.98")
         if self._mode not in ARMED:
-            raise NotEnabled(f"{self._name} sounds in safe or full mode only; call enable() first")
+            raise NotEnabled(f"{self._name} beeps in safe or full mode only; call enable() first")
         note = min(127, round(69 + 12 * math.log2(float(hz) / 440.0)))
         self._send(codec.song(0, [(note, round(float(seconds) * 64))]) + codec.play(0))
         return succeed({"beep.hz": 440.0 * 2.0 ** ((note - 69) / 12)})
@@ -163,23 +163,23 @@ class Create2Driver(LinkedDriver):
     # -- from the robot ---------------------------------------------------------------------------------------------
 
     def link_up(self, link: Link) -> None:
-        """Begin to talk; called by the line."""
+        """Start the robot; called by the link."""
         self._link = link
         self._silence_s = SILENCE_S
         self._start()
 
     def link_down(self) -> None:
-        """Bring the motion to rest here; the robot goes on until it is told, if it can be; called by the line."""
+        """Reset the motion here; the robot keeps driving until it is reachable again; called by the link."""
         self._link = None
         self._timer.cancel()
-        self._end_docking(LinkLost(f"the link to {self._name} went away"))
+        self._end_docking(LinkLost(f"the link to {self._name} was lost"))
         self._down()
 
     def _heard(self, frame: Mapping[str, int]) -> None:
         self._counts["frames"] += 1
         mode, before = mode_of(frame), self._mode
         if mode in ARMED and not self._is_up:
-            return  # it was said before the robot heard the start, which takes it into passive mode
+            return  # sent before the robot processed START, which selects passive mode
         now = self._clock.seconds()
         self._heard_at = now
         self._silence_s = SILENCE_S
@@ -192,15 +192,15 @@ class Create2Driver(LinkedDriver):
         values = seen(frame)
         if before in ARMED and mode not in ARMED and self._wants_motors:
             self._on_safety_event(event_of(values))
-        where = self._odometry
-        values |= {"odom.x": where.x, "odom.y": where.y, "odom.yaw": where.yaw}
-        values |= {"base.vx": where.vx, "base.vy": 0.0, "base.wz": where.wz}
-        values["base.moving"] = bool(where.vx or where.wz)
+        odometry = self._odometry
+        values |= {"odom.x": odometry.x, "odom.y": odometry.y, "odom.yaw": odometry.yaw}
+        values |= {"base.vx": odometry.vx, "base.vy": 0.0, "base.wz": odometry.wz}
+        values["base.moving"] = bool(odometry.vx or odometry.wz)
         values["safety.event"] = self._event
         values["skill.running"] = "" if self._docking is None else "dock"
         if self._docking is not None and values["dock.on"]:
             self._on_docked()
-        # The robot has no clock of its own.
+        # The robot sends no time.
         self._observed(values, now)
 
     def _on_safety_event(self, event: str) -> None:
@@ -211,20 +211,20 @@ class Create2Driver(LinkedDriver):
         self.log.warn("{robot} left {mode} mode: {event}", robot=self._name, mode=self._options.mode, event=event)
 
     def _start(self) -> None:
-        # A robot that was cut off within a command takes the first of these as the bytes that it lacks.
+        # A robot with an incomplete command takes the first of these bytes as the missing data.
         self._send(bytes((codec.START,)) * 5)
         self._reader = codec.StreamReader(IDS)
         self._odometry.forget()
         self._mode = ""
         self._bytes_at_start = self._counts["bytes"]
-        self._timer.set(SETTLE_S, self._ask)
+        self._timer.set(SETTLE_S, self._start_stream)
 
-    def _ask(self) -> None:
+    def _start_stream(self) -> None:
         self._send(codec.stream(IDS))
         self._heard_at = self._clock.seconds()
-        self._watch_in(self._silence_s)
+        self._schedule_watch(self._silence_s)
 
-    def _watch_in(self, seconds: float) -> None:
+    def _schedule_watch(self, seconds: float) -> None:
         self._watch_at = self._clock.seconds() + seconds
         self._timer.set(seconds, self._watch)
 
@@ -233,16 +233,16 @@ class Create2Driver(LinkedDriver):
         self._heard_at = heard_at(self._heard_at, self._watch_at, now)
         silent = now - self._heard_at
         if silent < self._silence_s:
-            self._watch_in(self._silence_s - silent)
+            self._schedule_watch(self._silence_s - silent)
             return
         self._silence_s = min(2.0 * self._silence_s, LAST_SILENCE_S)
-        is_babble = self._counts["bytes"] > self._bytes_at_start and not self._is_up
+        has_noise = self._counts["bytes"] > self._bytes_at_start and not self._is_up
         self._name_problem(
             f"it sends, but no frames; is {self._options.baud} baud right, and is it a Create 2?"
-            if is_babble
+            if has_noise
             else "it sends nothing; is it switched on, and the cable in?"
         )
-        self._end_docking(LinkLost(f"{self._name} fell silent"))
+        self._end_docking(LinkLost(f"{self._name} does not answer"))
         if self._is_up:
             self._down()
         self._start()
@@ -255,12 +255,12 @@ def _is_between(value: float | str, low: float, high: float) -> bool:
 def make_driver(
     options: Mapping[str, object], name: str, clock: IReactorTime, connector: Connector | None
 ) -> Create2Driver:
-    """A driver of the robot at the end of the serial cable that ``options`` name."""
+    """Return a driver of the robot on the serial device in ``options``."""
     if connector is not None:
         return Create2Driver(checked(options), name, connector, clock)
     return Create2Driver(checked(options), name, SerialConnector(), clock, kept(name))
 
 
 def describe(options: Mapping[str, object], name: str) -> Description:
-    """What that robot is."""
+    """Return the description of that robot."""
     return described(checked(options))

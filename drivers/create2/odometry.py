@@ -1,4 +1,4 @@
-"""Odometry: where the wheels say that the robot is."""
+"""Pose of the robot, integrated from its wheel encoders."""
 
 from __future__ import annotations
 
@@ -6,20 +6,20 @@ import math
 
 MM_PER_COUNT = math.pi * 72.0 / 508.8
 WHEEL_BASE = 235.0
-"""Millimetres from wheel to wheel."""
+"""Distance between the wheels in mm."""
 BASE_M, STEP_M = WHEEL_BASE / 1000.0, MM_PER_COUNT / 1000.0
 WINDOW_S = 0.12
-"""Speeds are means over so long: one count within one frame would be 30 mm/s."""
+"""Window of the mean speeds in seconds; one count within one frame would be 30 mm/s."""
 TOP = 0.8
-"""No wheel moves faster, m/s; the counts of who says so are none."""
+"""Top speed of a wheel in m/s; larger changes of the counts are invalid."""
 SLACK = 0.05
-"""Metres that frames which come late, and together, may seem too far."""
+"""Tolerance in metres for frames that arrive late and together."""
 
 
 class Odometry:
     """Pose and speed from the counts of both wheels, which wrap at 65536.
 
-    Lengths are metres, angles radians, counter-clockwise; the pose is 0 at first.
+    Lengths are in metres, angles in radians, counter-clockwise; the initial pose is 0.
     """
 
     def __init__(self) -> None:
@@ -30,13 +30,13 @@ class Odometry:
         self._trail: list[tuple[float, float, float]] = []
 
     def forget(self) -> None:
-        """Keep the pose, not the counts: the next ones may come from a robot that was started again."""
+        """Keep the pose and discard the counts: the next ones may come from a restarted robot."""
         self._last = None
         self._trail = []
         self.vx = self.wz = 0.0
 
     def count(self, left: int, right: int, now: float) -> None:
-        """Take the wheels' counts of ``now``; jumps that no wheel can make move nothing."""
+        """Take the wheels' counts at ``now``; implausible jumps do not move the pose."""
         before, self._last = self._last, (left, right)
         if before is None:
             self._trail = [(now, 0.0, 0.0)]
@@ -58,7 +58,7 @@ class Odometry:
 
     def _move(self, left: float, right: float) -> None:
         ahead, turn = (left + right) / 2.0, (right - left) / BASE_M
-        # The chord of the arc that both wheels drew.
+        # The chord of the arc of the movement.
         chord = ahead if abs(turn) < 1e-9 else 2.0 * ahead / turn * math.sin(turn / 2.0)
         self.x += chord * math.cos(self.yaw + turn / 2.0)
         self.y += chord * math.sin(self.yaw + turn / 2.0)

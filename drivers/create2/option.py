@@ -1,4 +1,4 @@
-"""Options of the kind "create2": read from a free table and checked, each fault with its remedy."""
+"""Options of the kind "create2"; each error names the remedy."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from drivers.option import Device, convert_options
 from drivers.reading import Description
 
 Baud = Literal[57600, 115200]
-"""A slower line does not carry a frame in the 15 ms after which the robot sends the next."""
+"""Slower lines cannot carry a frame within the 15 ms of the robot's interval."""
 Mode = Literal["safe", "full"]
 """The robot stops at cliffs by itself (safe), or does not (full)."""
 SKILLS = ("dock", "beep")
@@ -20,7 +20,7 @@ SKILLS = ("dock", "beep")
 
 @dataclass(frozen=True)
 class Options:
-    """The serial device and its speed, the mode that ``enable`` asks for, and limits of speed in m/s and rad/s."""
+    """The serial device and its speed, the mode that ``enable`` selects, and speed limits in m/s and rad/s."""
 
     port: Device
     baud: Baud = 115200
@@ -30,12 +30,12 @@ class Options:
 
 
 def checked(table: Mapping[str, object]) -> Options:
-    """The options in ``table``; raises ``UsageError`` that names the key and what to write instead."""
+    """Convert and check ``table``; raise ``UsageError`` that names the key and the remedy."""
     return convert_options("create2", table, Options)
 
 
 def described(options: Options) -> Description:
-    """What a Create 2 is, known without a connection."""
+    """Return the description of a Create 2."""
     return Description(
         kind="create2",
         model="iRobot Create 2",

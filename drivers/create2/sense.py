@@ -1,4 +1,4 @@
-"""Sense: what a frame of the Create 2 means, under the keys of an observation; pure."""
+"""Convert a frame of the Create 2 to the keys of an observation; pure."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from drivers.create2.codec import MODES
 from drivers.reading import Value
 
 IDS = (7, 9, 10, 11, 12, 13, 14, 17, 18, 21, 22, 23, 24, 25, 26, 28, 29, 30, 31, 34, 35, 43, 44, *range(45, 52), 58)
-"""The packets that are streamed: a frame of 81 bytes, about half of what the line carries."""
+"""The streamed packets: a frame of 81 bytes, about half of the line's capacity."""
 LEDGES = ("left", "front_left", "front_right", "right")
 LIGHTS = ("left", "front_left", "center_left", "center_right", "front_right", "right")
 BUTTONS = ("clean", "spot", "dock", "minute", "hour", "day", "schedule", "clock")
@@ -18,12 +18,12 @@ HOME_BASE = 2
 
 
 def mode_of(frame: Mapping[str, int]) -> str:
-    """``off passive safe full``; the wheels turn on command in the last two."""
+    """Return the mode, ``off passive safe full``; the wheels obey commands in the last two."""
     return MODES[frame["mode"]]
 
 
 def seen(frame: Mapping[str, int]) -> dict[str, Value]:
-    """What the robot feels, in SI units; the battery's level is left out where it does not know its capacity."""
+    """Return the sensor data in SI units; the battery's level is omitted if the robot does not know its capacity."""
     values: dict[str, Value] = {
         "mode": mode_of(frame),
         "estop.engaged": mode_of(frame) not in ARMED,
@@ -56,7 +56,7 @@ def seen(frame: Mapping[str, int]) -> dict[str, Value]:
 
 
 def event_of(values: Mapping[str, Value]) -> str:
-    """Why the robot left safe mode by itself, as far as it tells."""
+    """Return the reasons why the robot left safe mode by itself, according to its sensors."""
     causes = [
         key for key in (*(f"cliff.{name}" for name in LEDGES), "wheeldrop.left", "wheeldrop.right") if values[key]
     ]

@@ -1,1 +1,1 @@
-"""The dead man's switch: a small process beside the node that halts the robot when the node stands still or is gone."""
+"""The dead man's switch: a small process next to the node that halts the robot if the node freezes or dies."""

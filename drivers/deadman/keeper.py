@@ -1,7 +1,7 @@
-"""Keeper: a dead man's switch that is a process of its own, started, fed and reaped from the reactor's thread.
+"""Start, feed and reap the process of a dead man's switch from the reactor's thread.
 
-The process shares the robot's open link: the descriptor goes to it over a Unix socket.  It is started with the first
-link and ends with the driver; one that dies is replaced, after ever longer waits.
+The process shares the robot's open link: its descriptor is passed over a Unix socket.  The process starts with the
+first link and ends with the driver; if it dies, it is replaced with growing delays.
 """
 
 from __future__ import annotations
@@ -25,26 +25,26 @@ from drivers.link import reactor_or_running
 
 PROGRAM = Path(__file__).resolve().with_name("process.py")
 LEAVE_S = 0.02
-"""What is sent leaves with one of the reactor's next turns; until then it has not been said."""
+"""Seconds after which sent data has left this process, with one of the reactor's next iterations."""
 FIRST_WAIT_S, LAST_WAIT_S = 0.1, 5.0
-"""Before a process that died is replaced."""
+"""First and longest delay before a process that died is replaced."""
 REAP_S, END_S = 0.01, 1.0
-"""How often a process is looked at that was told to end, and when it is ended."""
+"""Interval of checks on a process that should end, and the time after which it is killed."""
 
 log = Logger()
 
 
 def kept(robot: str) -> DeadMan | None:
-    """A switch for ``robot``, or None, said once in the log, on a system where there can be none."""
+    """Return a switch for ``robot``; on a system that cannot run one log a warning and return None."""
     if os.name != "posix" or not hasattr(socket, "send_fds") or not sys.executable or not PROGRAM.exists():
-        log.warn("{robot}: no dead man's switch on this system; when this node freezes, nobody halts it", robot=robot)
+        log.warn("{robot}: no dead man's switch on this system; if this node freezes, the robot moves on", robot=robot)
         return None
     return Keeper(robot)
 
 
 @implementer(IReadDescriptor)
 class Keeper:
-    """Keeps the switch for ``robot`` on ``reactor`` (the running one where none is given)."""
+    """The switch for ``robot`` on ``reactor`` (None: the running one)."""
 
     log = Logger()
 
@@ -53,127 +53,127 @@ class Keeper:
         self._robot = robot
         self._given_reactor = reactor
         self._process: subprocess.Popen[bytes] | None = None
-        self._ending: list[subprocess.Popen[bytes]] = []
-        self._reaping: Any = None
+        self._ending_processes: list[subprocess.Popen[bytes]] = []
+        self._reap_timer: Any = None
         self._socket: socket.socket | None = None
-        self._began = 0.0
+        self._started_at = 0.0
         self._wait_s = FIRST_WAIT_S
-        self._word: LastWord | None = None
+        self._halt_command: LastWord | None = None
         self._end: float | None = None
         self._is_leaving = False
-        self._settling: Any = None
-        self._starting: Any = None
-        self._is_named = False
+        self._settle_timer: Any = None
+        self._start_timer: Any = None
+        self._is_warned = False
         self._closed: Deferred[None] | None = None
 
     @property
     def pid(self) -> int | None:
-        """The process, None while there is none."""
+        """The id of the process, None if there is none."""
         return None if self._process is None else self._process.pid
 
     # -- the switch -------------------------------------------------------------------------------------------------
 
     def guard(self, word: LastWord) -> None:
-        """Halt the robot by this from now on: there is a link."""
+        """Set the halt command; call this when a link opens or the command changes."""
         if self._closed is not None:
             return
-        self._word, self._is_leaving = word, False
+        self._halt_command, self._is_leaving = word, False
         if self._socket is not None:
-            self._say_word()
-        elif self._starting is None:
+            self._send_halt_command()
+        elif self._start_timer is None:
             self._start()
 
     def until(self, seconds: float) -> None:
-        """Learn, before a motion is commanded, that it is in force for so long from now."""
+        """Announce, before a motion is commanded, that it is in force for ``seconds`` from now."""
         if not self._is_leaving:
-            self._cancel("_settling")
-        # Both processes have the same clock: a word that was late on its way says the right moment all the same.
+            self._cancel("_settle_timer")
+        # Both processes read the same clock, so a delayed message still carries the correct time.
         self._end = now() + seconds
-        self._say(UNTIL, self._end)
+        self._send(UNTIL, self._end)
 
     def rest(self) -> None:
-        """Learn that a halt has just been sent, so that nothing is in force once it has left."""
+        """Announce that a halt was sent: nothing is in force once it has left this process."""
         if self._end is not None and self._closed is None:
-            self._settle_soon()
+            self._schedule_settle()
 
     def leave(self) -> None:
-        """Learn that the link is gone."""
-        if self._word is not None and self._closed is None:
+        """Announce that the link is lost."""
+        if self._halt_command is not None and self._closed is None:
             self._is_leaving = True
-            self._settle_soon()
+            self._schedule_settle()
 
     def close(self) -> Deferred[None]:
-        """End, once what was sent has left; fires when nothing is left of it."""
+        """End the process after pending data has left; fires when it has ended."""
         if self._closed is not None:
             return succeed(None)
-        self._cancel("_starting")
+        self._cancel("_start_timer")
         closed = self._closed = Deferred()
         if self._socket is not None:
-            self._settle_soon()
+            self._schedule_settle()
         else:
-            self._cancel("_settling")
+            self._cancel("_settle_timer")
             self._reap(END_S)
         return closed
 
     # -- to the process ---------------------------------------------------------------------------------------------
 
-    def _settle_soon(self) -> None:
-        if self._settling is None:
-            self._settling = self._reactor.callLater(LEAVE_S, self._settle)
+    def _schedule_settle(self) -> None:
+        if self._settle_timer is None:
+            self._settle_timer = self._reactor.callLater(LEAVE_S, self._settle)
 
     def _settle(self) -> None:
-        self._settling = None
+        self._settle_timer = None
         is_last = self._closed is not None
-        if not is_last and not self._is_leaving and self._word is not None and self._word.link.is_busy:
-            # The halt waits in this process still, and would freeze with it.
-            self._settle_soon()
+        if not is_last and not self._is_leaving and self._halt_command is not None and self._halt_command.link.is_busy:
+            # The halt is still buffered in this process and would freeze with it.
+            self._schedule_settle()
             return
         self._end = None
-        self._say(REST)
+        self._send(REST)
         if self._is_leaving:
-            self._is_leaving, self._word = False, None
-            self._say(LEAVE)
+            self._is_leaving, self._halt_command = False, None
+            self._send(LEAVE)
         if is_last:
-            self._hang_up()
+            self._close_socket()
             self._reap(END_S)
 
-    def _say_word(self) -> None:
-        word = self._word
-        if word is None:
+    def _send_halt_command(self) -> None:
+        command = self._halt_command
+        if command is None:
             return
-        if word.address is not None:
-            host, port = word.address
-            self._say(CALL, 0.0, f"{host}\0{port}\0".encode("ascii") + word.halt)
+        if command.address is not None:
+            host, port = command.address
+            self._send(CALL, 0.0, f"{host}\0{port}\0".encode("ascii") + command.halt)
             return
-        descriptor = getattr(word.link, "fileno", lambda: -1)()
+        descriptor = getattr(command.link, "fileno", lambda: -1)()
         if descriptor >= 0:
-            self._say(GUARD, 0.0, word.halt, [descriptor])
+            self._send(GUARD, 0.0, command.halt, [descriptor])
 
-    def _say(
+    def _send(
         self, kind: bytes, moment: float = 0.0, content: bytes = b"", descriptors: list[int] | None = None
     ) -> None:
         if self._socket is None:
             return
-        said = HEAD.pack(kind, moment, len(content)) + content
+        message = HEAD.pack(kind, moment, len(content)) + content
         try:
-            sent = socket.send_fds(self._socket, [said], descriptors or [])
+            sent = socket.send_fds(self._socket, [message], descriptors or [])
         except BlockingIOError:
             sent = 0
         except OSError:
-            return  # it died, as will be read
-        if sent < len(said) and self._process is not None:
-            # It does not listen: it is worth nothing.  Its end is read, and another one started.
+            return  # it died; the next read reports it
+        if sent < len(message) and self._process is not None:
+            # The process does not read.  Kill it; its end is noticed by the next read, which starts another.
             self._process.kill()
 
-    # -- its life ---------------------------------------------------------------------------------------------------
+    # -- process ----------------------------------------------------------------------------------------------------
 
     @property
     def _reactor(self) -> Any:
         return reactor_or_running(self._given_reactor)
 
     def _start(self) -> None:
-        self._starting = None
-        if self._word is None:
+        self._start_timer = None
+        if self._halt_command is None:
             return
         try:
             ours, theirs = socket.socketpair()
@@ -196,32 +196,32 @@ class Keeper:
         finally:
             theirs.close()
         ours.setblocking(False)
-        self._socket, self._began = ours, now()
+        self._socket, self._started_at = ours, now()
         self._reactor.addReader(self)
-        self._say_word()
+        self._send_halt_command()
         if self._end is not None:
-            self._say(UNTIL, self._end)
+            self._send(UNTIL, self._end)
 
     def _on_no_start(self, error: OSError) -> None:
-        if not self._is_named:
-            self.log.warn("{robot}: no dead man's switch yet: {error}", robot=self._robot, error=error)
-        self._is_named = True
-        self._start_later()
+        if not self._is_warned:
+            self.log.warn("{robot}: no dead man's switch yet, retrying: {error}", robot=self._robot, error=error)
+        self._is_warned = True
+        self._schedule_start()
 
-    def _start_later(self) -> None:
-        self._starting = self._reactor.callLater(self._wait_s, self._start)
+    def _schedule_start(self) -> None:
+        self._start_timer = self._reactor.callLater(self._wait_s, self._start)
         self._wait_s = min(2.0 * self._wait_s, LAST_WAIT_S)
 
     def fileno(self) -> int:
-        """The socket to the process; Twisted asks."""
+        """Return the socket to the process, for Twisted."""
         return -1 if self._socket is None else self._socket.fileno()
 
     def logPrefix(self) -> str:  # noqa: N802 (Twisted's)
-        """Name it in the log of the reactor."""
+        """Return the prefix in the reactor's log."""
         return "deadman"
 
     def doRead(self) -> None:  # noqa: N802 (Twisted's)
-        """Hear that it halted the robot, or died."""
+        """Read a report that it halted the robot, or notice that it died."""
         assert self._socket is not None
         try:
             data = self._socket.recv(4096)
@@ -231,46 +231,46 @@ class Keeper:
             data = b""
         if data:
             self.halts += len(data)
-            self.log.info("{robot}: this node stood still, so its dead man's switch halted it", robot=self._robot)
+            self.log.info("{robot}: this node was frozen, so its dead man's switch halted it", robot=self._robot)
         else:
             self._on_death()
 
     def connectionLost(self, reason: Failure) -> None:
-        """The reactor has no use for the socket any more."""
+        """Handle the loss of the socket."""
         self._on_death()
 
     def _on_death(self) -> None:
         if self._socket is None:
             return
-        self._hang_up()
+        self._close_socket()
         if self._closed is None:
-            if now() - self._began > LAST_WAIT_S:
-                self._wait_s, self._is_named = FIRST_WAIT_S, False
-            if not self._is_named:
-                self.log.warn("{robot}: its dead man's switch ended; another one is started", robot=self._robot)
-            self._is_named = True
-            self._start_later()
+            if now() - self._started_at > LAST_WAIT_S:
+                self._wait_s, self._is_warned = FIRST_WAIT_S, False
+            if not self._is_warned:
+                self.log.warn("{robot}: its dead man's switch died; starting another one", robot=self._robot)
+            self._is_warned = True
+            self._schedule_start()
         else:
-            self._cancel("_settling")
+            self._cancel("_settle_timer")
         self._reap(0.0)
 
-    def _hang_up(self) -> None:
-        """Close the socket: the process ends by itself."""
+    def _close_socket(self) -> None:
+        """Close the socket, upon which the process ends by itself."""
         if self._socket is not None and self._process is not None:
             self._reactor.removeReader(self)
             self._socket.close()
-            self._ending.append(self._process)
+            self._ending_processes.append(self._process)
             self._socket = self._process = None
 
     def _reap(self, patience: float) -> None:
-        """Take note of processes that have ended, and end those that have not after so many seconds."""
-        self._cancel("_reaping")
-        self._ending = [one for one in self._ending if one.poll() is None]
-        if self._ending:
+        """Reap processes that have ended, and kill the others after ``patience`` seconds."""
+        self._cancel("_reap_timer")
+        self._ending_processes = [process for process in self._ending_processes if process.poll() is None]
+        if self._ending_processes:
             if patience <= 0.0:
-                for process in self._ending:
+                for process in self._ending_processes:
                     process.kill()
-            self._reaping = self._reactor.callLater(REAP_S, self._reap, patience - REAP_S)
+            self._reap_timer = self._reactor.callLater(REAP_S, self._reap, patience - REAP_S)
         elif self._closed is not None and not self._closed.called:
             self._closed.callback(None)
 

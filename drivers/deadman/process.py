@@ -1,11 +1,11 @@
-"""Process: the dead man's switch itself, a program of its own that outlives a frozen node and halts the robot.
+"""The process of the dead man's switch: it outlives a frozen node and halts the robot.
 
-It hears from its node, over a socket that is its standard input, which bytes halt the robot, where they go, and until
-which moment a motion is in force.  When that moment is over without a newer word, or the socket closes while a motion
-is in force, it writes those bytes, three times.  It ends with the node.
+The node sends it, over a socket that is its standard input, the bytes that halt the robot, their destination, and the
+end of the motion in force.  When that time passes without a newer message, or the socket closes while a motion is in
+force, the process writes those bytes, three times.  It ends with the node.
 
-It is started without site packages and imports next to nothing (``_socket`` and ``_signal`` spare it what ``socket``
-and ``signal`` would load), so that it is ready within some 30 ms and takes some 9 MiB, of which not 4 are its own.
+It starts without site packages and imports almost nothing (``_socket`` and ``_signal`` avoid the imports of ``socket``
+and ``signal``), so it is ready within about 30 ms and takes about 9 MiB, of which less than 4 are private.
 """
 
 from __future__ import annotations
@@ -18,137 +18,140 @@ import time
 from struct import Struct
 
 HEAD = Struct("<cdI")
-"""Each word of the node: its kind, a moment, and how many bytes follow."""
+"""Header of each message of the node: kind, time, and number of bytes that follow."""
 GUARD, CALL, UNTIL, REST, LEAVE = b"g", b"c", b"u", b"r", b"l"
-"""``GUARD`` brings a descriptor and the bytes that halt; ``CALL`` host, port and a request, with NUL between."""
+"""Kinds of messages.
+
+``GUARD`` carries a descriptor and the bytes that halt; ``CALL`` host, port and a request, separated by NUL.
+"""
 HALTED = b"."
-"""What the node is told each time."""
+"""Sent to the node after each halt."""
 GRACE_S = 0.05
-"""The node has so long after the end of a motion to say that it is at rest, before it is taken for frozen."""
+"""Seconds after the end of a motion within which a running node reports rest; after that it counts as frozen."""
 AGAIN_S, TIMES = 0.1, 3
-"""How often a halt is said: one that fell into a command that the node had written in part is lost."""
+"""Interval and number of repetitions of a halt: one written into the middle of a partly written command is lost."""
 ANSWER_S = 0.25
-"""A server has so long to answer a request."""
+"""Seconds to wait for a server's answer."""
 TICK_S = 0.05
-"""Waiting stands still while the machine is suspended, so nothing in force is waited for longer than that."""
+"""Longest wait while a motion is in force: waits do not progress while the machine is suspended."""
 FDS = Struct("<i")
 
 
 def now() -> float:
-    """Seconds on the clock of this machine that no one sets and that counts time suspended; the node has the same."""
+    """Return seconds on a clock that is never set and counts suspended time; the node uses the same clock."""
     return time.clock_gettime(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))
 
 
 class Open:
-    """A way to the robot that is open: a socket or a serial device, whose other user is the node."""
+    """An open connection to the robot, a socket or a serial device, which the node uses as well."""
 
     def __init__(self, descriptor: int) -> None:
         self._descriptor = descriptor
         self._left = b""
 
     def say(self, halt: bytes) -> bool:
-        """Write without waiting, what was cut off last time first; nobody tells whether it was heard."""
-        said = self._left + halt
+        """Write without blocking, bytes left over from the last call first; return False, as nothing confirms it."""
+        data = self._left + halt
         try:
             poll = select.poll()
             poll.register(self._descriptor, select.POLLOUT)
             if poll.poll(0):
-                self._left = said[os.write(self._descriptor, said) :]
+                self._left = data[os.write(self._descriptor, data) :]
         except OSError:
-            pass  # the link is dead: nobody can
+            pass  # the link is dead
         return False
 
     def close(self) -> None:
-        """Let go of it: only then is it closed, if the node has closed it, too."""
+        """Close this descriptor; the connection closes when the node has closed its descriptor as well."""
         os.close(self._descriptor)
 
 
 class Server:
-    """A way to a robot that takes each command by a connection of its own."""
+    """A robot that takes each command over a new connection."""
 
     def __init__(self, host: str, port: int) -> None:
         self._family = _socket.AF_INET6 if ":" in host else _socket.AF_INET
         self._address = (host, port)
 
     def say(self, request: bytes) -> bool:
-        """Ask, and wait a little; whether it was answered."""
-        asking = _socket.socket(self._family, _socket.SOCK_STREAM)
+        """Send the request and wait up to ``ANSWER_S``; return whether it was answered."""
+        connection = _socket.socket(self._family, _socket.SOCK_STREAM)
         try:
-            asking.settimeout(ANSWER_S)
-            asking.connect(self._address)
-            asking.send(request)
-            return bool(asking.recv(1))
+            connection.settimeout(ANSWER_S)
+            connection.connect(self._address)
+            connection.send(request)
+            return bool(connection.recv(1))
         except OSError:
             return False
         finally:
-            asking.close()
+            connection.close()
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Do nothing: no connection is open."""
 
 
 class Watch:
-    """One robot: the way to it, what halts it, and until when a motion is in force."""
+    """One robot: its connection, its halt command, and the end of the motion in force."""
 
     def __init__(self) -> None:
         self.halts = 0
-        self._way: Open | Server | None = None
+        self._target: Open | Server | None = None
         self._halt = b""
         self._end: float | None = None
         self._times = 0
         self._again_at = 0.0
 
-    def guard(self, way: Open | Server, halt: bytes) -> None:
-        """Halt by this from now on; what is in force stays so."""
+    def guard(self, target: Open | Server, halt: bytes) -> None:
+        """Set the connection and the halt command; a motion in force stays in force."""
         self._close()
-        self._way, self._halt = way, halt
+        self._target, self._halt = target, halt
 
     def until(self, moment: float) -> None:
-        """Take a motion that is in force up to ``moment``."""
+        """Set the end of the motion in force."""
         self._end, self._times = moment, 0
 
     def rest(self) -> None:
-        """Take it that nothing is in force."""
+        """Clear the motion in force."""
         self._end, self._times = None, 0
 
     def leave(self) -> None:
-        """Forget the way."""
+        """Clear the motion and close the connection."""
         self.rest()
         self._close()
 
     def end(self, moment: float) -> None:
-        """The node is gone: halt now, if anything is in force."""
+        """Handle the end of the node: halt now if a motion is in force."""
         if self._end is not None:
             self._end = moment - GRACE_S
 
     def wait(self, moment: float) -> float | None:
-        """Seconds until there is something to do; None where nothing is in force."""
+        """Return the seconds until ``turn`` is due; None if nothing is in force."""
         if self._times:
             return max(0.0, self._again_at - moment)
         return None if self._end is None else max(0.0, self._end + GRACE_S - moment)
 
     def turn(self, moment: float) -> None:
-        """Do what is due."""
+        """Send the halts that are due."""
         if self._end is not None and moment >= self._end + GRACE_S:
             self._end = None
-            if self._way is not None:
+            if self._target is not None:
                 self.halts += 1
                 self._times, self._again_at = TIMES, moment
-        if self._times and moment >= self._again_at and self._way is not None:
+        if self._times and moment >= self._again_at and self._target is not None:
             self._times -= 1
             self._again_at = moment + AGAIN_S
-            if self._way.say(self._halt):
+            if self._target.say(self._halt):
                 self._times = 0
 
     def _close(self) -> None:
-        way, self._way = self._way, None
+        target, self._target = self._target, None
         self._times = 0
-        if way is not None:
-            way.close()
+        if target is not None:
+            target.close()
 
 
 class Ear:
-    """What the node says, cut anyhow, to the ``watch``."""
+    """Parses messages of the node, cut at any byte, and applies them to ``watch``."""
 
     def __init__(self, watch: Watch) -> None:
         self._watch = watch
@@ -156,7 +159,7 @@ class Ear:
         self._descriptors: list[int] = []
 
     def heard(self, data: bytes, descriptors: list[int]) -> None:
-        """Take bytes, and the descriptors that came with them."""
+        """Take bytes, and the descriptors that arrived with them."""
         self._descriptors += descriptors
         self._rest += data
         while len(self._rest) >= HEAD.size:
@@ -179,8 +182,8 @@ class Ear:
 
 
 def main() -> None:
-    """Watch until the node is gone, and the robot at rest."""
-    # The node ends first, whoever is told to end: Ctrl-C and service managers tell all.
+    """Run until the node is gone and the robot is at rest."""
+    # Ctrl-C and service managers signal all processes; this one has to end after its node.
     for number in (_signal.SIGINT, _signal.SIGTERM, _signal.SIGHUP, _signal.SIGQUIT, _signal.SIGTSTP):
         _signal.signal(number, _signal.SIG_IGN)
     node = _socket.socket(fileno=0)
@@ -191,7 +194,7 @@ def main() -> None:
     ear = Ear(watch)
     is_open = True
     while True:
-        told = watch.halts
+        halts_before = watch.halts
         wait = watch.wait(now())
         if not is_open:
             if wait is None:
@@ -202,20 +205,20 @@ def main() -> None:
             if not is_open:
                 watch.end(now())
         watch.turn(now())
-        if watch.halts > told and is_open:
+        if watch.halts > halts_before and is_open:
             tell(node)
 
 
 def tell(node: _socket.socket) -> None:
-    """Say that the robot was halted; a frozen node reads it later."""
+    """Report a halt to the node; a frozen node reads it later."""
     try:
         node.send(HALTED)
     except OSError:
-        return  # it is gone, as will be heard
+        return  # the node is gone; the next read reports it
 
 
 def listened(node: _socket.socket, ear: Ear) -> bool:
-    """Hear all that there is to hear, so that newer words count before time does; whether the node is there."""
+    """Read all pending messages, so that newer ones count before time does; return whether the node still runs."""
     while True:
         try:
             data, extras, _, _ = node.recvmsg(65536, _socket.CMSG_SPACE(4 * FDS.size))

@@ -1,7 +1,7 @@
-"""Switch: what a driver holds of its dead man's switch, and the twin of it in memory.
+"""The interface of a dead man's switch, and an implementation in memory for tests.
 
-A driver says which bytes halt its robot, until when a motion is in force, and when the robot is at rest.  Whoever
-keeps the switch halts the robot when the time is over and no newer word has come.
+A driver reports the bytes that halt its robot, the end of the motion in force, and when the robot is at rest.  The
+switch halts the robot when that time passes without a newer message.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from drivers.link import Link
 
 @dataclass(frozen=True)
 class LastWord:
-    """The bytes that halt a robot, whole, and where they go.
+    """The bytes that halt a robot, as one complete command, and their destination.
 
-    That is the open ``link`` itself, or, where each command has a connection of its own, the numeric ``address`` and
-    port of a server.
+    The destination is the open ``link``, or, if each command uses a new connection, the numeric ``address`` and port of
+    a server.
     """
 
     halt: bytes
@@ -28,31 +28,31 @@ class LastWord:
 
 
 class DeadMan(Protocol):
-    """A switch for one robot; nothing here blocks."""
+    """A switch for one robot; no method blocks."""
 
     @property
     def halts(self) -> int:
-        """How often it has halted the robot."""
+        """The number of times that it has halted the robot."""
 
     def guard(self, word: LastWord) -> None:
-        """Halt the robot by this from now on: there is a link."""
+        """Set the halt command; call this when a link opens or the command changes."""
 
     def until(self, seconds: float) -> None:
-        """Learn, before a motion is commanded, that it is in force for so long from now."""
+        """Announce, before a motion is commanded, that it is in force for ``seconds`` from now."""
 
     def rest(self) -> None:
-        """Learn that a halt has just been sent, so that nothing is in force once it has left."""
+        """Announce that a halt was sent: nothing is in force once it has left this process."""
 
     def leave(self) -> None:
-        """Learn that the link is gone."""
+        """Announce that the link is lost."""
 
     def close(self) -> Deferred[None]:
-        """End, once what was sent has left; fires when nothing is left of it."""
+        """End the switch after pending data has left; fires when all its resources are released."""
 
 
 @dataclass
 class MemoryDeadMan:
-    """A switch that halts nothing, and keeps what it was told: ``seconds`` is None while nothing is in force."""
+    """A switch that only records its calls; ``seconds`` is None while nothing is in force."""
 
     halts: int = 0
     word: LastWord | None = None
@@ -61,27 +61,27 @@ class MemoryDeadMan:
     told: list[str] = field(default_factory=list)
 
     def guard(self, word: LastWord) -> None:
-        """Keep the word."""
+        """Record the halt command."""
         self.word = word
         self.told.append("guard")
 
     def until(self, seconds: float) -> None:
-        """Keep how long."""
+        """Record the duration."""
         self.seconds = seconds
         self.told.append("until")
 
     def rest(self) -> None:
-        """Keep that nothing is in force."""
+        """Record that nothing is in force."""
         self.seconds = None
         self.told.append("rest")
 
     def leave(self) -> None:
-        """Keep that there is no link."""
+        """Record that there is no link."""
         self.word = None
         self.told.append("leave")
 
     def close(self) -> Deferred[None]:
-        """Keep that it ended."""
+        """Record the end."""
         self.is_closed = True
         self.told.append("close")
         return succeed(None)

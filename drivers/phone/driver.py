@@ -1,4 +1,4 @@
-"""PhoneDriver: a visitor's phone, whose looks come in from outside; it senses, and moves as its visitor does."""
+"""Driver of a visitor's phone: its pictures are handed in by the web node; it senses, and its visitor moves it."""
 
 from __future__ import annotations
 
@@ -17,43 +17,43 @@ from drivers.reading import Description, Frame, Value
 MANIFEST = Manifest()
 
 SIGHT = ("target.bearing", "target.distance")
-"""Where the phone's own page sees the red target: radians, left positive, and metres; NaN while it sees none."""
+"""Position of the red target in the page's detection: radians, left positive, and metres; NaN if it is not seen."""
 
 
 class PhoneDriver(SensingDriver):
-    """One phone, whose page sends what it sees."""
+    """One phone; its page sends pictures and measurements."""
 
     STALE_S = 0.5
 
     def __init__(self, options: Options | Mapping[str, object], clock: IReactorTime) -> None:
         options = options if isinstance(options, Options) else checked(options)
         super().__init__(described(options), "the phone", clock)
-        self._began = 0.0
+        self._started_at = 0.0
 
     def look(self, jpeg: bytes, width: int, height: int, values: Mapping[str, float]) -> None:
-        """Take one picture and what was measured with it; before ``connect`` and after the end it is dropped."""
+        """Take one picture with its measurements; dropped before ``connect`` and after the end."""
         if self.state in ("idle", "closed"):
             return
         if self.state != "ready" and self.state != "stopped":
             self._up()
         self._counts["frames"] += 1
         self._counts["bytes"] += len(jpeg)
-        t = self._clock.seconds() - self._began
+        t = self._clock.seconds() - self._started_at
         sensed: dict[str, Value] = {**dict.fromkeys(SIGHT, math.nan), **values}
         self._observed(sensed, t, frame=Frame(self._counts["frames"], width, height, jpeg, t))
 
     def _open(self) -> None:
-        self._began = self._clock.seconds()
+        self._started_at = self._clock.seconds()
 
     def _close(self) -> Deferred[None]:
         return succeed(None)
 
 
 def make_driver(options: Mapping[str, object], name: str, clock: IReactorTime, connector: Any) -> PhoneDriver:
-    """A driver of a phone; it opens no link, as looks are handed to it."""
+    """Return a driver of a phone; it opens no link, because pictures are passed to ``look``."""
     return PhoneDriver(options, clock)
 
 
 def describe(options: Mapping[str, object], name: str) -> Description:
-    """What that phone is."""
+    """Return the description of that phone."""
     return described(checked(options))

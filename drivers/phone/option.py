@@ -1,4 +1,4 @@
-"""Options of the kind "phone": what its browser said that the phone has, checked."""
+"""Options of the kind "phone": the features that its browser reported."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from drivers.reading import Description
 from formats.convert import Unit
 
 LENS_DEG = 65.0
-"""Across the longer side of the picture.  No browser tells it; those of phones are from 60 to 75."""
+"""Field of view across the longer side of the picture.  No browser reports it; phones have 60 to 75 degrees."""
 LEAST_SIDE, MOST_SIDE = 16, 640
-"""Pixels of a side of a picture."""
+"""Smallest and largest side of a picture, in pixels."""
 Side = Annotated[int, Meta(ge=LEAST_SIDE, le=MOST_SIDE), Unit("pixels")]
 FPS = 10.0
-"""Pictures a second that a phone is asked for while it has a task."""
+"""Pictures per second that are requested from a phone with a task."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """The pictures' size in pixels, and whether the phone tells how it is held and where it is."""
+    """The pictures' size in pixels, and whether the phone reports its orientation and position."""
 
     width: Side = 208
     height: Side = 156
@@ -32,12 +32,12 @@ class Options:
 
 
 def checked(table: Mapping[str, object]) -> Options:
-    """The options in ``table``; raises ``UsageError`` that names the key and what to write instead."""
+    """Convert and check ``table``; raise ``UsageError`` that names the key and the remedy."""
     return convert_options("phone", table, Options)
 
 
 def described(options: Options) -> Description:
-    """What the phone is; it has no motor, so there is nothing that it can be told to do."""
+    """Return the description of the phone; it has no motor, so it has no actions."""
     lens = "fov_h_deg" if options.width >= options.height else "fov_v_deg"
     camera = {"width": options.width, "height": options.height, "fps": FPS, lens: LENS_DEG}
     capabilities: dict[str, Mapping[str, float | str]] = {"camera": camera}

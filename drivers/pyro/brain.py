@@ -1,4 +1,4 @@
-"""Brain: what decides for a robot ten times a second; and Engine, which lets one run."""
+"""Brains, which control a robot in steps of 0.1 s, and the engine that runs one."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SHORT_WAYS = (
 
 
 class Brain:
-    """A brain: override ``setup``, ``step``, and ``destroy`` where there is something to give back."""
+    """A brain: override ``setup``, ``step``, and, to release resources, ``destroy``."""
 
     robot: PyroRobot
     pauseTime = 0.1
@@ -34,29 +34,29 @@ class Brain:
         self.setup(**arguments)
 
     def __getattr__(self, name: str) -> Any:
-        """The short ways to the robot: ``self.move(0.5, 0.0)`` is ``self.robot.move(0.5, 0.0)``."""
+        """Delegate to the robot: ``self.move(0.5, 0.0)`` is ``self.robot.move(0.5, 0.0)``."""
         if name == "robot":
-            raise AttributeError("this brain was made without an engine, so it has no robot")
+            raise AttributeError("this brain has no engine and therefore no robot")
         if name not in SHORT_WAYS:
             raise AttributeError(f"a brain has no {name}")
         return getattr(self.robot, name)
 
     def setup(self, **arguments: Any) -> None:
-        """Get ready."""
+        """Initialize the brain."""
 
     def step(self) -> None:
-        """Decide once; called after the robot was updated."""
+        """Make one decision; called after the robot was updated."""
         raise NotImplementedError(f"{type(self).__name__} has no step")
 
     def destroy(self) -> None:
-        """Give back what was taken in ``setup``."""
+        """Release the resources of ``setup``."""
 
     def pleaseStop(self) -> None:
-        """Pause: the robot stands."""
+        """Pause; the robot stands still."""
         self.needToStop = 1
 
     def pleaseRun(self) -> None:
-        """Go on."""
+        """Continue."""
         self.needToStop = 0
 
     def quit(self) -> None:
@@ -64,16 +64,16 @@ class Brain:
         self.needToQuit = 1
 
     def getEngine(self) -> Engine | None:
-        """What lets it run."""
+        """Return the engine."""
         return self.engine
 
     def getRobot(self) -> PyroRobot:
-        """As ``robot``."""
+        """Return ``robot``."""
         return self.robot
 
 
 class Engine:
-    """Lets one brain run on ``robot``; ``init`` makes it out of the engine, as ``INIT`` in a brain's file does."""
+    """Runs one brain on ``robot``; ``init`` creates it from the engine, like ``INIT`` in a brain's file."""
 
     def __init__(self, robot: PyroRobot, clock: IReactorTime) -> None:
         self.robot = robot
@@ -82,7 +82,7 @@ class Engine:
         self._loop: LoopingCall | None = None
 
     def run(self, init: Callable[[Engine], Brain]) -> Deferred[None]:
-        """Make the brain and step it; fires once it has quit, and fails with what it raises.  The robot stands then."""
+        """Create the brain and step it; fires when it has quit, fails with its exception.  Finally, stop the robot."""
         self.robot.update()
         self.robot.localize()
         brain = self.brain = init(self)

@@ -1,4 +1,4 @@
-"""Camera: the robot's newest picture, and a row of filters that tell what is in it."""
+"""The robot's newest picture, and a list of filters that analyse it."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from drivers.reading import Frame, Value
 from formats.jpeg import size_of
 
 Blob = tuple[int, int, int, int, int]
-"""Left, top, right and bottom in pixels from the upper left corner, and the area; all 0: none."""
+"""Left, top, right and bottom in pixels from the upper left corner, and the area; all 0 for none."""
 Filter = Callable[["Camera"], Any]
 TOLERANCE = 30
 DEPTH = 3
 
 
 class Camera(Device):
-    """The camera; ``width`` and ``height`` in pixels, ``depth`` bytes each.
+    """The camera; ``width`` and ``height`` in pixels, ``depth`` bytes per pixel.
 
-    ``addFilter`` names one of ``match`` (red, green, blue, tolerance: marks the pixels of about that colour) and
-    ``blobify`` (channel, low, high, sort, size, draw, count: the largest patches of what was marked, or without a mark
-    of that brightness), or is a function of this camera.  With each new picture all of them run in turn, and
-    ``filterResults`` has what each has told.
+    ``addFilter`` takes the name ``match`` (red, green, blue, tolerance: marks pixels of about that colour), the name
+    ``blobify`` (channel, low, high, sort, size, draw, count: the largest blobs of marked pixels, or of that brightness
+    if none are marked), or a function of this camera.  All filters run on each new picture, and ``filterResults`` has
+    their results.
     """
 
     depth = DEPTH
@@ -41,44 +41,44 @@ class Camera(Device):
 
     @property
     def data(self) -> bytes:
-        """The newest picture, three bytes a pixel (red, green, blue), row by row; empty before the first."""
-        return b"" if self._picture() is None else bytes(self._image.tobytes())
+        """The newest picture, three bytes per pixel (red, green, blue), row by row; empty before the first."""
+        return b"" if self._load_picture() is None else bytes(self._image.tobytes())
 
     def addFilter(self, name: str | Filter, *arguments: float) -> None:
-        """Run this filter from the next picture on, after those that are there."""
+        """Append a filter, which runs from the next picture on."""
         if callable(name):
             self._filters.append((name, getattr(name, "__name__", "filter")))
             return
         if name not in ("match", "blobify"):
-            raise AttributeError(f"no filter is called {name!r}; there are match and blobify, or give a function")
+            raise AttributeError(f"unknown filter {name!r}; known are match and blobify, or pass a function")
         self._filters.append((lambda camera: camera.apply(name, *arguments), name))
 
     def clearFilters(self) -> None:
-        """Run none."""
+        """Remove all filters."""
         self._filters, self.filterResults = [], []
 
     def apply(self, name: str, *arguments: float) -> Any:
-        """Run one filter now, as a function given to ``addFilter`` may do."""
+        """Run one filter now; for functions given to ``addFilter``."""
         whole = [int(value) for value in arguments]
         return self._match(*whole) if name == "match" else self._blobify(*whole)
 
     def see(self, frame: Frame | None) -> None:
-        """Take a picture, if it is a new one, and run the filters on it."""
+        """Take a picture if it is new, and run the filters on it."""
         if frame is None or frame.seq == self._seq:
             return
         self._seq, self._frame, self._image, self._marked = frame.seq, frame, None, None
-        if self._filters and self._picture() is not None:
+        if self._filters and self._load_picture() is not None:
             self.filterResults = [each(self) for each, _ in self._filters]
 
     def update(self, values: Mapping[str, Value], now: float) -> None:
-        """Nothing of what the robot feels concerns its camera."""
+        """Ignore the sensor values; a camera has none."""
         self.timestamp = now
 
-    def _picture(self) -> Any:
+    def _load_picture(self) -> Any:
         frame, self._frame = self._frame, None
         if frame is not None:
             try:
-                self._image = _decoded(frame.data)
+                self._image = _decode_picture(frame.data)
             except BadFrame:
                 self.bad_pictures += 1
                 return self._image
@@ -89,7 +89,7 @@ class Camera(Device):
     def _match(self, red: int, green: int, blue: int, tolerance: int = TOLERANCE, *_: int) -> int:
         import numpy as np
 
-        image = self._picture()
+        image = self._load_picture()
         off = np.abs(image.astype(np.int16) - np.array((red, green, blue), np.int16))
         matching = (off <= tolerance).all(axis=2)
         self._marked = matching if self._marked is None else self._marked | matching
@@ -109,7 +109,7 @@ class Camera(Device):
         import cv2
         import numpy as np
 
-        image = self._picture()
+        image = self._load_picture()
         plane = image[:, :, channel]
         marked = (plane >= low) & (plane <= high) if self._marked is None else self._marked
         found, _, stats, _ = cv2.connectedComponentsWithStats(marked.astype(np.uint8), connectivity=8)
@@ -119,8 +119,11 @@ class Camera(Device):
         return [*blobs, *[(0, 0, 0, 0, 0)] * count][:count]
 
 
-def _decoded(data: bytes) -> Any:
-    """The picture as rows of red, green, blue; raises ``BadFrame``, and ``UsageError`` where OpenCV is missing."""
+def _decode_picture(data: bytes) -> Any:
+    """Decode a picture to rows of red, green, blue.
+
+    Raises ``BadFrame`` for an invalid picture and ``UsageError`` if OpenCV is missing.
+    """
     try:
         import cv2
         import numpy as np
@@ -128,5 +131,5 @@ def _decoded(data: bytes) -> Any:
         raise UsageError("pictures need OpenCV: pip install 'swarm-node[vision]'") from error
     picture = None if size_of(data) is None else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     if picture is None:
-        raise BadFrame(f"{len(data)} bytes are no picture")
+        raise BadFrame(f"{len(data)} bytes are not a picture")
     return np.ascontiguousarray(picture[:, :, ::-1])

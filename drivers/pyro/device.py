@@ -1,4 +1,4 @@
-"""Device: what a robot has, as brains know it: range sensors, bumpers, a position, a battery, a head."""
+"""Devices of a robot in Pyro's interface: range sensors, bumpers, position, battery, head."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ DIRECTIONS: Mapping[str, float] = {
     **{"front_left": 45.0, "left": 90.0, "back_left": 135.0, "back": 180.0},
     **{"back_right": -135.0, "right": -90.0, "front_right": -45.0},
 }
-"""Where a ranger of this name looks, in degrees; one of another name where its capability says ``NAME_deg``."""
+"""Direction of a ranger by its name, in degrees; other names have ``NAME_deg`` in the capability."""
 UNITS = ("ROBOTS", "METERS", "CM", "MM", "SCALED", "RAW")
 ALIASES = {"M": "METERS", "ROBOT": "ROBOTS"}
 ARC = math.radians(20.0)
@@ -33,11 +33,11 @@ GROUPS: Mapping[str, tuple[float, float]] = {
     "back": (157.5, 202.5),
     "back-all": (112.5, 247.5),
 }
-"""Degrees from the right edge of a group to its left edge."""
+"""Range of each group in degrees, from its right to its left edge."""
 
 
 class Geometry(NamedTuple):
-    """Where a sensor sits on the robot (metres), where it looks (radians, left positive), and how wide it sees."""
+    """Position of a sensor on the robot (metres), its direction (radians, left positive), and its field of view."""
 
     x: float
     y: float
@@ -47,9 +47,9 @@ class Geometry(NamedTuple):
 
 
 class SensorValue:
-    """One reading: ``metres`` from the sensor; where nothing is in reach that is ``most``, the farthest it measures.
+    """One reading: ``metres`` from the sensor, or ``most``, its maximum, if nothing is in range.
 
-    ``unit`` is the one of ``value``; ``radius`` is the robot's.  ``noise`` is 0: what is told is what was measured.
+    ``unit`` is the unit of ``value``; ``radius`` is the robot's.  ``noise`` is 0: no noise is added.
     """
 
     noise = 0.0
@@ -70,23 +70,23 @@ class SensorValue:
         return self.distance()
 
     def distance(self, unit: str | None = None) -> float:
-        """The distance in ``unit``: ``ROBOTS`` (robots' diameters), ``METERS``, ``CM``, ``MM``, ``SCALED``, ``RAW``."""
+        """Return the distance in ``unit``: ``ROBOTS`` (diameters), ``METERS``, ``CM``, ``MM``, ``SCALED``, ``RAW``."""
         name = unit_named(unit or self._unit)
         if name == "ROBOTS":
             return self.rawValue / (2.0 * self._radius)
         return self.rawValue * {"CM": 100.0, "MM": 1000.0, "SCALED": 1.0 / self._most}.get(name, 1.0)
 
     def angle(self, unit: str = "degrees") -> float | None:
-        """Where it looks, left positive; None where nobody knows."""
+        """Return the direction of the sensor, left positive; None if it is unknown."""
         if unit.lower() not in ("degrees", "radians"):
-            raise AttributeError(f"an angle is in degrees or radians, not in {unit!r}")
+            raise AttributeError(f"the unit of an angle is degrees or radians, not {unit!r}")
         if self.geometry is None:
             return None
         return math.degrees(self.geometry.theta) if unit.lower() == "degrees" else self.geometry.theta
 
     @property
     def hit(self) -> tuple[float | None, float | None, float | None]:
-        """The point that it measured, in metres from the middle of the robot."""
+        """The measured point, in metres from the centre of the robot."""
         if self.geometry is None:
             return None, None, None
         x, y, z, theta, _ = self.geometry
@@ -94,16 +94,16 @@ class SensorValue:
 
 
 def unit_named(name: str) -> str:
-    """The unit called so; raises ``AttributeError``, which names those there are."""
+    """Return the unit of this name; raise ``AttributeError`` that lists the known units."""
     upper = name.upper()
     found = ALIASES.get(upper, upper)
     if found not in UNITS:
-        raise AttributeError(f"no unit is called {name!r}; there are {', '.join(UNITS)}")
+        raise AttributeError(f"unknown unit {name!r}; known are {', '.join(UNITS)}")
     return found
 
 
 class Device:
-    """A device of ``type``; ``update`` gives it what the robot feels now."""
+    """A device of ``type``; ``update`` passes it the newest sensor values."""
 
     def __init__(self, kind: str) -> None:
         self.type = kind
@@ -116,11 +116,11 @@ class Device:
         self.values: Mapping[str, Value] = {}
 
     def update(self, values: Mapping[str, Value], now: float) -> None:
-        """Take in what the robot feels."""
+        """Take the newest sensor values."""
         self.values, self.timestamp = values, now
 
     def getSensorValue(self, pos: int) -> SensorValue:
-        """The reading of the sensor at ``pos``."""
+        """Return the reading of the sensor at ``pos``."""
         raise IndexError(f"the {self.type} has no sensor {pos}")
 
     def __len__(self) -> int:
@@ -128,7 +128,7 @@ class Device:
 
 
 class Rows(Device):
-    """A device of several sensors; ``places`` maps a key of an observation to where the sensor is."""
+    """A device of several sensors; ``places`` maps a key of an observation to the position of the sensor."""
 
     units = "ROBOTS"
     rawunits = "METERS"
@@ -141,22 +141,22 @@ class Rows(Device):
         self._keys: list[str] = []
 
     def update(self, values: Mapping[str, Value], now: float) -> None:
-        """Take in what the robot feels; its sensors count from the left."""
+        """Take the newest sensor values; the sensors are numbered from the left."""
         super().update(values, now)
         self._keys = [key for key in self._places if key in values]
 
     def setUnits(self, name: str) -> None:
-        """Have ``value`` in this unit from now on."""
+        """Set the unit of ``value``."""
         self.units = unit_named(name)
 
     def getSensorValue(self, pos: int) -> SensorValue:
-        """The reading of the sensor at ``pos``, from the left."""
+        """Return the reading of the sensor at ``pos``, from the left."""
         key = self._keys[pos]
         return SensorValue(float(self.values[key]), self.maxvalueraw, pos, self._places[key], self.radius, self.units)
 
     @property
     def groups(self) -> dict[str, tuple[int, ...]]:
-        """The names of groups of sensors, and which these are."""
+        """The names of the groups, and the positions of their sensors."""
         found = {"all": tuple(range(len(self)))}
         for name, (low, high) in GROUPS.items():
             found[name] = tuple(one.pos for one in self if _is_within(one.angle(), low, high))
@@ -175,7 +175,7 @@ class Rows(Device):
             return [self.getSensorValue(pos) for pos in range(len(self))[item]]
         if isinstance(item, str):
             if item not in GROUPS and item != "all":
-                raise AttributeError(f"the {self.type} has no group {item!r}; there are all, {', '.join(GROUPS)}")
+                raise AttributeError(f"the {self.type} has no group {item!r}; known are all, {', '.join(GROUPS)}")
             item = self.groups[item]
         return [self.getSensorValue(pos) for pos in item]
 
@@ -197,49 +197,49 @@ class Rows(Device):
 
     @property
     def pos(self) -> list[int]:
-        """The places in the row."""
+        """The positions of the sensors."""
         return [one.pos for one in self]
 
     @property
     def geometry(self) -> list[Geometry | None]:
-        """Where each is."""
+        """The geometry of each sensor."""
         return [one.geometry for one in self]
 
     @property
     def hit(self) -> list[tuple[float | None, float | None, float | None]]:
-        """The points that were measured."""
+        """The measured points."""
         return [one.hit for one in self]
 
     @property
     def noise(self) -> list[float]:
-        """None is added."""
+        """The noise of each reading, always 0."""
         return [one.noise for one in self]
 
     def distance(self, unit: str | None = None) -> list[float]:
-        """All distances in ``unit``."""
+        """Return all distances in ``unit``."""
         return [one.distance(unit) for one in self]
 
     def angle(self, unit: str = "degrees") -> list[float | None]:
-        """Where each looks."""
+        """Return the direction of each sensor."""
         return [one.angle(unit) for one in self]
 
     def span(self, start: float, stop: float, units: str = "degrees") -> list[SensorValue]:
-        """Those that look between two angles, whichever is the left one."""
+        """Return the sensors between two angles, given in any order."""
         low, high = min(start, stop), max(start, stop)
         return [one for one in self if (angle := one.angle(units)) is not None and low <= angle <= high]
 
 
 class Bumper(Rows):
-    """The bumpers; ``value`` is 1 where one is pressed."""
+    """The bumpers; ``value`` is 1 for a pressed bumper."""
 
     def getSensorValue(self, pos: int) -> SensorValue:
-        """Whether the bumper at ``pos``, from the left, is pressed: 1 or 0."""
+        """Return 1 if the bumper at ``pos``, from the left, is pressed, else 0."""
         key = self._keys[pos]
         return SensorValue(float(bool(self.values[key])), 1.0, pos, self._places[key], self.radius, "RAW")
 
 
 class Battery(Device):
-    """The battery: ``level`` 0 to 1, ``volts``; None where the robot does not say."""
+    """The battery: ``level`` 0 to 1, ``volts``; None if the robot does not report it."""
 
     @property
     def level(self) -> float | None:
@@ -262,11 +262,11 @@ class Pose(NamedTuple):
 
 
 AXES = {"pan": "pan", "tilt": "tilt", "roll": "nod"}
-"""What the brain calls it, and what the robot does."""
+"""Names of axes in brains, and the robot's names."""
 
 
 class Ptz(Device):
-    """A head; ``look`` turns joints to radians, ``limits`` are those of the robot (``pan_min``, ``pan_max`` ...)."""
+    """A head; ``look`` turns joints to radians, ``limits`` are the robot's (``pan_min``, ``pan_max`` ...)."""
 
     supports = ("pan", "tilt", "roll")
 
@@ -276,11 +276,11 @@ class Ptz(Device):
         self._limits = limits
 
     def pan(self, share: float) -> None:
-        """Look to the left (to 1) or to the right (to -1)."""
+        """Turn left (to 1) or right (to -1)."""
         self._turn(pan=share)
 
     def tilt(self, share: float) -> None:
-        """Look down (to -1) or ahead (0)."""
+        """Tilt down (to -1) or ahead (0)."""
         self._turn(tilt=share)
 
     def roll(self, share: float) -> None:
@@ -288,21 +288,21 @@ class Ptz(Device):
         self._turn(roll=share)
 
     def zoom(self, share: float) -> None:
-        """There is none."""
+        """Do nothing: the head has no zoom."""
 
     def center(self) -> None:
-        """Look ahead."""
+        """Turn ahead."""
         self._turn(pan=0.0, tilt=0.0, roll=0.0)
 
     def setPose(self, pan: float, tilt: float, zoom: float = 0.0, roll: float | None = None) -> None:
-        """Turn all at once; the zoom is ignored."""
+        """Set all axes at once; the zoom is ignored."""
         self._turn(pan=pan, tilt=tilt, **({} if roll is None else {"roll": roll}))
 
     @property
     def pose(self) -> Pose:
-        """Where the robot says that it looks."""
-        told = {axis: self._share(joint, float(self.values.get(f"ptz.{joint}", 0.0))) for axis, joint in AXES.items()}
-        return Pose(told["pan"], told["tilt"], 0.0, told["roll"])
+        """The pose that the robot reports."""
+        pose = {axis: self._share(joint, float(self.values.get(f"ptz.{joint}", 0.0))) for axis, joint in AXES.items()}
+        return Pose(pose["pan"], pose["tilt"], 0.0, pose["roll"])
 
     def _turn(self, **shares: float) -> None:
         self._look({AXES[axis]: self._radians(AXES[axis], share) for axis, share in shares.items()})
@@ -320,17 +320,17 @@ class Ptz(Device):
 
 
 def ranger_of(description: Description, values: Mapping[str, Value]) -> Rows | None:
-    """The range sensors that a robot has; None without any.
+    """Return the range sensors of a robot; None without any.
 
-    They are called ``laser`` where there are many, ``ir`` on a dog that has a near and a far one, else ``sonar``.
+    They are named ``laser`` if there are more than four, ``ir`` on a dog with a near and a far one, else ``sonar``.
     """
-    told = description.capabilities.get("ranger")
+    capability = description.capabilities.get("ranger")
     names = [key.removeprefix("range.") for key in values if key.startswith("range.")]
-    if told is None or not names:
+    if capability is None or not names:
         return None
-    most = told.get("max", 1.0)
+    most = capability.get("max", 1.0)
     kind = "laser" if len(names) > 4 else "ir" if "near" in names else "sonar"
-    angles = {name: told.get(f"{name}_deg", DIRECTIONS.get(name, math.nan)) for name in names}
+    angles = {name: capability.get(f"{name}_deg", DIRECTIONS.get(name, math.nan)) for name in names}
     known = {name: math.radians(float(angle)) for name, angle in angles.items() if angle == angle}
     names.sort(key=lambda name: (-known.get(name, -math.inf), list(values).index(f"range.{name}")))
     places = {f"range.{name}": _on_hull(known.get(name), description.radius) for name in names}
@@ -338,7 +338,7 @@ def ranger_of(description: Description, values: Mapping[str, Value]) -> Rows | N
 
 
 def bumper_of(description: Description, values: Mapping[str, Value]) -> Bumper | None:
-    """The bumpers that a robot has; None without any."""
+    """Return the bumpers of a robot; None without any."""
     names = [key.removeprefix("bump.") for key in values if key.startswith("bump.")]
     if not names:
         return None

@@ -1,11 +1,11 @@
-"""PyroRobot: one robot as brains of 2011 drove it, over any driver of today.
+"""Pyro's robot interface of 2011 over any current driver.
 
-Thin and synchronous: each call does what it says and returns.  On the reactor's thread it calls the driver directly;
-for another thread it is made with ``partial(blockingCallFromThread, reactor)`` as its ``call``.
+All calls are synchronous.  On the reactor's thread they call the driver directly; for another thread pass
+``partial(blockingCallFromThread, reactor)`` as ``call``.
 
-It is a robot of a lab, and of no team: it moves under the lowest token, so a robot that has obeyed a team refuses it
-(``StaleCommand``), and stops half a second after its brain has fallen silent.  While its link is lost, or its motors
-are off, it stands whatever it is told, and the log says why.
+The robot is not part of a team: it moves under the lowest token, so a robot that has obeyed a team refuses it
+(``StaleCommand``), and it stops half a second after the last call of its brain.  While its link is lost or its
+motors are off it ignores motion commands, and the log says why.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from drivers.reading import Observation, Value
 
 TOKEN = 1
 TTL_S = 0.5
-"""A brain that does not move or update for so long has its robot stopped."""
+"""Seconds after the last move or update of its brain after which the robot stops."""
 FEATURES = {
     "continuous-movement": "base2d",
     "range-sensor": "ranger",
@@ -34,7 +34,7 @@ FEATURES = {
     "mono-sound": "sound",
     "visual-feedback": "leds",
 }
-"""What brains call a feature, and the capability that it is."""
+"""Names of features in brains, and the corresponding capabilities."""
 RANGERS = ("ir", "sonar", "laser")
 LEGS = {"left front": "LFr", "right front": "RFr", "left back": "LBk", "right back": "RBk"}
 JOINTS = {"rotator": "rotor", "rotor": "rotor", "elevator": "elvtr", "knee": "knee"}
@@ -44,15 +44,15 @@ Call = Callable[[Callable[[], Any]], Any]
 
 
 def here(call: Callable[[], Any]) -> Any:
-    """Call it on the reactor's thread: what takes its time goes on afterwards, and is not waited for."""
+    """Call ``call`` on the reactor's thread, without waiting for asynchronous results."""
     return call()
 
 
 class PyroRobot:
     """One robot; ``clock`` is its driver's.
 
-    ``call`` calls a function where the driver lives, and returns what that gives in the end.  Speeds are shares of
-    the robot's own, -1 to 1: ahead, to the left and counter-clockwise are positive.
+    ``call`` runs a function on the driver's thread and returns its result.  Speeds are fractions of the robot's limits,
+    -1 to 1: ahead, to the left and counter-clockwise are positive.
     """
 
     log = Logger()
@@ -70,16 +70,16 @@ class PyroRobot:
         self._range: Device | None = None
         self._shares = {"base.vx": 0.0, "base.vy": 0.0, "base.wz": 0.0}
         self._values: Mapping[str, Value] = {}
-        self._stands = False
+        self._is_standing = False
         self._pose = self._origin = (0.0, 0.0, 0.0)
-        self._at_origin = (0.0, 0.0, 0.0)
+        self._pose_at_origin = (0.0, 0.0, 0.0)
 
     # -- the link ---------------------------------------------------------------------------------------------------
 
     def connect(self) -> Any:
-        """Open the link and switch the motors on; on the reactor's thread it returns a Deferred that fires then.
+        """Open the link and switch the motors on; on the reactor's thread return a Deferred that fires then.
 
-        Where the link is open already, as after somebody pressed the robot's own switch, only the motors are.
+        If the link is already open, as after an emergency stop at the robot, only the motors are switched on.
         """
         if self.driver.state not in ("idle", "closed"):
             return self._call(self.driver.enable)
@@ -96,25 +96,25 @@ class PyroRobot:
     # -- motion -----------------------------------------------------------------------------------------------------
 
     def move(self, translate: float, rotate: float) -> None:
-        """Walk and turn with these shares of the robot's speed."""
-        self._go({"base.vx": translate, "base.wz": rotate})
+        """Drive and turn at these fractions of the robot's speed."""
+        self._set_shares({"base.vx": translate, "base.wz": rotate})
 
     def translate(self, share: float) -> None:
-        """Walk ahead (to 1) or back (to -1); go on turning as before."""
-        self._go({"base.vx": share})
+        """Drive ahead (to 1) or back (to -1); the turn rate stays."""
+        self._set_shares({"base.vx": share})
 
     def rotate(self, share: float) -> None:
-        """Turn left (to 1) or right (to -1); go on walking as before."""
-        self._go({"base.wz": share})
+        """Turn left (to 1) or right (to -1); the speed stays."""
+        self._set_shares({"base.wz": share})
 
     def strafe(self, share: float) -> None:
-        """Walk to the left (to 1) or to the right (to -1); ``Unsupported`` where the robot cannot."""
+        """Drive to the left (to 1) or to the right (to -1); raise ``Unsupported`` if the robot cannot."""
         if "base.vy" not in self.driver.description.limits:
             raise Unsupported("this robot cannot walk sideways")
-        self._go({"base.vy": share})
+        self._set_shares({"base.vy": share})
 
     def motors(self, left: float, right: float) -> None:
-        """Turn the left and the right wheel with these shares."""
+        """Turn the left and the right wheel at these fractions."""
         self.move((right + left) / 2.0, (right - left) / 2.0)
 
     def stop(self) -> None:
@@ -122,37 +122,37 @@ class PyroRobot:
         self._shares = dict.fromkeys(self._shares, 0.0)
         self._call(self.driver.stop)
 
-    def _go(self, shares: Mapping[str, float]) -> None:
+    def _set_shares(self, shares: Mapping[str, float]) -> None:
         for share in shares.values():
             if isinstance(share, bool) or not isinstance(share, int | float) or not math.isfinite(share):
-                raise UsageError(f"a speed is a share from -1 to 1, not {share!r}")
+                raise UsageError(f"a speed must be a number from -1 to 1, not {share!r}")
         self._shares |= {key: max(-1.0, min(1.0, float(share))) for key, share in shares.items()}
-        self._call(self._act)
+        self._call(self._send_action)
 
-    def _act(self) -> None:
-        wished = {}
+    def _send_action(self) -> None:
+        action = {}
         for key, share in self._shares.items():
             if key in self.driver.description.limits:
                 low, high = self.driver.description.limits[key]
-                wished[key] = share * high if share > 0.0 else -share * low
+                action[key] = share * high if share > 0.0 else -share * low
         try:
-            self.driver.act(wished, Permit(TOKEN, self._clock.seconds() + TTL_S))
+            self.driver.act(action, Permit(TOKEN, self._clock.seconds() + TTL_S))
         except NotEnabled as error:
-            # The link is being opened again, or its own switch stopped it.  It does not start again by itself.
+            # The link is lost or the motors are off.  The motion does not resume by itself.
             self._shares = dict.fromkeys(self._shares, 0.0)
-            if not self._stands:
-                self.log.warn("the robot stands: {error}", error=error)
-            self._stands = True
+            if not self._is_standing:
+                self.log.warn("motion command ignored: {error}", error=error)
+            self._is_standing = True
         else:
-            self._stands = False
+            self._is_standing = False
 
-    # -- what it feels ----------------------------------------------------------------------------------------------
+    # -- sensors ----------------------------------------------------------------------------------------------------
 
     def update(self) -> None:
-        """Take in the newest that the robot feels, and go on moving as before: whoever updates is alive."""
+        """Read the newest sensor values and prolong the current motion."""
         self._call(self._refresh)
         if any(self._shares.values()):
-            self._call(self._act)
+            self._call(self._send_action)
 
     def _refresh(self) -> None:
         seen = self.driver.observe()
@@ -163,9 +163,9 @@ class PyroRobot:
         self.stall = int(
             any(value is True and key.startswith(("bump.", "stall.l", "stall.r")) for key, value in values.items())
         )
-        self._reckon()
+        self._update_pose()
         if not self._devices:
-            self._start(seen)
+            self._create_devices(seen)
         for devices in self._devices.values():
             for device in devices:
                 if device.active:
@@ -173,10 +173,10 @@ class PyroRobot:
                     if isinstance(device, Camera):
                         device.see(seen.frame)
 
-    def _reckon(self) -> None:
+    def _update_pose(self) -> None:
         x, y, yaw = self._pose = self._odometry()
         x0, y0, yaw0 = self._origin
-        x1, y1, yaw1 = self._at_origin
+        x1, y1, yaw1 = self._pose_at_origin
         turn = yaw1 - yaw0
         self.x = x1 + math.cos(turn) * (x - x0) - math.sin(turn) * (y - y0)
         self.y = y1 + math.sin(turn) * (x - x0) + math.cos(turn) * (y - y0)
@@ -188,60 +188,60 @@ class PyroRobot:
         return x, y, yaw
 
     def localize(self, x: float = 0.0, y: float = 0.0, thr: float = 0.0) -> None:
-        """Count from here on that the robot is at (x, y) in metres, and looks to ``thr`` radians."""
-        self._origin, self._at_origin = self._pose, (x, y, thr)
-        self._reckon()
+        """Set the current pose to (x, y) in metres and ``thr`` in radians."""
+        self._origin, self._pose_at_origin = self._pose, (x, y, thr)
+        self._update_pose()
 
     # -- devices ----------------------------------------------------------------------------------------------------
 
     @property
     def builtinDevices(self) -> list[str]:
-        """The devices that the robot has; all of them are started when it is heard first."""
+        """The devices of the robot; all of them start with its first observation."""
         return sorted(self._devices)
 
     @property
     def devices(self) -> list[str]:
-        """The types of the devices that are started."""
+        """The types of the started devices."""
         return sorted(kind for kind, rows in self._devices.items() if any(one.active for one in rows))
 
     def getDevices(self) -> list[str]:
-        """As ``devices``."""
+        """Return ``devices``."""
         return self.devices
 
     def getSupportedDevices(self) -> list[str]:
-        """As ``builtinDevices``."""
+        """Return ``builtinDevices``."""
         return self.builtinDevices
 
     def getDevice(self, kind: str, index: int = 0) -> Device:
-        """The device of this type."""
-        return self._having(kind)[index]
+        """Return the device of this type."""
+        return self._devices_of(kind)[index]
 
     def startDevice(self, name: str, **_options: object) -> Device:
-        """Have a device of the robot followed again; a number behind its type is passed over (``camera0``)."""
-        device = self._having(name.rstrip("0123456789"))[0]
+        """Update a device again; a number after its type is ignored (``camera0``)."""
+        device = self._devices_of(name.rstrip("0123456789"))[0]
         device.active, device.state = 1, "started"
         return device
 
     def removeDevice(self, kind: str, index: int | None = None) -> None:
-        """Follow it no more: what it told last stands."""
-        for device in self._having(kind.rstrip("0123456789"))[slice(index, None if index is None else index + 1)]:
+        """Stop updating a device; its last values stay."""
+        for device in self._devices_of(kind.rstrip("0123456789"))[slice(index, None if index is None else index + 1)]:
             device.active, device.state = 0, "stopped"
 
     @property
     def supportedFeatures(self) -> list[str]:
-        """What the robot can, in the words of brains."""
+        """The features of the robot under their names in brains."""
         return [name for name, capability in FEATURES.items() if capability in self.driver.description.capabilities]
 
     def supports(self, feature: str) -> bool:
-        """Whether it can."""
+        """Return whether the robot has ``feature``."""
         return feature in self.supportedFeatures
 
     def hasA(self, kind: str) -> int:
-        """1 where a device of this type is started, else 0."""
+        """Return 1 if a device of this type is started, else 0."""
         return int(kind in self.devices or (kind == "range" and self._range is not None))
 
     def requires(self, wanted: str | Sequence[str]) -> int:
-        """1 where the robot has all of these features and devices; raises ``ImportError``, which names what lacks."""
+        """Return 1 if the robot has all of these features and devices; raise ``ImportError`` that lists the others."""
         names = [wanted] if isinstance(wanted, str) else list(wanted)
         lacking = [name for name in names if not (self.supports(name) or self.hasA(name))]
         if lacking:
@@ -249,35 +249,35 @@ class PyroRobot:
         return 1
 
     def setRangeSensor(self, kind: str, index: int = 0) -> None:
-        """Have ``robot.range`` be this device."""
-        self._range = self._having(kind)[index]
+        """Make this device ``robot.range``."""
+        self._range = self._devices_of(kind)[index]
 
     @property
     def range(self) -> Rows:
-        """The range sensor, in readings from the left: ``robot.range["front"]``, ``robot.range[0]``."""
+        """The range sensor, with readings from the left: ``robot.range["front"]``, ``robot.range[0]``."""
         if not isinstance(self._range, Rows):
-            raise AttributeError(f"this robot ({self.type}) has no range sensor; it has {self._known()}")
+            raise AttributeError(f"this robot ({self.type}) has no range sensor; it has {self._device_names()}")
         return self._range
 
     def __getattr__(self, name: str) -> list[Any]:
-        """The started devices of a type: ``robot.camera[0]``; raises ``AttributeError`` with those there are."""
+        """Return the started devices of a type: ``robot.camera[0]``; ``AttributeError`` lists the known types."""
         if name.startswith("_") or name not in self._devices:
             raise AttributeError(
-                f"this robot has no {name}" + ("" if name.startswith("_") else f"; it has {self._known()}")
+                f"this robot has no {name}" + ("" if name.startswith("_") else f"; it has {self._device_names()}")
             )
         return list(self._devices[name])
 
-    def _having(self, kind: str) -> list[Device]:
+    def _devices_of(self, kind: str) -> list[Device]:
         if kind == "range" and self._range is not None:
             return [self._range]
         if kind not in self._devices:
-            raise AttributeError(f"this robot ({self.type}) has no {kind}; it has {self._known()}")
+            raise AttributeError(f"this robot ({self.type}) has no {kind}; it has {self._device_names()}")
         return self._devices[kind]
 
-    def _known(self) -> str:
+    def _device_names(self) -> str:
         return ", ".join(sorted(self._devices)) or "nothing before it is connected"
 
-    def _start(self, seen: Observation) -> None:
+    def _create_devices(self, seen: Observation) -> None:
         description = self.driver.description
         found: list[Device | None] = [ranger_of(description, seen.values), bumper_of(description, seen.values)]
         if "power" in description.capabilities:
@@ -288,65 +288,65 @@ class PyroRobot:
         if camera is not None:
             found.append(Camera(int(float(camera.get("width", 0))), int(float(camera.get("height", 0)))))
         if "look" in description.skills:
-            found.append(Ptz(self._look, description.capabilities.get("ptz", {})))
+            found.append(Ptz(self._move_head, description.capabilities.get("ptz", {})))
         self._devices = {device.type: [device] for device in found if device is not None}
         self._range = next((self._devices[kind][0] for kind in RANGERS if kind in self._devices), None)
 
-    # -- what an AIBO has beside --------------------------------------------------------------------------------------
+    # -- AIBO -------------------------------------------------------------------------------------------------------
 
     def getJoint(self, name: str) -> tuple[float, float]:
-        """Where a joint stands in radians, and its effort: ``left front leg knee``, ``head pan``, or by its key."""
+        """Return a joint's angle in radians and its effort: ``left front leg knee``, ``head pan``, or its key."""
         known = [key[6:-4] for key in self._values if key.startswith("joint.") and key.endswith(".pos")]
         words = name.replace(" leg ", " ")
         side, _, joint = words.rpartition(" ")
         found = {**PLACES, **TAILS}.get(name) or (f"{LEGS[side]}:{JOINTS.get(joint, joint)}" if side in LEGS else name)
         if found not in known:
-            raise AttributeError(f"no joint is called {name!r}; there are {', '.join(known) or 'none'}")
+            raise AttributeError(f"unknown joint {name!r}; known are {', '.join(known) or 'none'}")
         effort = self._values.get(f"joint.{found}.effort", 0.0)
         return float(self._values[f"joint.{found}.pos"]), float(effort)
 
     def getButton(self, name: str) -> float:
-        """How hard a button is pressed, 0 to 1: ``chin``, ``head``, ``frontback``."""
-        return self._told(f"button.{name}", "button.", name)
+        """Return the pressure on a button, 0 to 1: ``chin``, ``head``, ``frontback``."""
+        return self._read_value(f"button.{name}", "button.", name)
 
     def getSensor(self, name: str) -> float:
-        """What a sensor tells: ``ir near`` (metres), ``accel x`` (m/s2), ``power``, or any key of an observation."""
+        """Return a sensor value: ``ir near`` (metres), ``accel x`` (m/s2), ``power``, or any key of an observation."""
         words = name.split()
         if len(words) == 2 and words[0] == "ir":
-            return self._told(f"range.{words[1]}", "range.", name)
+            return self._read_value(f"range.{words[1]}", "range.", name)
         if len(words) == 2 and words[0].startswith("accel"):
-            return self._told(f"imu.a{words[1]}", "imu.", name)
-        return self._told("power.level" if name == "power" else name, "", name)
+            return self._read_value(f"imu.a{words[1]}", "imu.", name)
+        return self._read_value("power.level" if name == "power" else name, "", name)
 
     def playSound(self, name: str) -> Any:
-        """Play a sound: one that the robot knows, or a file on its stick."""
+        """Play a sound: one of the robot's skills, or a file on its memory stick."""
         if name in self.driver.description.skills:
-            return self._do(name)
-        return self._do("play", sound=name)
+            return self._invoke(name)
+        return self._invoke("play", sound=name)
 
     def runMotion(self, name: str) -> Any:
-        """Have it do one of its skills."""
-        return self._do(name)
+        """Run one of the robot's skills."""
+        return self._invoke(name)
 
     def setWalk(self, name: str) -> Any:
-        """Choose another walk; ``Unsupported`` where the robot has one only."""
-        return self._do("walk", name=name)
+        """Choose another walk; raise ``Unsupported`` if the robot has only one."""
+        return self._invoke("walk", name=name)
 
-    def _told(self, key: str, prefix: str, name: str) -> float:
+    def _read_value(self, key: str, prefix: str, name: str) -> float:
         value = self._values.get(key)
         if not isinstance(value, int | float):
             known = ", ".join(sorted(one.removeprefix(prefix) for one in self._values if one.startswith(prefix)))
-            raise AttributeError(f"nothing is called {name!r}; there are {known or 'none'}")
+            raise AttributeError(f"unknown sensor {name!r}; known are {known or 'none'}")
         return float(value)
 
-    def _look(self, joints: Mapping[str, float]) -> None:
-        self._do("look", **joints)
+    def _move_head(self, joints: Mapping[str, float]) -> None:
+        self._invoke("look", **joints)
 
-    def _do(self, skill: str, **arguments: float | str) -> Any:
+    def _invoke(self, skill: str, **arguments: float | str) -> Any:
         known = self.driver.description.skills
         if skill not in known:
-            raise Unsupported(f"this robot has no skill {skill!r}; it knows {', '.join(known) or 'none'}")
-        return self._call(lambda: self.driver.invoke(skill, **arguments).addErrback(self._not_done, skill))
+            raise Unsupported(f"this robot has no skill {skill!r}; its skills are {', '.join(known) or 'none'}")
+        return self._call(lambda: self.driver.invoke(skill, **arguments).addErrback(self._on_failed, skill))
 
-    def _not_done(self, failure: Any, name: str) -> None:
+    def _on_failed(self, failure: Any, name: str) -> None:
         self.log.warn("{name}: {reason}", name=name, reason=failure.getErrorMessage())

@@ -1,1 +1,1 @@
-"""A ROS robot behind rosbridge: JSON over a WebSocket."""
+"""ROS robots through rosbridge: JSON over a WebSocket."""

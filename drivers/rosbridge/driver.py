@@ -1,4 +1,4 @@
-"""RosbridgeDriver: a robot that runs ROS 1 or 2, asked through its rosbridge."""
+"""Driver of robots with ROS 1 or 2, through rosbridge."""
 
 from __future__ import annotations
 
@@ -28,21 +28,21 @@ from drivers.timer import Timer
 MANIFEST = Manifest()
 
 REPEAT_S = 0.1
-"""A velocity is said so often while it is in force: most bases stop by themselves when they hear none."""
+"""Interval in seconds at which a velocity is repeated: most bases stop by themselves without one."""
 ASK_S = 1.0
-"""The robot has so long to say which type its velocity has."""
+"""Seconds to wait for the type of the velocity topic."""
 CALL_S = 5.0
 SOURCE_S = 2.0
-"""What a topic said last is shown for so long; then its keys are left out, though others go on."""
+"""Seconds for which the last message of a topic is valid; then its keys are omitted."""
 TYPE_SERVICE = "/rosapi/topic_type"
 
 
 class RosbridgeDriver(BaseDriver):
     """One robot.
 
-    ROS has no motors to switch: ``enable`` and ``disable`` are a lock in this driver (``estop.engaged``), and the
-    service ``motor_service`` besides, where the options name one.  The driver says the velocity again and again while
-    it is in force, and zero at its end.  When the link is lost, only the base itself can stop: see docs/robots.
+    ROS has no motors to switch: ``enable`` and ``disable`` set a lock in this driver (``estop.engaged``) and call the
+    service ``motor_service`` if the options name one.  The driver repeats the velocity while it is in force, and sends
+    zero at its end.  When the link is lost, only the base itself can stop: see docs/robots.
     """
 
     STALE_S = 0.5
@@ -60,45 +60,45 @@ class RosbridgeDriver(BaseDriver):
         self._bridge = Bridge(self, connector, clock, self._options.host, self._options.port, self._options.path)
         self._sources = {topic: source for source, topic in self._options.topics.items()}
         self._sectors = {name: (math.radians(middle), math.radians(width)) for name, (middle, width) in SECTORS.items()}
-        self._told: dict[str, tuple[float, dict[str, Value]]] = {}
+        self._source_values: dict[str, tuple[float, dict[str, Value]]] = {}
         self._frame: Frame | None = None
         self._t_robot = 0.0
         self._has_motors = False
         self._is_stamped: bool | None = None
         self._was_stamped = False
         self._velocity = (0.0, 0.0, 0.0)
-        self._repeat, self._settling = Timer(clock), Timer(clock)
+        self._repeat_timer, self._type_timer = Timer(clock), Timer(clock)
         self._calls: dict[str, tuple[Deferred[Mapping[str, Any]], Any]] = {}
-        self._number = 0
+        self._call_count = 0
         self._warned: set[str] = set()
 
     @property
     def camera_fps(self) -> float:
-        """Pictures a second that the camera is asked for."""
+        """The requested frame rate in pictures per second."""
         return self._options.camera_fps if self._options.image_topic else 0.0
 
     def set_camera_fps(self, fps: float) -> None:
-        """Ask for so many pictures a second from now on; 0: none."""
+        """Set the frame rate in pictures per second; 0 stops."""
         self._options = replace(self._options, camera_fps=fps)
         if self._options.image_topic:
             self._subscribe("image", self._options.image_topic)
 
     def invoke(self, name: str, **arguments: float | str) -> Deferred[Mapping[str, Value]]:
-        """Call the service of this skill; fires with the plain values of its answer."""
+        """Call the service of this skill; fires with the scalar values of its answer."""
         if name not in self._options.services:
             return super().invoke(name, **arguments)
         if not self._is_up:
             return fail(LinkLost(f"{self._name} is {self.state}; connect first, or wait for the link"))
 
-        def plain(values: Mapping[str, Any]) -> Mapping[str, Value]:
+        def scalars(values: Mapping[str, Any]) -> Mapping[str, Value]:
             return {key: value for key, value in values.items() if isinstance(value, (bool, int, float, str))}
 
-        return self._call(self._options.services[name], **arguments).addCallback(plain)
+        return self._call(self._options.services[name], **arguments).addCallback(scalars)
 
     def diagnostics(self) -> dict[str, float]:
-        """As every driver's; ``age.SOURCE``, the seconds since each topic spoke, and the ``faults`` of the link."""
+        """As for every driver; ``age.SOURCE`` is the age of a topic's last message in s, ``faults`` is the link's."""
         now = self._clock.seconds()
-        ages = {f"age.{source}": now - at for source, (at, _) in self._told.items()}
+        ages = {f"age.{source}": now - at for source, (at, _) in self._source_values.items()}
         return {**super().diagnostics(), "bytes": self._bridge.bytes, "faults": self._bridge.faults, **ages}
 
     # -- to the robot -----------------------------------------------------------------------------------------------
@@ -107,7 +107,7 @@ class RosbridgeDriver(BaseDriver):
         self._bridge.open()
 
     def _close(self) -> Deferred[None]:
-        self._quiet()
+        self._stop_repeating()
         self._fail_calls(LinkLost(f"{self._name}: disconnected"))
         return self._bridge.hang_up()
 
@@ -116,7 +116,7 @@ class RosbridgeDriver(BaseDriver):
             if values.get("success") is True:
                 self._has_motors = on
             else:
-                self._warn(f"{self._options.motor_service} refused: {codec.brief(values.get('message'), 200)}")
+                self._warn_once(f"{self._options.motor_service} refused: {codec.brief(values.get('message'), 200)}")
 
         if self._options.motor_service:
             self._call(self._options.motor_service, data=on).addCallbacks(switched, self._on_call_failed)
@@ -125,37 +125,37 @@ class RosbridgeDriver(BaseDriver):
 
     def _drive(self, motion: Action, permit: Permit) -> Action:
         self._velocity = (motion["base.vx"], motion.get("base.vy", 0.0), motion["base.wz"])
-        self._say_velocity()
-        if not self._repeat.is_set:
-            self._repeat.set(REPEAT_S, self._on_repeat)
+        self._send_velocity()
+        if not self._repeat_timer.is_set:
+            self._repeat_timer.set(REPEAT_S, self._on_repeat)
         return motion
 
     def _halt(self) -> None:
-        self._quiet()
-        self._say_velocity()
+        self._stop_repeating()
+        self._send_velocity()
 
     def _on_repeat(self) -> None:
         if not self._may_move:
             self.stop()
             return
-        self._repeat.set(REPEAT_S, self._on_repeat)
+        self._repeat_timer.set(REPEAT_S, self._on_repeat)
         if not self._bridge.is_busy:
-            self._say_velocity()
+            self._send_velocity()
 
-    def _quiet(self) -> None:
+    def _stop_repeating(self) -> None:
         self._velocity = (0.0, 0.0, 0.0)
-        self._repeat.cancel()
+        self._repeat_timer.cancel()
 
     def _last_word(self) -> LastWord | None:
         link = self._bridge.link
-        return None if link is None else LastWord(self._bridge.framed(self._published(0.0, 0.0, 0.0)), link)
+        return None if link is None else LastWord(self._bridge.framed(self._velocity_message(0.0, 0.0, 0.0)), link)
 
-    def _say_velocity(self) -> None:
-        self._bridge.send(self._published(*self._velocity))
+    def _send_velocity(self) -> None:
+        self._bridge.send(self._velocity_message(*self._velocity))
 
-    def _published(self, vx: float, vy: float, wz: float) -> bytes:
-        said = (codec.twist_stamped if self._is_stamped else codec.twist)(vx, vy, wz)
-        return encoded("publish", topic=self._options.velocity_topic, msg=said)
+    def _velocity_message(self, vx: float, vy: float, wz: float) -> bytes:
+        message = (codec.twist_stamped if self._is_stamped else codec.twist)(vx, vy, wz)
+        return encoded("publish", topic=self._options.velocity_topic, msg=message)
 
     def _subscribe(self, source: str, topic: str) -> None:
         rate = self._options.camera_fps if source == "image" else RATES[source]
@@ -174,8 +174,8 @@ class RosbridgeDriver(BaseDriver):
         )
 
     def _call(self, service: str, **arguments: object) -> Deferred[Mapping[str, Any]]:
-        self._number += 1
-        number = f"call:{self._number}"
+        self._call_count += 1
+        number = f"call:{self._call_count}"
         answered: Deferred[Mapping[str, Any]] = Deferred()
 
         def late() -> None:
@@ -189,25 +189,25 @@ class RosbridgeDriver(BaseDriver):
     # -- from the robot ---------------------------------------------------------------------------------------------
 
     def bridge_up(self) -> None:
-        """Subscribe, and find out which type the velocity has; called by the bridge."""
+        """Subscribe, and determine the type of the velocity topic; called by the bridge."""
         for source, topic in self._options.topics.items():
             if source != "image" or self._options.camera_fps > 0:
                 self._subscribe(source, topic)
-        self._ask_type()
+        self._request_type()
         if self._options.velocity_type != "auto":
-            self._settle(self._options.velocity_type == "twist_stamped")
+            self._start_with_type(self._options.velocity_type == "twist_stamped")
 
     def bridge_down(self) -> None:
-        """Bring the motion to rest here, as the base should there; called by the bridge."""
-        self._quiet()
-        self._settling.cancel()
+        """Reset the motion here, as the base should do itself; called by the bridge."""
+        self._stop_repeating()
+        self._type_timer.cancel()
         self._is_stamped = None
         self._t_robot = 0.0
-        self._fail_calls(LinkLost(f"the link to {self._name} went away"))
+        self._fail_calls(LinkLost(f"the link to {self._name} was lost"))
         self._down()
 
     def bridge_said(self, payload: bytes) -> None:
-        """Take one message; called by the bridge."""
+        """Process one message; called by the bridge."""
         self._counts["frames"] += 1
         try:
             self._on_message(decoded(payload))
@@ -217,48 +217,48 @@ class RosbridgeDriver(BaseDriver):
 
     def _on_message(self, message: codec.Message) -> None:
         match message:
-            case Published(topic, said):
+            case Published(topic, content):
                 if topic in self._sources:
-                    self._on_published(self._sources[topic], said)
+                    self._on_published(self._sources[topic], content)
             case Answered(number, values, is_done):
                 self._on_answer(number, values, is_done)
             case Status(level, text):
                 self._counts["refused"] += level == "error"
                 if level in ("error", "warning"):
-                    self._warn(f"rosbridge says: {text}")
+                    self._warn_once(f"rosbridge says: {text}")
 
-    def _on_published(self, source: str, said: Mapping[str, Any]) -> None:
+    def _on_published(self, source: str, content: Mapping[str, Any]) -> None:
         values: dict[str, Value] = {}
         match source:
             case "odometry":
-                values = codec.odometry(said)
+                values = codec.odometry(content)
             case "scan":
-                values = codec.scan(said, self._sectors, math.radians(self._options.scan_turn))
+                values = codec.scan(content, self._sectors, math.radians(self._options.scan_turn))
             case "imu":
-                values = codec.imu(said)
+                values = codec.imu(content)
             case "battery":
-                values = codec.battery(said, self._options.battery_full)
-        stamp = codec.stamp(said)
-        # Topics arrive a little out of turn; only a clock that was set goes back.
+                values = codec.battery(content, self._options.battery_full)
+        stamp = codec.stamp(content)
+        # Topics arrive slightly out of order; a large step back means that the clock was set.
         if stamp is not None and (stamp > self._t_robot or self._t_robot - stamp > 1.0):
             self._t_robot = stamp
         if source == "image":
-            data, width, height = codec.picture(said)
+            data, width, height = codec.picture(content)
             self._counts["pictures"] += 1
             self._frame = Frame(self._counts["pictures"], width, height, data, self._t_robot)
         now = self._clock.seconds()
-        self._told[source] = (now, values)
+        self._source_values[source] = (now, values)
         if self._is_stamped is None:
-            return  # it cannot be driven yet, so it is not ready
+            return  # not ready: it cannot be driven before the type is known
         seen: dict[str, Value] = {ENGAGED: not self._has_motors}
-        for at, some in self._told.values():
+        for at, some in self._source_values.values():
             if now - at <= SOURCE_S:
                 seen.update(some)
         self._observed(seen, self._t_robot, frame=self._frame)
 
     def _on_answer(self, number: str, values: Mapping[str, Any], is_done: bool) -> None:
         if number not in self._calls:
-            return  # it came too late
+            return  # too late
         answered, timer = self._calls.pop(number)
         timer.cancel()
         if is_done:
@@ -266,13 +266,13 @@ class RosbridgeDriver(BaseDriver):
         else:
             answered.errback(RobotError(codec.brief(values.get("error", values), 300)))
 
-    # -- which type the velocity has --------------------------------------------------------------------------------
+    # -- type of the velocity topic ---------------------------------------------------------------------------------
 
-    def _ask_type(self) -> None:
-        asked = self._call(TYPE_SERVICE, topic=self._options.velocity_topic)
-        asked.addCallbacks(self._on_type, lambda _: None)
+    def _request_type(self) -> None:
+        call = self._call(TYPE_SERVICE, topic=self._options.velocity_topic)
+        call.addCallbacks(self._on_type, lambda _: None)
         if self._options.velocity_type == "auto":
-            self._settling.set(ASK_S, self._on_no_type)
+            self._type_timer.set(ASK_S, self._on_no_type)
 
     def _on_type(self, values: Mapping[str, Any]) -> None:
         topic, found = self._options.velocity_topic, codec.brief(values.get("type", ""), 100)
@@ -281,29 +281,30 @@ class RosbridgeDriver(BaseDriver):
             if known is not None and known is not self._is_stamped:
                 self._on_other_type(known, found)
             return
-        self._settling.cancel()
+        self._type_timer.cancel()
         if known is not None:
-            self._settle(known)
+            self._start_with_type(known)
             return
-        # Nobody listens there yet, or somebody to something else; a base may still be starting.
-        self._warn(f"{topic} is {found or 'listened to by nobody'}; is velocity_topic right? asking again")
-        self._settling.set(ASK_S, self._ask_type)
+        # The topic has no subscriber yet, or another type; the base may still be starting.
+        state = f"is {found}" if found else "has no subscriber"
+        self._warn_once(f"{topic} {state}; is velocity_topic right? retrying")
+        self._type_timer.set(ASK_S, self._request_type)
 
     def _on_no_type(self) -> None:
-        taken = "TwistStamped" if self._was_stamped else "Twist"
-        self._warn(f"no rosapi says which type the velocity has: taking {taken}; velocity_type can say it")
-        self._settle(self._was_stamped)
+        default = "TwistStamped" if self._was_stamped else "Twist"
+        self._warn_once(f"rosapi does not report the type of the velocity: using {default}; or set velocity_type")
+        self._start_with_type(self._was_stamped)
 
     def _on_other_type(self, is_stamped: bool, found: str) -> None:
         if self._options.velocity_type == "auto":
-            self._advertise(is_stamped)  # the answer came late
+            self._advertise(is_stamped)  # the answer arrived late
             return
         wanted, topic = "twist_stamped" if is_stamped else "twist", self._options.velocity_topic
-        self._warn(f'{topic} is {found}, so it would not move: write velocity_type = "{wanted}" or "auto"')
+        self._warn_once(f'{topic} is {found}, so it would not move: write velocity_type = "{wanted}" or "auto"')
 
-    def _settle(self, is_stamped: bool) -> None:
+    def _start_with_type(self, is_stamped: bool) -> None:
         self._advertise(is_stamped)
-        self._say_velocity()  # zero: what was said before the link was lost may still be in force
+        self._send_velocity()  # zero: an earlier velocity may still be in force
         self._up()
 
     def _advertise(self, is_stamped: bool) -> None:
@@ -314,7 +315,7 @@ class RosbridgeDriver(BaseDriver):
             self._guard()
 
     def _fail_calls(self, error: Exception) -> None:
-        self._settling.cancel()
+        self._type_timer.cancel()
         calls, self._calls = self._calls, {}
         for answered, timer in calls.values():
             timer.cancel()
@@ -322,10 +323,9 @@ class RosbridgeDriver(BaseDriver):
 
     def _on_call_failed(self, failure: Failure) -> None:
         if not failure.check(LinkLost):
-            self._warn(f"{self._options.motor_service}: {failure.getErrorMessage()[:200]}")
+            self._warn_once(f"{self._options.motor_service}: {failure.getErrorMessage()[:200]}")
 
-    def _warn(self, text: str) -> None:
-        """Say it once."""
+    def _warn_once(self, text: str) -> None:
         if text not in self._warned and len(self._warned) < 100:
             self._warned.add(text)
             self.log.warn("{robot}: {text}", robot=self._name, text=text)
@@ -334,12 +334,12 @@ class RosbridgeDriver(BaseDriver):
 def make_driver(
     options: Mapping[str, object], name: str, clock: IReactorTime, connector: Connector | None
 ) -> RosbridgeDriver:
-    """A driver of the robot behind the rosbridge that ``options`` names."""
+    """Return a driver of the robot behind the rosbridge in ``options``."""
     if connector is not None:
         return RosbridgeDriver(checked(options), connector, clock, name)
     return RosbridgeDriver(checked(options), TcpConnector(says=True), clock, name, dead_man=kept(name))
 
 
 def describe(options: Mapping[str, object], name: str) -> Description:
-    """What that robot is."""
+    """Return the description of that robot."""
     return described(checked(options))

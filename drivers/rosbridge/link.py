@@ -1,4 +1,4 @@
-"""Link: one standing WebSocket to rosbridge, over links that a ``Connector`` opens; it knows no message."""
+"""A persistent WebSocket connection to rosbridge, over links from a ``Connector``; it does not interpret messages."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from drivers.timer import Timer
 
 PING_S = 1.0
 SILENCE_S = 3.0
-"""A rosbridge that answers no ping for so long is gone, though its link stays up."""
+"""Seconds without an answer to a ping after which rosbridge counts as gone, although its link is open."""
 FIRST_HOLD_S, LAST_HOLD_S = 0.5, 5.0
-"""How long what speaks no rosbridge is left alone before it is called again."""
+"""First and longest delay before a new attempt at a server that is not rosbridge."""
 
 
 class Owner(Protocol):
-    """Who is told."""
+    """Receives the messages and the state of a ``Bridge``."""
 
     def bridge_up(self) -> None:
-        """Learn that rosbridge has answered."""
+        """Handle the first answer of rosbridge."""
 
     def bridge_down(self) -> None:
-        """Learn that it is gone; it is called again."""
+        """Handle the loss of rosbridge; the bridge reconnects."""
 
     def bridge_said(self, payload: bytes) -> None:
-        """Take one message."""
+        """Process one message."""
 
 
 class Bridge:
-    """A wish to be connected to the rosbridge at ``host`` and ``port``."""
+    """A connection to the rosbridge at ``host`` and ``port`` that is reopened whenever it is lost."""
 
     log = Logger()
 
@@ -49,35 +49,35 @@ class Bridge:
         self._host, self._port, self._path = host, port, path
         self._line: Line | None = None
         self._link: Link | None = None
-        self._socket = self._fresh()
+        self._socket = self._make_socket()
         self._is_up = False
         self._heard_at = self._ping_at = 0.0
         self._hold_s = FIRST_HOLD_S
         self._is_held = False
         self._hold_until = 0.0
         self._timer = Timer(clock)
-        self._told = ""
+        self._logged_reason = ""
 
     @property
     def is_busy(self) -> bool:
-        """Whether what was sent before has not left yet."""
+        """Whether earlier data is still unsent."""
         return self._link is not None and self._link.is_busy
 
     @property
     def link(self) -> Link | None:
-        """The link by which there is a rosbridge now."""
+        """The link while rosbridge answers, else None."""
         return self._link if self._is_up else None
 
     def framed(self, payload: bytes) -> bytes:
-        """One message as it would be sent."""
+        """Return one message as a WebSocket frame."""
         return self._socket.text(payload)
 
     def open(self) -> None:
-        """Call, and call again whenever it is lost."""
+        """Connect, and reconnect after each loss."""
         self._line = self._connector.call(self._host, self._port, self)
 
     def hang_up(self) -> Deferred[None]:
-        """Say goodbye, and call no more."""
+        """Close the WebSocket and stop reconnecting."""
         if self._is_up and self._link is not None:
             self._link.send(self._socket.closing())
         self._is_up, self._is_held = False, True
@@ -85,92 +85,92 @@ class Bridge:
         return succeed(None) if self._line is None else self._line.hang_up()
 
     def send(self, payload: bytes) -> None:
-        """Send one message; does nothing while there is no rosbridge."""
+        """Send one message; does nothing without a rosbridge."""
         if self._is_up and self._link is not None:
             self._link.send(self._socket.text(payload))
 
-    # -- called by the line -----------------------------------------------------------------------------------------
+    # -- called by the link -----------------------------------------------------------------------------------------
 
     def link_up(self, link: Link) -> None:
-        """Greet; not before the time where what spoke no rosbridge hung up by itself."""
+        """Start the handshake, after a delay if the server was not a rosbridge before."""
         self._link = link
         self._is_held = True
         wait = self._hold_until - self._clock.seconds()
         if wait > 0:
-            self._timer.set(wait, self._greet, link)
+            self._timer.set(wait, self._start_handshake, link)
         else:
-            self._greet(link)
+            self._start_handshake(link)
 
     def link_down(self) -> None:
-        """Forget the link."""
+        """Handle the loss of the link."""
         self._link = None
         self._timer.cancel()
-        self._sink()
+        self._on_down()
 
     def received(self, data: bytes) -> None:
         """Take bytes."""
         self.bytes += len(data)
         socket, link, frames = self._socket, self._link, self._socket.frames
         if self._is_held:
-            return  # a fault was told already, or we hung up; the link is closed soon
+            return  # after a fault or hang_up; the link closes soon
         messages, reply = socket.received(data)
         if socket.frames > frames or (socket.is_open and not self._is_up):
-            # Bytes alone are no sign of life: they may belong to a frame whose length was spoilt.
+            # Only complete frames count: bytes may belong to a frame with a corrupt length.
             self._heard_at = self._clock.seconds()
         if reply and link is not None and not link.is_busy:
-            link.send(reply)  # else it would pile up here: the other end sends pings, and takes no answers
+            link.send(reply)  # dropped if busy, or replies to a peer that does not read would accumulate
         if socket.is_open and not self._is_up and not socket.fault:
-            self._rise()
+            self._on_up()
         for message in messages:
             if not self._is_up:
-                return  # the owner hung up in between
-            self._hold_s, self._told = FIRST_HOLD_S, ""
+                return  # the owner closed the bridge
+            self._hold_s, self._logged_reason = FIRST_HOLD_S, ""
             self._owner.bridge_said(message)
         if socket.fault and not self._is_held:
             self._on_fault(socket.fault)
 
-    def _fresh(self) -> WebSocket:
+    def _make_socket(self) -> WebSocket:
         return WebSocket(f"{self._host}:{self._port}", self._path)
 
-    def _greet(self, link: Link) -> None:
+    def _start_handshake(self, link: Link) -> None:
         self._is_held = False
-        self._socket = self._fresh()
+        self._socket = self._make_socket()
         self._heard_at = self._clock.seconds()
         link.send(self._socket.opening())
-        self._ping_later()
+        self._schedule_ping()
 
-    def _ping_later(self) -> None:
+    def _schedule_ping(self) -> None:
         self._ping_at = self._clock.seconds() + PING_S
         self._timer.set(PING_S, self._on_time)
 
     def _on_time(self) -> None:
         self._heard_at = heard_at(self._heard_at, self._ping_at, self._clock.seconds())
         if self._clock.seconds() - self._heard_at > SILENCE_S:
-            self._on_fault(f"nothing whole was heard for {SILENCE_S:g} s")
+            self._on_fault(f"no complete frame for {SILENCE_S:g} s")
             return
         if self._is_up and self._link is not None:
             self._link.send(self._socket.ping())
-        self._ping_later()
+        self._schedule_ping()
 
     def _on_fault(self, reason: str) -> None:
-        """Leave the link as it is for a while, then close it, so that whoever speaks no rosbridge is not pestered."""
+        """Keep the link open for a delay before closing it, to limit attempts at a server that is not rosbridge."""
         self.faults += 1
-        if reason != self._told:
+        if reason != self._logged_reason:
             self.log.warn("rosbridge at {host}:{port}: {reason}", host=self._host, port=self._port, reason=reason)
-        self._told = reason
+        self._logged_reason = reason
         self._is_held = True
         self._timer.cancel()
-        self._sink()
+        self._on_down()
         if self._link is not None:
             self._timer.set(self._hold_s, self._link.close)
             self._hold_until = self._clock.seconds() + self._hold_s
             self._hold_s = min(2 * self._hold_s, LAST_HOLD_S)
 
-    def _rise(self) -> None:
+    def _on_up(self) -> None:
         self._is_up = True
         self._owner.bridge_up()
 
-    def _sink(self) -> None:
+    def _on_down(self) -> None:
         was_up, self._is_up = self._is_up, False
         if was_up:
             self._owner.bridge_down()

@@ -1,4 +1,4 @@
-"""Options of the kind "rosbridge": where it is, which topic is what, and what the robot can do; checked."""
+"""Options of the kind "rosbridge": its address, its topics, and the limits of the robot."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SECTORS: Mapping[str, tuple[float, float]] = {
     "right": (-90.0, 40.0),
     "front_right": (-45.0, 40.0),
 }
-"""The middle and the whole width of each, in degrees; left is positive."""
+"""Centre and full width of each sector in degrees, left positive."""
 TYPES = {
     "odometry": "nav_msgs/Odometry",
     "scan": "sensor_msgs/LaserScan",
@@ -36,15 +36,15 @@ TYPES = {
     "battery": "sensor_msgs/BatteryState",
     "image": "sensor_msgs/CompressedImage",
 }
-"""What is observed, to the type of its topic in ROS 1; ROS 2 writes ``/msg/`` in the middle."""
+"""Sources of observations, and the types of their topics in ROS 1; ROS 2 adds ``/msg/``."""
 RATES = {"odometry": 20.0, "scan": 10.0, "imu": 20.0, "battery": 1.0}
-"""How often each is asked for, a second at most."""
+"""Highest requested rate of each source in Hz."""
 
 
 def _check_skills(services: Mapping[str, str]) -> Mapping[str, str]:
     for name in services:
         if not name.isidentifier():
-            raise ValueError(f"has {name!r}, which is no name of a skill")
+            raise ValueError(f"has {name!r}, which is not a valid skill name")
     return services
 
 
@@ -56,11 +56,11 @@ def _check_full(value: float) -> float:
 
 @dataclass(frozen=True)
 class Options:
-    """The robot; an empty topic means that it has none.
+    """The robot; an empty topic means that the robot does not have it.
 
     ``velocity_type`` "auto" asks the robot (rosapi).  ``max_vx`` and ``max_vy`` are in m/s, ``max_wz`` in rad/s,
-    ``radius`` in m.  ``scan_turn`` is how the scanner stands on the robot in degrees, ``battery_full`` what a full
-    battery reports.  ``motor_service`` (std_srvs/SetBool) switches the motors of robots that have one;
+    ``radius`` in m.  ``scan_turn`` is the rotation of the scanner on the robot in degrees, ``battery_full`` the
+    percentage of a full battery.  ``motor_service`` (std_srvs/SetBool) switches the motors of robots that have it;
     ``services`` maps skills to services without arguments (std_srvs/Trigger).
     """
 
@@ -96,24 +96,24 @@ class Options:
 
     @property
     def topics(self) -> dict[str, str]:
-        """What is observed, to its topic; only what the robot has, and the image always where it has one."""
+        """Sources of observations, and their topics; includes the image at rate 0."""
         return {name: topic for name in TYPES if (topic := str(getattr(self, f"{name}_topic")))}
 
     def type_of(self, name: str) -> str:
-        """A ROS 1 type as this robot writes it."""
+        """Return the name of a ROS 1 type in the robot's version of ROS."""
         return name if self.ros == 1 else name.replace("/", "/msg/")
 
 
 def checked(table: Mapping[str, object]) -> Options:
-    """The options in ``table``; raises ``UsageError`` that names the key and what to write instead."""
+    """Convert and check ``table``; raise ``UsageError`` that names the key and the remedy."""
     options = convert_options("rosbridge", table, Options)
     if not any(topic for name, topic in options.topics.items() if name in ("odometry", "scan", "imu")):
-        raise UsageError('driver "rosbridge": give odometry_topic, scan_topic or imu_topic, or nobody sees it is alive')
+        raise UsageError('driver "rosbridge": set odometry_topic, scan_topic or imu_topic, to detect a silent robot')
     return options
 
 
 def described(options: Options) -> Description:
-    """What the robot is, as far as the options say."""
+    """Return the description of the robot according to its options."""
     capabilities: dict[str, Mapping[str, float | str]] = {"base2d": {}}
     topics = options.topics
     named = {"odometry": "odometry", "scan": "ranger", "imu": "imu", "battery": "power"}

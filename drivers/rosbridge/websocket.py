@@ -1,4 +1,4 @@
-"""Websocket: how rosbridge uses one, for both ends."""
+"""WebSocket connections of rosbridge, for both ends."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from wsproto.events import AcceptConnection, RejectConnection, Request
 from formats.websocket import End
 
 MAX_MESSAGE = 4 * 1024 * 1024
-"""Bytes of a message: a compressed picture of 2 megapixels fits, in base64."""
+"""Largest message in bytes: fits a compressed picture of 2 megapixels in base64."""
 
 
 class WebSocket(End):
-    """One end of a connection to rosbridge: the client's where ``host`` is given; its messages are JSON."""
+    """One end of a connection to rosbridge, the client if ``host`` is given; its messages are JSON."""
 
     def __init__(self, host: str = "", path: str = "/") -> None:
         super().__init__(MAX_MESSAGE, Request(host, path) if host else None)
@@ -21,7 +21,7 @@ class WebSocket(End):
 
     def _fault_of(self, answer: AcceptConnection | RejectConnection | Exception) -> str:
         if isinstance(answer, Exception):
-            return f"no rosbridge answers there ({answer.__context__ or answer}); look at host, port and path"
+            return f"no rosbridge answers there ({answer.__context__ or answer}); check host, port and path"
         if isinstance(answer, RejectConnection):
-            return f"no rosbridge answers there, but HTTP status {answer.status_code}; look at host, port and path"
+            return f"no rosbridge answers there, but HTTP status {answer.status_code}; check host, port and path"
         return ""

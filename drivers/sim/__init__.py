@@ -1,1 +1,1 @@
-"""The simulated dog: options, codec, link and driver, and the operator's client of the same yard."""
+"""The simulated dog: options, codec, link and driver, and the operator's client of the simulator."""

@@ -1,9 +1,9 @@
-"""Codec of the yard's wire: messages to frames and back; pure.
+"""Codec of the simulator's protocol: messages to frames and back; pure.
 
-A frame is two marker bytes, four bytes of length (big-endian) and a msgpack array ``[tag, field, ...]``.  What is no
-message raises ``BadFrame``; after bytes that are no frame the reader looks for the next marker.
+A frame is two marker bytes, four bytes of length (big-endian) and a msgpack array ``[tag, field, ...]``.  Invalid
+messages raise ``BadFrame``; after invalid bytes the reader searches for the next marker.
 
-Durations and the yard's own stamps travel, never a moment of the sender's clock.
+Times are durations or the simulator's time stamps, never times on the sender's clock.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class _Message(Struct, frozen=True, array_like=True, forbid_unknown_fields=True)
 
 
 class Hello(_Message, tag="hello", frozen=True):
-    """From a driver: give me the robot, with so many pictures a second (0: none)."""
+    """From a driver: request a robot, with ``camera_fps`` pictures per second (0: none)."""
 
     version: Count
     robot: Text
@@ -40,23 +40,23 @@ class Hello(_Message, tag="hello", frozen=True):
 
 
 class Overlook(_Message, tag="overlook", frozen=True):
-    """From the operator: send the truth about the yard, so many times a second."""
+    """From the operator: request the state of the world, ``rate`` times per second."""
 
     version: Count
     rate: Number
 
 
 class Motors(_Message, tag="motors", frozen=True):
-    """From a driver: motors on or off."""
+    """From a driver: switch the motors on or off."""
 
     on: bool
 
 
 class Drive(_Message, tag="drive", frozen=True):
-    """From a driver: walk like this (m/s, m/s, rad/s) for ``ttl`` seconds under fencing ``token``.
+    """From a driver: move at these velocities (m/s, m/s, rad/s) for ``ttl`` seconds under fencing ``token``.
 
-    ``sent`` is the yard's own time as the driver knew it when the command left: the stamp of the newest frame it had
-    seen, plus the time it had waited since.  A command that was held up on the way is thereby shortened, not moved.
+    ``sent`` is the driver's estimate of the simulator's time when the command left: the stamp of the newest frame plus
+    its age.  Delay on the network therefore shortens a command and does not shift it.
     """
 
     vx: Number
@@ -68,11 +68,11 @@ class Drive(_Message, tag="drive", frozen=True):
 
 
 class Halt(_Message, tag="halt", frozen=True):
-    """From a driver: stand still now; never refused."""
+    """From a driver: stop now; never refused."""
 
 
 class Alive(_Message, tag="alive", frozen=True):
-    """From either client: still here; a yard that hears nothing for some seconds gives the robot free."""
+    """From either client: keep-alive; the simulator releases the robot after some seconds without data."""
 
 
 class Order(_Message, tag="order", frozen=True):
@@ -84,7 +84,7 @@ class Order(_Message, tag="order", frozen=True):
 
 
 class Sensors(_Message, tag="sensors", frozen=True):
-    """From the yard: what the robot feels at ``t`` of the yard's time, and the highest token that it has obeyed."""
+    """From the simulator: the robot's sensor values at its time ``t``, and the highest token that it has obeyed."""
 
     t: Number
     values: Annotated[Mapping[Text, Entry], MAX_ENTRIES]
@@ -93,7 +93,7 @@ class Sensors(_Message, tag="sensors", frozen=True):
 
 
 class Picture(_Message, tag="picture", frozen=True):
-    """From the yard: one camera picture as a JPEG."""
+    """From the simulator: one camera picture as a JPEG."""
 
     seq: Count
     t: Number
@@ -103,20 +103,20 @@ class Picture(_Message, tag="picture", frozen=True):
 
 
 class Truth(_Message, tag="truth", frozen=True):
-    """From the yard to the operator: the whole yard as seen from above."""
+    """From the simulator to the operator: the state of the whole world."""
 
     snapshot: Mapping[str, Any]
 
 
 class Done(_Message, tag="done", frozen=True):
-    """From the yard: the order of this number was carried out, or, where ``problem`` is not empty, why not."""
+    """From the simulator: the order was carried out, or ``problem`` says why not."""
 
     number: Count
     problem: Text
 
 
 class Refused(_Message, tag="refused", frozen=True):
-    """From the yard: no robot for you; ``lasting`` says that asking again will not help."""
+    """From the simulator: the robot is not available; with ``lasting`` a retry cannot help."""
 
     reason: Text
     lasting: bool
@@ -138,7 +138,7 @@ class _Target(TypedDict):
 
 
 class _Snapshot(TypedDict):
-    """What the map and the referee read of a snapshot without looking twice; it may have more."""
+    """The parts of a snapshot that the map and the judge read without further checks; it may have more."""
 
     t: Number
     walls: tuple[Number, Number]
@@ -149,32 +149,32 @@ class _Snapshot(TypedDict):
 
 Message = Hello | Overlook | Motors | Drive | Halt | Alive | Order | Sensors | Picture | Truth | Done | Refused
 _ENCODER = msgpack.Encoder(enc_hook=float)
-"""NumPy's numbers are sent as what they are."""
+"""Encodes NumPy's numbers as floats."""
 _DECODER: msgpack.Decoder[Message] = msgpack.Decoder(Message)
 
 
 def encoded(message: Message) -> bytes:
-    """The frame of ``message``."""
+    """Return the frame of ``message``."""
     payload = _ENCODER.encode(message)
     if len(payload) > MAX_PAYLOAD:
         kind = type(message).__name__
-        raise ValueError(f"a {kind} message of {len(payload)} bytes is above the limit of {MAX_PAYLOAD}")
+        raise ValueError(f"a {kind} message of {len(payload)} bytes exceeds the limit of {MAX_PAYLOAD}")
     return MARKER + len(payload).to_bytes(4, "big") + payload
 
 
 def decoded(payload: bytes) -> Message:
-    """The message in the ``payload`` of one frame; raises ``BadFrame`` for anything else, whatever the bytes are."""
+    """Decode the ``payload`` of one frame; raise ``BadFrame`` for any invalid bytes."""
     try:
         message = _DECODER.decode(payload)
         if isinstance(message, Truth):
             convert(message.snapshot, _Snapshot)
     except (MsgspecError, ValueError, RecursionError) as error:
-        raise BadFrame(f"{len(payload)} bytes are no message: {error}") from error
+        raise BadFrame(f"{len(payload)} bytes are not a valid message: {error}") from error
     return message
 
 
 class FrameReader:
-    """Cuts a stream of bytes into messages, however the bytes are cut; counts and drops what is none."""
+    """Splits a stream into messages; counts and drops invalid data."""
 
     def __init__(self) -> None:
         self.frames = 0
@@ -197,23 +197,23 @@ class FrameReader:
         rest = self._rest
         while True:
             if not rest.startswith(MARKER[: len(rest)]):
-                self._drop_to_marker()
+                self._skip_to_marker()
             if len(rest) < HEADER:
                 return None
             length = int.from_bytes(rest[len(MARKER) : HEADER], "big")
             if length <= MAX_PAYLOAD:
                 break
             del rest[0]
-            self._drop_to_marker()
+            self._skip_to_marker()
         if len(rest) < HEADER + length:
             return None
         payload = bytes(rest[HEADER : HEADER + length])
         del rest[: HEADER + length]
         return payload
 
-    def _drop_to_marker(self) -> None:
+    def _skip_to_marker(self) -> None:
         self.bad_frames += 1
         at = self._rest.find(MARKER)
-        # The last byte may be the first half of a marker whose other half is still on the way.
+        # The last byte may be the first half of an incomplete marker.
         keep = at if at >= 0 else len(self._rest) - (1 if self._rest.endswith(MARKER[:1]) else 0)
         del self._rest[:keep]

@@ -1,4 +1,4 @@
-"""SimDriver: a dog of the simulated yard, asked like any other robot."""
+"""Driver of a simulated dog."""
 
 from __future__ import annotations
 
@@ -35,11 +35,10 @@ ALIVE_S = 0.5
 
 
 class SimDriver(LinkedDriver):
-    """One dog of the yard, through links that ``connector`` opens.
+    """One dog of the simulator, over links that ``connector`` opens.
 
     After ``connect`` the motors are off and ``estop.engaged`` is true until ``enable``.  ``connect`` fails with
-    ``Unsupported`` where the yard has no such robot; while another driver holds it, it is asked for again until it is
-    free.
+    ``Unsupported`` if the simulator has no such robot; while another driver holds it, the request is repeated.
     """
 
     def __init__(self, options: Options | Mapping[str, object], connector: Connector, clock: IReactorTime) -> None:
@@ -51,42 +50,42 @@ class SimDriver(LinkedDriver):
 
     @property
     def camera_fps(self) -> float:
-        """Pictures a second that the camera is asked for."""
+        """The requested frame rate in pictures per second."""
         return self._options.wanted_fps
 
     def set_camera_fps(self, fps: float) -> None:
-        """Ask the camera for so many pictures a second from now on; 0: none."""
+        """Set the frame rate in pictures per second; 0 stops."""
         self._options = replace(self._options, camera_fps=fps)
-        self._say(Hello(VERSION, self._options.robot, self._options.wanted_fps))
+        self._send_message(Hello(VERSION, self._options.robot, self._options.wanted_fps))
 
-    # -- to the yard ------------------------------------------------------------------------------------------------
+    # -- to the simulator -------------------------------------------------------------------------------------------
 
     def _power(self, on: bool) -> None:
-        self._say(Motors(on))
+        self._send_message(Motors(on))
 
     def _drive(self, motion: Action, permit: Permit) -> Action:
         now, newest = self._clock.seconds(), self._newest
-        assert newest is not None  # nothing is driven before
+        assert newest is not None  # act() requires an observation
         sent = newest.t_robot + (now - newest.t_host)
         vx, vy, wz = motion["base.vx"], motion["base.vy"], motion["base.wz"]
-        self._say(Drive(vx, vy, wz, permit.token, permit.deadline - now, sent))
+        self._send_message(Drive(vx, vy, wz, permit.token, permit.deadline - now, sent))
         return motion
 
     def _halt(self) -> None:
-        self._say(Halt())
+        self._send_message(Halt())
 
-    # -- from the yard ----------------------------------------------------------------------------------------------
+    # -- from the simulator -----------------------------------------------------------------------------------------
 
     def link_up(self, link: Link) -> None:
-        """Ask the yard for the robot; called by the line."""
+        """Request the robot; called by the link."""
         self._link = link
         self._reader = FrameReader()
-        self._say(Hello(VERSION, self._options.robot, self._options.wanted_fps))
+        self._send_message(Hello(VERSION, self._options.robot, self._options.wanted_fps))
         self._up()
         self._keep_alive()
 
     def link_down(self) -> None:
-        """Bring the motion to rest here, as the yard does there; called by the line."""
+        """Reset the motion here, as the simulator does itself; called by the link."""
         self._link = None
         self._timer.cancel()
         self._down()
@@ -112,28 +111,30 @@ class SimDriver(LinkedDriver):
             self._refused(Unsupported(message.reason))
             return
         if not self._has_problem:
-            self.log.warn("yard: {reason}; asking again", reason=message.reason)
+            self.log.warn("simulator: {reason}; retrying", reason=message.reason)
         self._has_problem = True
 
-    def _say(self, message: Message) -> None:
+    def _send_message(self, message: Message) -> None:
         self._send(encoded(message))
 
     def _keep_alive(self) -> None:
-        self._say(Alive())
+        self._send_message(Alive())
         self._timer.set(ALIVE_S, self._keep_alive)
 
 
 def make_driver(
     options: Mapping[str, object], name: str, clock: IReactorTime, connector: Connector | None
 ) -> SimDriver:
-    """A driver of the dog that ``options`` or else the device's ``name`` names."""
-    return SimDriver(_named(options, name), TcpConnector(says=True) if connector is None else connector, clock)
+    """Return a driver of the dog that ``options`` or else the device's ``name`` selects."""
+    return SimDriver(
+        _checked_options(options, name), TcpConnector(says=True) if connector is None else connector, clock
+    )
 
 
 def describe(options: Mapping[str, object], name: str) -> Description:
-    """What that dog is."""
-    return described(_named(options, name))
+    """Return the description of that dog."""
+    return described(_checked_options(options, name))
 
 
-def _named(options: Mapping[str, object], name: str) -> Options:
+def _checked_options(options: Mapping[str, object], name: str) -> Options:
     return checked({"robot": name, **options})

@@ -1,4 +1,4 @@
-"""YardOperator: the yard from above: the truth for the map and the referee, and the operator's hand in it."""
+"""The operator's client of the simulator: the true state of the world, and commands that change it."""
 
 from __future__ import annotations
 
@@ -21,15 +21,16 @@ REPLY_S = 2.0
 ALIVE_S = 0.5
 
 Snapshot = Mapping[str, Any]
-"""``t``, ``walls`` (width, height), ``dogs`` (each name, x, y, heading, moving, stripes), ``target`` (x, y,
-radius) or None, ``collisions``."""
+"""The true state: ``t``, ``walls`` (width, height), ``dogs`` (each name, x, y, heading, moving, stripes), ``target``
+(x, y, radius) or None, ``collisions``.
+"""
 
 
 class YardOperator:
-    """A client that sees the whole yard ``rate`` times a second, and may move things in it.
+    """A client that receives the state of the world ``rate`` times per second and can change it.
 
-    An order's Deferred fires with True when the yard has carried it out; it fails with ``UsageError`` where the yard
-    says why not, with ``LinkLost`` without a link, with ``NoReply`` after ``REPLY_S``.
+    The Deferred of an order fires with True when the simulator has carried it out; it fails with ``UsageError`` if the
+    simulator refuses it, with ``LinkLost`` without a link, with ``NoReply`` after ``REPLY_S``.
     """
 
     log = Logger()
@@ -53,19 +54,19 @@ class YardOperator:
         self._snapshot: Snapshot | None = None
         self._connecting: Deferred[Snapshot] | None = None
         self._alive = Timer(clock)
-        self._seen = Subscribers[Snapshot]("the yard", self.log)
+        self._seen = Subscribers[Snapshot]("the simulator", self.log)
         self._orders: dict[int, tuple[Deferred[bool], Any]] = {}
         self._number = 0
 
     @property
     def snapshot(self) -> Snapshot | None:
-        """The newest truth, None before the first and while the link is down."""
+        """The newest snapshot, None before the first and while the link is down."""
         return self._snapshot
 
     def connect(self) -> Deferred[Snapshot]:
-        """Open the link and keep it open; fires with the first snapshot, however long the yard needs to appear."""
+        """Open the link and keep it open; fires with the first snapshot, even if the simulator starts much later."""
         if self._line is not None:
-            return fail(UsageError("this operator is connected already, or on its way"))
+            return fail(UsageError("this operator is already connected or connecting; use it as it is"))
         self._connecting = Deferred(lambda _: None)
         connecting = self._connecting
         self._line = self._connector.call(self._host, self._port, self)
@@ -76,11 +77,11 @@ class YardOperator:
         line, self._line = self._line, None
         connecting, self._connecting = self._connecting, None
         if connecting is not None:
-            connecting.errback(LinkLost("the operator left before the first snapshot"))
+            connecting.errback(LinkLost("disconnected before the first snapshot"))
         return succeed(None) if line is None else line.hang_up()
 
     def subscribe(self, seen: Callable[[Snapshot], None]) -> Callable[[], None]:
-        """Call ``seen`` at each snapshot; call what is returned to end that."""
+        """Call ``seen`` with each snapshot; return a function that ends the subscription."""
         return self._seen.add(seen)
 
     def place_target(self, x: float, y: float) -> Deferred[bool]:
@@ -92,51 +93,51 @@ class YardOperator:
         return self._order("place_target_at_random")
 
     def place_target_later(self, seconds: float) -> Deferred[bool]:
-        """Put the red target at a free place after ``seconds`` of the yard's time, unless it is moved before."""
+        """Put the red target at a free place after ``seconds`` of simulated time, unless it is moved before."""
         return self._order("place_target_later", float(seconds))
 
     def clear_target(self) -> Deferred[bool]:
-        """Take the red target away."""
+        """Remove the red target."""
         return self._order("clear_target")
 
     def move_dog(self, name: str, x: float, y: float, heading: float) -> Deferred[bool]:
-        """Lift a dog and set it down here, heading in radians."""
+        """Move a dog to this place, heading in radians."""
         return self._order("move_dog", name, float(x), float(y), float(heading))
 
     def scatter(self, seed: int) -> Deferred[bool]:
-        """Set all dogs down at random free places; the same seed gives the same places."""
+        """Move all dogs to random free places; the same seed gives the same places."""
         return self._order("scatter", seed)
 
     def unplug(self, name: str) -> Deferred[bool]:
-        """Break what leads to the robot ``name``, where that is no simulated dog's own link (``sim.robots.table``)."""
+        """Break the links to the emulated robot ``name`` (``sim.robots.table``)."""
         return self._order("unplug", name)
 
     def plug(self, name: str) -> Deferred[bool]:
-        """Mend what leads to the robot ``name``."""
+        """Restore the links to the emulated robot ``name``."""
         return self._order("plug", name)
 
     def link_up(self, link: Link) -> None:
-        """Ask for the view from above; called by the line."""
+        """Request snapshots; called by the link."""
         self._link = link
         self._reader = FrameReader()
         link.send(encoded(Overlook(VERSION, self._rate)))
         self._keep_alive()
 
     def link_down(self) -> None:
-        """Forget what is old; called by the line."""
+        """Drop the snapshot and fail open orders; called by the link."""
         self._link = None
         self._snapshot = None
         self._alive.cancel()
         for number in list(self._orders):
-            self._settle(number, LinkLost("the link to the yard went away"))
+            self._finish_order(number, LinkLost("the link to the simulator was lost"))
 
     def received(self, data: bytes) -> None:
-        """Take bytes from the yard; called by the line."""
+        """Take bytes from the simulator; called by the link."""
         for message in self._reader.read(data):
             if isinstance(message, Truth):
                 self._on_truth(message.snapshot)
             elif isinstance(message, Done):
-                self._settle(message.number, UsageError(message.problem) if message.problem else None)
+                self._finish_order(message.number, UsageError(message.problem) if message.problem else None)
 
     def _on_truth(self, snapshot: Snapshot) -> None:
         self._snapshot = snapshot
@@ -152,16 +153,16 @@ class YardOperator:
 
     def _order(self, verb: str, *arguments: Value) -> Deferred[bool]:
         if self._link is None:
-            return fail(LinkLost(f"no link to the yard at {self._host}:{self._port}; is it running?"))
+            return fail(LinkLost(f"no link to the simulator at {self._host}:{self._port}; is it running?"))
         self._number += 1
         number = self._number
         done: Deferred[bool] = Deferred()
-        late = NoReply(f"the yard did not answer {verb} within {REPLY_S:g} s")
-        self._orders[number] = (done, self._clock.callLater(REPLY_S, self._settle, number, late))
+        late = NoReply(f"the simulator did not answer {verb} within {REPLY_S:g} s")
+        self._orders[number] = (done, self._clock.callLater(REPLY_S, self._finish_order, number, late))
         self._link.send(encoded(Order(number, verb, arguments)))
         return done
 
-    def _settle(self, number: int, error: Exception | None) -> None:
+    def _finish_order(self, number: int, error: Exception | None) -> None:
         done, timer = self._orders.pop(number, (None, None))
         if done is None or timer is None:
             return

@@ -1,4 +1,4 @@
-"""Options of the simulated driver: read from a free table and checked, each fault with its remedy."""
+"""Options of the kind "sim"; each error names the remedy."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ DEFAULT_PORT = 7400
 
 @dataclass(frozen=True)
 class Options:
-    """Where the yard is, which of its robots is meant, and how many pictures a second are wanted (0: no camera)."""
+    """The address of the simulator, the name of the robot, and the frame rate (0: no camera)."""
 
     robot: Annotated[str, Meta(min_length=1, max_length=32, examples=["dog1"])]
     host: Annotated[str, Meta(min_length=1)] = "127.0.0.1"
@@ -26,17 +26,17 @@ class Options:
 
     @property
     def wanted_fps(self) -> float:
-        """Pictures a second to ask for."""
+        """The requested frame rate in pictures per second."""
         return self.camera_fps if self.camera else 0.0
 
 
 def checked(table: Mapping[str, object]) -> Options:
-    """The options in ``table``; raises ``UsageError`` that names the key and what to write instead."""
+    """Convert and check ``table``; raise ``UsageError`` that names the key and the remedy."""
     return convert_options("sim", table, Options)
 
 
 def described(options: Options) -> Description:
-    """What a dog of the yard is: an ERS-7 (Tekkotsu's walk figures and sensor ranges), known without a connection."""
+    """Return the description of a simulated dog: an ERS-7 with Tekkotsu's walking speeds and sensor ranges."""
     capabilities: dict[str, Mapping[str, float | str]] = {
         "base2d": {},
         "odometry": {},

@@ -1,4 +1,4 @@
-"""Emulator: the rover's side of the wire, on an endless floor; ``python emulator.py`` serves it on port 4000."""
+"""Emulator of the rover, on an endless floor; ``python emulator.py`` serves it on port 4000."""
 
 import math
 
@@ -6,15 +6,15 @@ PERIOD_S = 0.05
 
 
 class Emulator:
-    """One rover that lives by ``clock``; it obeys the last of several clients."""
+    """One rover, timed by ``clock``; with several clients it obeys the latest command."""
 
     def __init__(self, clock):
         self._clock = clock
         self._links = []
-        self._began = clock.seconds()
+        self._started_at = clock.seconds()
         self._x = self._y = self._yaw = self._vx = self._wz = 0.0
         self._has_motors = False
-        self._tell()
+        self._report()
 
     def accept(self, link):
         """Serve a new link."""
@@ -22,29 +22,29 @@ class Emulator:
         return _Client(self, link)
 
     def true_speed(self):
-        """How fast it moves, in m/s."""
+        """Return its speed in m/s."""
         return abs(self._vx)
 
     def obey(self, line):
-        """Do what a line says; what is none of ours is passed over."""
-        word, *numbers = line.split() or [b""]
-        if word == b"M":
+        """Execute a command; ignore unknown lines."""
+        command, *numbers = line.split() or [b""]
+        if command == b"M":
             self._has_motors = numbers == [b"1"]
             self._vx = self._wz = 0.0
-        elif word == b"V" and self._has_motors:
+        elif command == b"V" and self._has_motors:
             self._vx, self._wz = map(float, numbers)
 
     def leave(self, link):
-        """Forget a link; a rover that nobody holds stands still."""
+        """Remove a link and stop."""
         self._links.remove(link)
         self._vx = self._wz = 0.0
 
-    def _tell(self):
-        self._clock.callLater(PERIOD_S, self._tell)
+    def _report(self):
+        self._clock.callLater(PERIOD_S, self._report)
         self._x += self._vx * math.cos(self._yaw) * PERIOD_S
         self._y += self._vx * math.sin(self._yaw) * PERIOD_S
         self._yaw = math.remainder(self._yaw + self._wz * PERIOD_S, math.tau)
-        t = self._clock.seconds() - self._began
+        t = self._clock.seconds() - self._started_at
         line = f"{t:.3f} {self._x:.4f} {self._y:.4f} {self._yaw:.4f} 0 {self._has_motors:d}\n"
         for link in self._links:
             link.send(line.encode())
@@ -69,5 +69,5 @@ if __name__ == "__main__":
     from drivers.link import TcpLinkFactory
 
     reactor.listenTCP(4000, TcpLinkFactory(Emulator(reactor).accept), interface="127.0.0.1")
-    print("a rover on 127.0.0.1:4000; Ctrl-C ends it")
+    print("serving a rover on 127.0.0.1:4000; press Ctrl-C to stop")
     reactor.run()

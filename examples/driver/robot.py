@@ -1,4 +1,4 @@
-"""Rover: a robot of one's own.  It says ``t x y yaw bumped motors`` 20 times a second, and obeys ``V`` and ``M``."""
+"""Template of a driver.  The rover sends ``t x y yaw bumped motors`` 20 times per second and obeys ``V`` and ``M``."""
 
 import re
 
@@ -36,7 +36,7 @@ class Rover(BaseDriver):
     def _halt(self):
         self._link.send(b"V 0 0\n")
 
-    def link_up(self, link):  # noqa: D102 (the connector's, as the next)
+    def link_up(self, link):  # noqa: D102 (interface of the connector, like received)
         self._link, self._tail = link, b""
         self._halt()
         self._up()
@@ -48,7 +48,7 @@ class Rover(BaseDriver):
             self._counts["frames" if is_whole else "bad_frames"] += 1
             if is_whole:
                 t, x, y, yaw, bumped, motors = map(float, words)
-                place = {"odom.x": x, "odom.y": y, "odom.yaw": yaw}
-                self._observed({**place, "bump.front": bumped > 0, ENGAGED: motors == 0}, t)
+                pose = {"odom.x": x, "odom.y": y, "odom.yaw": yaw}
+                self._observed({**pose, "bump.front": bumped > 0, ENGAGED: motors == 0}, t)
 
     link_down = BaseDriver._down

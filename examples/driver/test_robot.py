@@ -1,4 +1,4 @@
-"""The tests that every driver needs, two lines each."""
+"""Conformance tests of the example driver."""
 
 from functools import partial
 

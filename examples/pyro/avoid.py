@@ -1,4 +1,4 @@
-"""Avoid: wander about, and turn away from what is ahead.  ``python examples/pyro/avoid.py`` or ``--host ROBOT``."""
+"""A brain that wanders and avoids obstacles.  ``python examples/pyro/avoid.py`` or ``--host ROBOT``."""
 
 from __future__ import annotations
 
@@ -7,22 +7,22 @@ import math
 from drivers.pyro.brain import Brain, Engine
 
 NEAR, FREE = 0.55, 0.9
-"""Metres ahead at which it turns away, and which it wants to have before it goes on."""
+"""Distance in metres at which the robot turns away, and the free distance it needs to continue."""
 CRUISE, TURN, SWING = 0.7, 0.4, 0.45
-"""Shares of what the robot can."""
+"""Fractions of the robot's limits."""
 
 
 class Avoid(Brain):
-    """Walks on while the way is free; swings as it goes, for an AIBO ranges straight ahead only."""
+    """Drives straight while nothing is ahead; swings from side to side, as an AIBO ranges only straight ahead."""
 
     def setup(self) -> None:
-        """No turn yet."""
+        """Reset the state."""
         self.side = 0
         self.more = 0
         self.bumps = 0
 
     def step(self) -> None:
-        """Look ahead, and decide."""
+        """Read the range ahead, and decide."""
         robot = self.robot
         if robot.hasA("bumper") and any(robot.bumper[0].value):
             self.bumps = 8
@@ -31,7 +31,7 @@ class Avoid(Brain):
             return robot.move(-0.3, 0.0) if self.bumps > 4 else robot.move(0.0, TURN)
         ahead = min((one.distance("M") for one in robot.range["front-all"]), default=math.inf)
         if self.side == 0 and ahead < NEAR:
-            # Where it swings to now, there it stands: the other side is the better one.
+            # The obstacle is on the side of the swing, so turn to the other side.
             self.side = -1 if math.sin(self.stepCount * 0.5) > 0 else 1
         if self.side:
             self.more = 5 if ahead < FREE else self.more - 1
@@ -42,7 +42,7 @@ class Avoid(Brain):
 
 
 def INIT(engine: Engine) -> Brain:
-    """The brain of this file."""
+    """Return the brain of this file."""
     engine.robot.requires("range-sensor")
     return Avoid("Avoid", engine)
 

@@ -1,4 +1,4 @@
-"""The lab of the two brains: a robot to drive, or a yard of its own with an emulated AIBO in it."""
+"""Common code of the two brains: connects to a robot, or simulates a world with an emulated AIBO."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ STEPS = 2
 
 
 class Pen:
-    """A yard with a red target and an emulated AIBO, which is its first dog; ``seed`` says where they stand."""
+    """A world with a red target and an emulated AIBO, its first dog; ``seed`` determines their positions."""
 
     def __init__(self, clock: IReactorTime, seed: int = 1) -> None:
         self.world = World(random.Random(seed), loaded("three-dogs"))
@@ -39,38 +39,40 @@ class Pen:
         self._clock = clock
         body = DogBody(self.world, self.dog, self._senses, camera)
         self._emulator = AiboEmulator(clock, body, random.Random(seed + 3))
-        self._loop = LoopingCall.withCount(self._turn)
+        self._loop = LoopingCall.withCount(self._on_tick)
         self._loop.clock = clock
 
     def start(self) -> None:
-        """Switch the dog on, and let time run."""
+        """Start the dog and simulated time."""
         self._loop.start(STEPS * SUBSTEP)
         self._emulator.start()
 
     def stop(self) -> None:
-        """Switch it off."""
+        """Stop both."""
         self._emulator.stop()
         self._loop.stop()
 
     def driver(self) -> Driver:
-        """A driver of the dog, joined through memory."""
+        """Return a driver of the dog, connected in memory."""
         return driver_for("aibo", {"host": "pen"}, "pen", self._clock, self._emulator.connector())
 
-    def _turn(self, count: int) -> None:
+    def _on_tick(self, count: int) -> None:
         for _ in range(min(count, 100) * STEPS):
             self.world.step()
             self._senses.sample()
 
 
 def main(init: Callable[[Engine], Brain], about: str) -> None:
-    """Run a brain from the command line until it quits, its seconds are over, or Ctrl-C; the robot stands then."""
+    """Run a brain from the command line, until it quits, ``--seconds`` pass, or Ctrl-C; then stop the robot."""
     parser = argparse.ArgumentParser(description=about)
     parser.add_argument("--kind", default="aibo", choices=kinds(), help="the kind of robot (default %(default)s)")
-    parser.add_argument("--host", help="where it is; without it, and no options: an emulated AIBO in this process")
-    parser.add_argument("--option", action="append", default=[], metavar="KEY=VALUE", help="another of its options")
-    parser.add_argument("--seconds", type=float, default=30.0, help="how long to run (default %(default)s)")
-    parser.add_argument("--seed", type=int, default=1, help="of the yard in this process (default %(default)s)")
-    chosen = parser.parse_args()
+    parser.add_argument("--host", help="its address; without options an emulated AIBO runs in this process")
+    parser.add_argument(
+        "--option", action="append", default=[], metavar="KEY=VALUE", help="an option of its driver; repeatable"
+    )
+    parser.add_argument("--seconds", type=float, default=30.0, help="duration of the run (default %(default)s)")
+    parser.add_argument("--seed", type=int, default=1, help="of the simulated world (default %(default)s)")
+    args = parser.parse_args()
 
     from twisted.internet import reactor as running
 
@@ -78,17 +80,17 @@ def main(init: Callable[[Engine], Brain], about: str) -> None:
 
     use_monotonic_time()
     reactor: Any = running
-    options: dict[str, object] = {} if chosen.host is None else {"host": chosen.host}
-    for text in chosen.option:
+    options: dict[str, object] = {} if args.host is None else {"host": args.host}
+    for text in args.option:
         key, _, value = text.partition("=")
         options[key] = int(value) if value.isdigit() else value
-    if options or chosen.kind != "aibo":
+    if options or args.kind != "aibo":
         try:
-            driver = driver_for(chosen.kind, options, "lab", reactor)
+            driver = driver_for(args.kind, options, "lab", reactor)
         except UsageError as error:
             parser.error(str(error))
     else:
-        pen = Pen(reactor, chosen.seed)
+        pen = Pen(reactor, args.seed)
         pen.start()
         driver = pen.driver()
     robot = PyroRobot(driver, reactor)
@@ -96,8 +98,8 @@ def main(init: Callable[[Engine], Brain], about: str) -> None:
 
     async def play() -> None:
         await robot.connect()
-        print(f"{robot.type}: has {', '.join(robot.devices)}; Ctrl-C ends it", flush=True)
-        reactor.callLater(chosen.seconds, engine.stop)
+        print(f"{robot.type}: has {', '.join(robot.devices)}; press Ctrl-C to stop", flush=True)
+        reactor.callLater(args.seconds, engine.stop)
         await engine.run(init)
 
     def over(failure: Any = None) -> None:

@@ -1,4 +1,4 @@
-"""TrackBall: keep turning to a red ball.  ``python examples/pyro/track_ball.py`` or ``--host ROBOT``."""
+"""A brain that turns towards a red ball.  ``python examples/pyro/track_ball.py`` or ``--host ROBOT``."""
 
 from __future__ import annotations
 
@@ -7,24 +7,24 @@ from drivers.pyro.brain import Brain, Engine
 RED = (190, 32, 42)
 TOLERANCE = 55
 LEAST = 12
-"""Pixels that a ball has at least."""
+"""Smallest area of a ball in pixels."""
 
 
 class TrackBall(Brain):
-    """Looks for the ball as it turns, and faces it once it is in sight."""
+    """Turns until the ball is in sight, and then faces it."""
 
     def setup(self) -> None:
-        """Have the camera tell where it is red."""
+        """Add filters that find red pixels."""
         self.cam = self.robot.camera[0]
         self.cam.addFilter("match", *RED, TOLERANCE)
         self.cam.addFilter("blobify", 0, 255, 255, 0, 1, 1, 1)
 
     def destroy(self) -> None:
-        """Look for nothing."""
+        """Remove the filters."""
         self.cam.clearFilters()
 
     def step(self) -> None:
-        """Turn to the largest red patch, or on."""
+        """Turn to the largest red blob, or continue to search."""
         results = self.cam.filterResults
         if len(results) > 1 and len(results[-1]) > 0:  # both filters have run
             x1, y1, x2, y2, area = results[-1][0]
@@ -35,7 +35,7 @@ class TrackBall(Brain):
 
 
 def INIT(engine: Engine) -> Brain:
-    """The brain of this file."""
+    """Return the brain of this file."""
     engine.robot.requires("camera")
     return TrackBall("TrackBall", engine)
 

@@ -1,4 +1,4 @@
-"""Spare: of all that are near enough, the one with the fullest battery; a strategy of one's own in ten lines."""
+"""A strategy in ten lines: of all robots that are near enough, select the one with the fullest battery."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from middleware.consensus.strategy import Report
 
 
 class Spare(CapabilityCost):
-    """Ways that differ by less than ten metres count as equal; then the battery decides, and then the id."""
+    """Distances that differ by less than ten metres count as equal; then the battery decides, and then the id."""
 
     name = "spare"
     version = "1"
 
     def weigh(self, report: Report) -> float:
-        """Tens of metres, and then what is missing in the battery."""
+        """Return tens of metres plus half of the missing charge."""
         return report.cost // 10.0 + (1.0 - report.battery) / 2.0

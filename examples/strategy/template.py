@@ -1,6 +1,6 @@
-"""Template: every method that a strategy has, to be copied and changed.  This one names the farthest.
+"""Template with every method of a strategy; this one selects the farthest robot.
 
-Run its tests in this folder by ``python -m twisted.trial test_strategies``; README.md says how a node finds it.
+Run its tests in this folder with ``python -m twisted.trial test_strategies``; README.md explains its installation.
 """
 
 from __future__ import annotations
@@ -11,13 +11,13 @@ from middleware.consensus.strategy import Consensus, Report, digest_of, refusal,
 
 
 class Farthest:
-    """The highest cost wins, ties go by the agent's id; a strategy asks no clock, no dice, no network."""
+    """The highest cost wins, ties are broken by the agent's id; pure: no clock, no randomness, no network."""
 
     name = "farthest"
     version = "1"
 
     def find(self, contacts: Sequence[Report]) -> Consensus:
-        """Who should act, out of the reports of all, oneself included; equal for equal reports in any order."""
+        """Select the agent that should act, from all reports including its own; their order has no effect."""
         order = sorted(standing(contacts, self.rank), key=lambda r: (self.rank(r), r.agent))
         if not order:
             return Consensus(None, reason="no report counts")
@@ -25,13 +25,13 @@ class Farthest:
         return Consensus(names[0], tuple(names[1:]), digest_of(order), reason=f"{order[0].cost:g} is the most")
 
     def improves(self, current: Report, offer: Report, hysteresis: float) -> bool:
-        """Whether a late report is so much better that the task should change hands."""
+        """Return whether a late report is so much better that the task should change hands."""
         return not refusal(offer) and offer.cost * (1.0 - hysteresis) > current.cost
 
     def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
-        """What of both has to travel on, so that ``find`` of it finds the same as of all reports."""
+        """Return the reports that have to be forwarded, so that ``find`` gives the same result as with all reports."""
         return standing((*a, *b), self.rank)
 
     def rank(self, report: Report) -> float:
-        """The lowest rank wins."""
+        """Return the rank of a report; the lowest wins."""
         return -report.cost

@@ -1,4 +1,4 @@
-"""The tests that every strategy needs, two lines each."""
+"""Conformance tests of the example strategies."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class FarthestTests(Conformance, SynchronousTestCase):
 
 
 class SpareTests(Conformance, SynchronousTestCase):
-    """The example conforms, and does what it says."""
+    """The example conforms, and the battery decides."""
 
     make = Spare
 

@@ -1,1 +1,1 @@
-"""The simulator of robots: a map with bodies, cameras and sensors, and the robots' side of each driver's wire."""
+"""The robot simulator: a map with robots, cameras and sensors, and the robots' side of each driver's protocol."""

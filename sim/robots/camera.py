@@ -1,4 +1,4 @@
-"""Camera: what a dog sees, painted far to near from the world alone; 208x160, 56.9 by 45.2 degrees as on the ERS-7."""
+"""Rendering of a dog's camera with the painter's algorithm: 208x160 pixels, 56.9 by 45.2 degrees as on the ERS-7."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ Span = tuple[float, float]
 
 
 class Camera:
-    """Draws for every dog of ``world``; the noise comes from ``rng``, so a seed gives the same pictures."""
+    """The cameras of all dogs of ``world``; the noise comes from ``rng``, so a seed gives the same pictures."""
 
     def __init__(self, rng: Random, world: World) -> None:
         self._world = world
@@ -51,11 +51,11 @@ class Camera:
         self._joints = _joints(world.scene.width, world.scene.height)
 
     def jpeg(self, dog: Dog, is_halved: bool = False) -> bytes:
-        """The picture as a JPEG, with half the width and height if asked for."""
+        """Return the picture as a JPEG, optionally at half the width and height."""
         return encoded(self.image(dog), is_halved)
 
     def image(self, dog: Dog) -> Image:
-        """The picture as blue, green and red bytes, sensor noise included."""
+        """Return the picture as blue, green and red bytes, with sensor noise."""
         view = View(dog.x, dog.y, dog.body.angle)
         image = self._room.floor()
         self._draw_joints(image, view)
@@ -97,14 +97,14 @@ def _draw_dog(image: Image, view: View, dog: Dog, mesh: _Mesh) -> None:
         return
     cos, sin = math.cos(dog.body.angle), math.sin(dog.body.angle)
     draw_shadow(image, view, dog.x, dog.y, 0.14)
-    # The eye in the dog's own frame says which faces look towards it.
+    # The position of the lens in the dog's frame determines the visible faces.
     eye = np.array([-cos * x - sin * y, sin * x - cos * y, EYE])
     towards = eye - mesh.centres[: mesh.count]
-    looks = (towards * mesh.normals[: mesh.count]).sum(axis=1) > 0.0
+    is_visible = (towards * mesh.normals[: mesh.count]).sum(axis=1) > 0.0
     depth = (towards * towards).sum(axis=1)
     placed = mesh.corners @ np.array([(cos, sin, 0.0), (-sin, cos, 0.0), (0.0, 0.0, 1.0)]) + (dog.x, dog.y, 0.0)
     seen = view.seen(placed)
-    order = [face for face in np.argsort(-depth, kind="stable").tolist() if looks[face]]
+    order = [face for face in np.argsort(-depth, kind="stable").tolist() if is_visible[face]]
     parts = [part for face in order for part in (face, *mesh.marks[face])]
     if seen[:, 0].min() < NEAR_PLANE:
         for part in parts:
@@ -115,7 +115,7 @@ def _draw_dog(image: Image, view: View, dog: Dog, mesh: _Mesh) -> None:
 
 
 def _joints(width: float, height: float) -> Points:
-    """The joints between the floor tiles as pairs of points."""
+    """Return the joints between the floor tiles as pairs of points."""
     across = [((x, 0.0, 0.0), (x, height, 0.0)) for x in np.arange(TILE, width - 0.01, TILE)]
     along = [((0.0, y, 0.0), (width, y, 0.0)) for y in np.arange(TILE, height - 0.01, TILE)]
     return np.array(across + along).reshape(-1, 3)
@@ -123,9 +123,9 @@ def _joints(width: float, height: float) -> Points:
 
 @dataclass(frozen=True)
 class _Mesh:
-    """Faces of four ``corners`` each, in the dog's own frame; a face is seen from the side that its normal points to.
+    """Faces of four ``corners`` each, in the dog's frame; a face is visible from the side of its normal.
 
-    The first ``count`` faces stand by themselves; ``marks`` lists, for each of them, the faces that are painted on it.
+    The first ``count`` faces are independent; ``marks`` lists, for each of them, the faces that are painted on it.
     """
 
     corners: Points
@@ -137,7 +137,7 @@ class _Mesh:
 
 
 def _dog_mesh(stripes: int) -> _Mesh:
-    """An ERS-7 in outline: body, head with ``stripes`` yellow stripes, ears, legs, tail, the shade below."""
+    """Build a simplified ERS-7: body, head with ``stripes`` yellow stripes, ears, legs, tail, the shade below."""
     faces: list[Points] = []
     plain: list[Colour] = []
     bands: list[list[Points]] = []
@@ -161,9 +161,9 @@ def _dog_mesh(stripes: int) -> _Mesh:
 
 
 def _boxes(stripes: int) -> Iterator[tuple[Span, Span, Span, Colour, int]]:
-    """The boxes of a dog: spans of x, y and z in metres, the colour, and how many stripes each side has.
+    """Yield the boxes of a dog: spans of x, y and z in metres, the colour, and the number of stripes on each side.
 
-    The trunk is as high as the target, so that a dog in front of it hides it whole.
+    The trunk is as high as the target, so a dog in front of the target hides it completely.
     """
     yield (-0.105, 0.095), (-0.055, 0.055), (0.0, 0.11), _DARK, 0
     for x in (-0.105, 0.045):
@@ -178,7 +178,7 @@ def _boxes(stripes: int) -> Iterator[tuple[Span, Span, Span, Colour, int]]:
 
 
 def _bands(face: Points, stripes: int) -> list[Points]:
-    """``stripes`` upright bands across a face, in its own plane."""
+    """Return ``stripes`` upright bands across a face, in its plane."""
     a, b, c, d = face
     edges = np.arange(1, 2 * stripes + 1) / (2 * stripes + 1)
     return [

@@ -1,4 +1,4 @@
-"""Dog: the body of one simulated ERS-7 in the physics, moved by velocities with limited acceleration."""
+"""Physics of one simulated ERS-7, controlled by velocities with limited acceleration."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pymunk
 from sim.robots.scene import FOOTPRINT, Kennel
 
 LIMITS = {"base.vx": (-0.156, 0.160), "base.vy": (-0.103, 0.103), "base.wz": (-2.03, 2.03)}
-"""The walk figures of the ERS-7 in m/s and rad/s (Tekkotsu's stock gait)."""
+"""Speed limits of the ERS-7 in m/s and rad/s (Tekkotsu's stock gait)."""
 ACCELERATION = 0.8
 BRAKING = 3.0
 ANGULAR_ACCELERATION = 12.0
@@ -20,7 +20,7 @@ DOG, TARGET, WALL = 1, 2, 3
 
 
 class Motion(NamedTuple):
-    """A velocity in the dog's own frame: m/s forward, m/s to the left, rad/s counter-clockwise."""
+    """A velocity in the dog's frame: m/s forward, m/s to the left, rad/s counter-clockwise."""
 
     vx: float = 0.0
     vy: float = 0.0
@@ -31,7 +31,7 @@ REST = Motion()
 
 
 class Dog:
-    """One dog: its place, its command, and the acceleration that its body felt in the newest substep."""
+    """One dog: its position, its command, and its acceleration in the last substep."""
 
     def __init__(self, kennel: Kennel, number: int) -> None:
         self.name = kennel.name
@@ -45,10 +45,10 @@ class Dog:
         self.shape = pymunk.Circle(self.body, FOOTPRINT)
         self.shape.friction = 0.3
         self.shape.collision_type = DOG
-        # Shapes of one group are not found by the rays that carry the group: a dog does not range itself.
+        # Rays ignore shapes of the same group: a dog does not measure the distance to itself.
         self.shape.filter = pymunk.ShapeFilter(group=number)
         self.motion = REST
-        """The velocity of the body in its own frame, as the newest substep left it."""
+        """The velocity in the dog's frame after the newest substep."""
         self._before = (0.0, 0.0)
 
     @property
@@ -68,13 +68,13 @@ class Dog:
 
     @property
     def is_moving(self) -> bool:
-        """Whether the dog walks, turns, or is about to."""
+        """Whether the dog moves, or has a command to move."""
         vx, vy, wz = self.motion
         return self.command != REST or math.hypot(vx, vy) > 0.005 or abs(wz) > 0.02
 
     @property
     def touches(self) -> list[float]:
-        """Where something touches it now: radians from straight ahead, left positive."""
+        """Directions of current contacts: radians from straight ahead, left positive."""
         found: list[float] = []
 
         def note(arbiter: pymunk.Arbiter) -> None:
@@ -86,19 +86,19 @@ class Dog:
         return found
 
     def drive(self, motion: Motion) -> None:
-        """Move like this from now on, clipped to ``limits``; what has none there is not moved."""
+        """Set the commanded velocity, clipped to ``limits``; an axis without limits is 0."""
         spans = (self.limits.get(key, (0.0, 0.0)) for key in LIMITS)
         self.command = Motion(*(min(max(v, low), high) for v, (low, high) in zip(motion, spans, strict=True)))
 
     def strive(self, dt: float) -> None:
-        """Bring the velocity as near to the command as the legs can in ``dt`` seconds; called before the physics."""
+        """Accelerate towards the command for ``dt`` seconds; called before the physics step."""
         velocity = self.body.velocity
         self._before = (velocity.x, velocity.y)
         vx, vy, wz = self.motion
-        lack_x, lack_y = self.command.vx - vx, self.command.vy - vy
-        lack, can = math.hypot(lack_x, lack_y), (BRAKING if self.command == REST else ACCELERATION) * dt
-        share = 1.0 if lack <= can else can / lack
-        vx, vy = vx + share * lack_x, vy + share * lack_y
+        error_x, error_y = self.command.vx - vx, self.command.vy - vy
+        error, most = math.hypot(error_x, error_y), (BRAKING if self.command == REST else ACCELERATION) * dt
+        share = 1.0 if error <= most else most / error
+        vx, vy = vx + share * error_x, vy + share * error_y
         turn = ANGULAR_ACCELERATION * dt
         angle = self.body.angle
         cos, sin = math.cos(angle), math.sin(angle)
@@ -106,7 +106,7 @@ class Dog:
         self.body.angular_velocity = wz + min(max(self.command.wz - wz, -turn), turn)
 
     def feel(self, dt: float) -> None:
-        """Note the acceleration of the substep of ``dt`` seconds in the body's frame; called after the physics."""
+        """Store the acceleration of a substep of ``dt`` seconds in the dog's frame; called after the physics step."""
         (vx, vy), angle = self.body.velocity, self.body.angle
         cos, sin = math.cos(angle), math.sin(angle)
         ax, ay = (vx - self._before[0]) / dt, (vy - self._before[1]) / dt
@@ -114,7 +114,7 @@ class Dog:
         self.motion = Motion(cos * vx + sin * vy, cos * vy - sin * vx, float(self.body.angular_velocity))
 
     def put(self, x: float, y: float, heading: float) -> None:
-        """Lift the dog and set it down at rest."""
+        """Move the dog to this place, at rest."""
         self.body.position = x, y
         self.body.angle = heading
         self.body.velocity = 0.0, 0.0

@@ -1,4 +1,4 @@
-"""Lens: what a camera on a robot's nose makes of a place, and what all such cameras paint with.
+"""Projection and drawing functions shared by all simulated cameras, which are mounted at the front of a robot.
 
 208x160 pixels, 56.9 by 45.2 degrees as on the ERS-7.
 """
@@ -18,13 +18,13 @@ WIDTH, HEIGHT = 208, 160
 FOCAL_X = WIDTH / 2 / math.tan(math.radians(56.9) / 2)
 FOCAL_Y = HEIGHT / 2 / math.tan(math.radians(45.2) / 2)
 EYE = 0.19
-"""Metres of the lens above the floor."""
+"""Height of the lens above the floor in metres."""
 QUALITY = 80
 NEAR_PLANE = 0.02
 SKIRTING_M = 0.03
 
 Colour = tuple[int, int, int]
-"""Blue, green, red, as OpenCV has them."""
+"""Blue, green, red, the order of OpenCV."""
 Points = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
@@ -34,7 +34,7 @@ _BEYOND: Colour = (214, 208, 202)
 _SHADOW: Colour = (84, 104, 92)
 
 _SEAMS = (1.0, 0.9, 0.72, 0.45, 0.1, -0.3, -0.62, -0.86, -1.0)
-"""Where the strips of the round target meet, as shares of its half width, from left to right."""
+"""Boundaries between the strips of the round target, as fractions of its half width, from left to right."""
 _REDS: tuple[Colour, ...] = (
     (28, 18, 158),
     (32, 22, 176),
@@ -56,7 +56,7 @@ cv2.setNumThreads(1)
 
 
 class View:
-    """What the lens on the nose of a robot at this place sees, in its own frame: forward, left, up."""
+    """Coordinates in the frame of the lens of a robot at this pose: forward, left, up."""
 
     def __init__(self, x: float, y: float, heading: float) -> None:
         self.cos, self.sin = math.cos(heading), math.sin(heading)
@@ -64,18 +64,18 @@ class View:
         self._turn = np.array([(self.cos, -self.sin, 0.0), (self.sin, self.cos, 0.0), (0.0, 0.0, 1.0)])
 
     def seen_one(self, x: float, y: float, z: float) -> list[float]:
-        """One point of the yard, from the lens."""
+        """Transform one point of the world."""
         x, y = x - self.x, y - self.y
         return [self.cos * x + self.sin * y, self.cos * y - self.sin * x, z - EYE]
 
     def seen(self, points: Points) -> Points:
-        """Points of the yard, from the lens."""
+        """Transform points of the world."""
         moved: Points = (points - (self.x, self.y, EYE)) @ self._turn
         return moved
 
 
 def pixels(seen: Points) -> NDArray[np.int32]:
-    """Where points before the near plane fall on the picture, in sixteenths of a pixel."""
+    """Project points beyond the near plane to the picture, in sixteenths of a pixel."""
     places = np.empty((len(seen), 2))
     np.divide(seen[:, 1:], seen[:, :1], out=places)
     places *= _SCALE
@@ -84,30 +84,30 @@ def pixels(seen: Points) -> NDArray[np.int32]:
 
 
 def filled(image: Image, seen: list[list[float]], colour: Colour) -> None:
-    """Fill a convex polygon of a few corners, clipped at the near plane; for so few, plain numbers beat arrays."""
+    """Fill a convex polygon, clipped at the near plane; for few corners, plain numbers are faster than arrays."""
     if all(corner[0] < NEAR_PLANE for corner in seen):
         return
     if any(corner[0] < NEAR_PLANE for corner in seen):
-        seen = _clipped(seen)
+        seen = _clip_polygon(seen)
     (scale_x, scale_y), (middle_x, middle_y) = _SCALE, _MIDDLE
     places = [(int(middle_x + scale_x * y / x), int(middle_y + scale_y * z / x)) for x, y, z in seen]
     cv2.fillConvexPoly(image, np.array(places, np.int32), colour, cv2.LINE_AA, SUB_BITS)
 
 
-def _clipped(seen: list[list[float]]) -> list[list[float]]:
-    """What of a convex polygon lies beyond the near plane (Sutherland and Hodgman's rule for one plane)."""
-    kept = []
+def _clip_polygon(seen: list[list[float]]) -> list[list[float]]:
+    """Clip a convex polygon at the near plane (Sutherland-Hodgman for one plane)."""
+    corners = []
     for one, other in zip(seen, seen[1:] + seen[:1], strict=True):
         if one[0] >= NEAR_PLANE:
-            kept.append(one)
+            corners.append(one)
         if (one[0] >= NEAR_PLANE) != (other[0] >= NEAR_PLANE):
             share = (NEAR_PLANE - one[0]) / (other[0] - one[0])
-            kept.append([NEAR_PLANE, *(a + share * (b - a) for a, b in zip(one[1:], other[1:], strict=True))])
-    return kept
+            corners.append([NEAR_PLANE, *(a + share * (b - a) for a, b in zip(one[1:], other[1:], strict=True))])
+    return corners
 
 
 def draw_shadow(image: Image, view: View, x: float, y: float, radius: float) -> None:
-    """Darken the floor under something round."""
+    """Darken the floor under a round object."""
     ring = [view.seen_one(x + radius * cos, y + radius * sin, 0.0) for cos, sin in _RING]
     filled(image, ring, _SHADOW)
 
@@ -124,7 +124,7 @@ def draw_target(image: Image, view: View, x: float, y: float, radius: float, hei
     for share in _SEAMS:
         off = half * share
         edge = max(-1.4, min(1.4, bearing + off))
-        # The foot and the top are round: the middle of the cylinder is nearer than its tangents.
+        # The front of the cylinder is nearer than its tangents.
         sagitta = math.sqrt(max(0.0, radius**2 - (distance * math.sin(off)) ** 2))
         along = distance * math.cos(off) - sagitta
         edges.append((max(along * math.cos(edge), NEAR_PLANE), along * math.sin(edge)))
@@ -135,13 +135,14 @@ def draw_target(image: Image, view: View, x: float, y: float, radius: float, hei
 
 
 class Room:
-    """An empty room of ``width`` by ``depth`` metres, and the noise of a camera's chip, whose dice are ``rng``."""
+    """An empty room of ``width`` by ``depth`` metres, and the sensor noise of a camera; ``rng`` generates the noise."""
 
     def __init__(self, rng: Random, width: float, depth: float, wall_height: float) -> None:
         self._rng = rng
-        dice = np.random.default_rng(rng.getrandbits(64))
+        generator = np.random.default_rng(rng.getrandbits(64))
         self._noise = [
-            np.clip(dice.normal(8.0, 3.0, (HEIGHT, WIDTH, 3)), 0, 16).astype(np.uint8) for _ in range(_NOISE_SHEETS)
+            np.clip(generator.normal(8.0, 3.0, (HEIGHT, WIDTH, 3)), 0, 16).astype(np.uint8)
+            for _ in range(_NOISE_SHEETS)
         ]
         self._backdrop = _backdrop()
         corners = [(0.0, 0.0), (width, 0.0), (width, depth), (0.0, depth)]
@@ -155,7 +156,7 @@ class Room:
         )
 
     def floor(self) -> Image:
-        """A new picture with the floor and the sky, and no walls yet."""
+        """Return a new picture with the floor and the background, without walls."""
         return self._backdrop.copy()
 
     def draw_walls(self, image: Image, view: View) -> None:
@@ -166,12 +167,12 @@ class Room:
             filled(image, rows[number + 4 : number + 8], _SKIRTING)
 
     def noisy(self, image: Image) -> Image:
-        """The picture as the chip delivers it."""
+        """Return the picture with sensor noise."""
         return np.asarray(cv2.add(image, self._noise[self._rng.randrange(_NOISE_SHEETS)]), dtype=np.uint8)
 
 
 def encoded(image: Image, is_halved: bool = False) -> bytes:
-    """The picture as a JPEG, with half the width and height if asked for."""
+    """Encode the picture as a JPEG, optionally at half the width and height."""
     if is_halved:
         image = np.asarray(cv2.resize(image, (WIDTH // 2, HEIGHT // 2), interpolation=cv2.INTER_AREA), np.uint8)
     done, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
@@ -181,7 +182,7 @@ def encoded(image: Image, is_halved: bool = False) -> bytes:
 
 
 def _backdrop() -> Image:
-    """The room beyond the walls above the horizon, the floor below it, lighter towards the lens."""
+    """Return the background: plain above the horizon, below it the floor, which is lighter towards the lens."""
     image = np.empty((HEIGHT, WIDTH, 3), np.uint8)
     image[:] = _BEYOND
     ramp = np.linspace(0.0, 1.0, HEIGHT - HEIGHT // 2)[:, None]

@@ -1,4 +1,4 @@
-"""Picture: the yard from above as a PNG, in the manner of the thesis' Figures 5.3 to 5.7."""
+"""The map of the simulator as a PNG, in the style of the thesis' Figures 5.3 to 5.7."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sim.robots.lens import Colour, Image
 
 WIDTH, HEIGHT = 640, 520
 _FINE = 3
-"""Everything is drawn so many times larger and then shrunk: smooth edges without a vector library."""
+"""Oversampling factor: the drawing is larger by this factor and then reduced, for smooth edges."""
 _MARGIN = 26
 _CAPTION = 40
 _FLOOR: Colour = (146, 172, 158)
@@ -32,9 +32,9 @@ _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
 def overhead(snapshot: Mapping[str, Any], caption: str = "") -> bytes:
-    """A PNG of the yard's ``snapshot``, with a ``caption``."""
+    """Return a PNG of ``snapshot``, with a ``caption``."""
     sheet = _Sheet(snapshot["walls"], caption)
-    sheet.draw_yard()
+    sheet.draw_world()
     if snapshot["target"] is not None:
         sheet.draw_target(snapshot["target"])
     for dog in snapshot["dogs"]:
@@ -62,14 +62,13 @@ class _Sheet:
         self._image: Image = np.full((HEIGHT * _FINE, WIDTH * _FINE, 3), _PAPER, np.uint8)
 
     def place(self, x: float, y: float) -> tuple[float, float]:
-        """Where a point of the yard falls, in pixels of the finished picture."""
+        """Return the position of a point in pixels of the finished picture."""
         return self._left + self.scale * x, self._bottom - self.scale * y
 
     def shrunk(self) -> Image:
-        """The finished picture."""
         return np.asarray(cv2.resize(self._image, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
-    def draw_yard(self) -> None:
+    def draw_world(self) -> None:
         width, height = self.room
         thick = 0.05
         shade = [(0.03, -0.08), (width + 0.08, -0.08), (width + 0.08, height - 0.03), (0.03, height - 0.03)]
@@ -91,7 +90,6 @@ class _Sheet:
         self._disc(x - radius * 0.3, y + radius * 0.3, radius * 0.26, (120, 112, 240))
 
     def draw_dog(self, dog: Mapping[str, Any]) -> None:
-        """Draw a dog from above: legs, trunk, tail, ears, and a head with its yellow stripes."""
         x, y, heading = dog["x"], dog["y"], dog["heading"]
         cos, sin = math.cos(heading), math.sin(heading)
 
@@ -120,23 +118,22 @@ class _Sheet:
         self._line([*points, points[0]], _EDGE, 0.006)
 
     def _polygon(self, points: Sequence[tuple[float, float]], colour: Colour) -> None:
-        cv2.fillPoly(self._image, [self._fine(points)], colour, cv2.LINE_AA, 4)
+        cv2.fillPoly(self._image, [self._to_pixels(points)], colour, cv2.LINE_AA, 4)
 
     def _line(self, points: Sequence[tuple[float, float]], colour: Colour, thickness: float) -> None:
         wide = max(1, round(thickness * self.scale * _FINE))
-        cv2.polylines(self._image, [self._fine(points)], False, colour, wide, cv2.LINE_AA, 4)
+        cv2.polylines(self._image, [self._to_pixels(points)], False, colour, wide, cv2.LINE_AA, 4)
 
     def _disc(self, x: float, y: float, radius: float, colour: Colour) -> None:
-        column, row = self._fine([(x, y)])[0]
+        column, row = self._to_pixels([(x, y)])[0]
         size = round(radius * self.scale * _FINE * 16)
         cv2.circle(self._image, (int(column), int(row)), size, colour, -1, cv2.LINE_AA, 4)
 
-    def _fine(self, points: Sequence[tuple[float, float]]) -> NDArray[np.int32]:
+    def _to_pixels(self, points: Sequence[tuple[float, float]]) -> NDArray[np.int32]:
         return (np.array([self.place(x, y) for x, y in points]) * (_FINE * 16)).round().astype(np.int32)
 
 
 def _rounded(x1: float, x2: float, y1: float, y2: float, radius: float) -> list[tuple[float, float]]:
-    """A rectangle with round corners."""
     points = []
     for number, (x, y) in enumerate(
         ((x2 - radius, y2 - radius), (x1 + radius, y2 - radius), (x1 + radius, y1 + radius), (x2 - radius, y1 + radius))
@@ -148,7 +145,7 @@ def _rounded(x1: float, x2: float, y1: float, y2: float, radius: float) -> list[
 
 
 def _draw_name(image: Image, sheet: _Sheet, dog: Mapping[str, Any]) -> None:
-    """Write the name beside the dog, on the side that has room."""
+    """Write the name above the dog, or below it near the upper edge."""
     name, size = str(dog["name"]), 0.45
     (wide, high), _ = cv2.getTextSize(name, _FONT, size, 1)
     x, y = sheet.place(dog["x"], dog["y"])
@@ -161,7 +158,7 @@ def _draw_name(image: Image, sheet: _Sheet, dog: Mapping[str, Any]) -> None:
 
 
 def _draw_caption(image: Image, caption: str) -> None:
-    """Write the caption below, in the middle, as large as fits."""
+    """Write the caption at the bottom, centred, reduced if it is too long."""
     width, size = image.shape[1], 0.55
     (wide, _), _ = cv2.getTextSize(caption, _FONT, size, 1)
     if wide > width - 20:

@@ -1,8 +1,8 @@
-"""Reception: a yard that a clock paces, and that drivers reach over connections; it knows not who lives there.
+"""A simulated world with a clock and with drivers over connections; independent of the kind of its robots.
 
-Each robot obeys one driver at a time, through a gate of its own: a command runs out after its time to live, whatever
-became of the driver, and the robot stops when the connection closes.  The gate outlives its drivers: what is older than
-what the robot has obeyed is refused, also over a new connection, and the robot tells the next driver how far it is.
+Each robot obeys one driver at a time, through its own gate: a command expires after its time to live, even if the
+driver is gone, and the robot stops when the connection closes.  The gate outlives its drivers: it refuses tokens
+lower than the highest obeyed one over new connections as well, and the robot reports that token to each driver.
 """
 
 from __future__ import annotations
@@ -35,29 +35,29 @@ from sim.robots.lens import HEIGHT, WIDTH
 from sim.robots.world import TICK
 
 SILENT_S = 3.0
-"""A client that says nothing for so long is given up, and its robot is free for another."""
+"""Seconds without data after which a client is disconnected, and its robot is free for another."""
 MAX_LATE_S = 1.0
-"""Seconds by which a yard may be late and still make up for them."""
+"""Delay in seconds up to which the simulator catches up with real time."""
 MAX_TTL_S = 10.0
 MAX_FPS = 30.0
 NAMED = 12
-"""A message names all robots of a yard only where there are no more."""
+"""Number of robots up to which a message lists all of them."""
 
 
 class Legs(Protocol):
-    """What moves the robots of a yard, by their names."""
+    """Moves the robots of a world, by name."""
 
     def drive(self, name: str, vx: float, vy: float, wz: float) -> None:
-        """Let a robot walk with this velocity in its own frame until told otherwise."""
+        """Set the robot's velocity in its frame, until the next command."""
 
     def halt(self, name: str) -> None:
-        """Let a robot stand still, as fast as it can brake."""
+        """Stop the robot, braking as hard as it can."""
 
 
 class PacedYard:
-    """A yard of the robots ``names``, which ``legs`` move, with at most ``most`` connections.
+    """A simulated world with the robots ``names``, which ``legs`` moves, and at most ``most`` connections.
 
-    ``start`` lets its time run on ``clock``, ``attach`` takes a connection; a subclass lets time pass in ``_play``.
+    ``start`` starts its time on ``clock``, ``attach`` adds a connection; subclasses implement ``_simulate``.
     """
 
     log = Logger()
@@ -69,23 +69,23 @@ class PacedYard:
         self._gates = {name: Gate() for name in names}
         self._sessions: list[Session] = []
         self._drivers: dict[str, Session] = {}
-        self._lent: set[str] = set()
+        self._reserved: set[str] = set()
         self._origin = clock.seconds()
         self._ticks = 0
         self._pending: IDelayedCall | None = None
 
     @property
     def holders(self) -> list[str]:
-        """The robots that a driver holds now."""
+        """The robots that currently have a driver."""
         return [name for name in self._gates if name in self._drivers]
 
     def start(self) -> None:
-        """Let time run from now on."""
+        """Start time."""
         self._origin = self._clock.seconds() - self._ticks * TICK
         self._schedule()
 
     def stop(self) -> None:
-        """Let time stand still, and close every connection."""
+        """Stop time, and close all connections."""
         if self._pending is not None:
             self._pending.cancel()
             self._pending = None
@@ -93,35 +93,35 @@ class PacedYard:
             session.link.close()
 
     def attach(self, link: Link) -> Session:
-        """Take a new connection; what arrives on it goes to the session that is returned."""
+        """Add a connection; return the session that receives its data."""
         session = Session(link, self._on_message, self._on_down, self._now())
         if len(self._sessions) >= self._most:
-            session.send(Refused(f"the yard has {self._most} connections already", False))
+            session.send(Refused(f"the simulator already has {self._most} connections, its maximum", False))
             link.close()
             return session
         self._sessions.append(session)
         return session
 
     def connector(self, delay: float = 0.0005) -> MemoryConnector:
-        """What drivers in this process connect through: ``SimDriver(options, yard.connector(), clock)``."""
+        """Return a connector for drivers in this process: ``SimDriver(options, yard.connector(), clock)``."""
         return MemoryConnector(self._clock, self.attach, delay)
 
     # -- for subclasses ---------------------------------------------------------------------------------------------
 
-    def _play(self, late: float) -> int:
-        """Let the tick that is due pass, and of those that are ``late``, in seconds, as many as wanted; how many."""
+    def _simulate(self, late: float) -> int:
+        """Simulate the due tick and, of those missed in ``late`` seconds, as many as wanted; return their number."""
         raise NotImplementedError
 
     def _on_other(self, session: Session, message: Message) -> None:
-        """Take a message that no driver sends."""
+        """Handle a message that is not from a driver."""
 
-    def _withhold(self, name: str) -> None:
-        """Have no driver hold this robot here; raises ``UsageError`` where there is no such robot."""
+    def _reserve_robot(self, name: str) -> None:
+        """Reserve a robot for an emulator, so that no driver can hold it; raise ``UsageError`` for an unknown robot."""
         if name not in self._gates:
-            raise UsageError(f"no robot is named {name!r} in this yard; it has {self._listed()}")
-        self._lent.add(name)
+            raise UsageError(f"no robot is named {name!r} in this simulator; it has {self._list_names()}")
+        self._reserved.add(name)
 
-    def _tell(
+    def _report_sensors(
         self,
         name: str,
         t: float,
@@ -129,34 +129,36 @@ class PacedYard:
         samples: Mapping[str, tuple[float, ...]],
         picture: Callable[[], bytes] | None,
     ) -> None:
-        """Tell who holds the robot ``name`` what it feels at ``t`` of the yard's time, and show what it sees if due."""
+        """Send the sensor values at time ``t`` to the driver of the robot ``name``, and a picture if it is due."""
         session = self._drivers.get(name)
         if session is None or session.link.is_busy:
             return
         if picture is not None and session.pictures.is_due(t):
             session.seq += 1
             session.send(Picture(session.seq, t, WIDTH, HEIGHT, picture()))
-        felt = {**values, "estop.engaged": not session.has_motors}
-        session.send(Sensors(t, felt, samples, self._gates[name].token or 0))
+        sensed = {**values, "estop.engaged": not session.has_motors}
+        session.send(Sensors(t, sensed, samples, self._gates[name].token or 0))
 
     def _expire(self, t: float) -> None:
-        """Halt the robots whose command has run out at ``t``."""
         for name, gate in self._gates.items():
             if gate.is_over(t):
                 self._halt(name)
 
     def _drop_silent(self) -> None:
-        """Close the connections on which nothing is heard any more."""
         now = self._now()
         for session in list(self._sessions):
             if now - session.heard_at > SILENT_S:
-                self.log.warn("{robot}: nothing heard for {seconds} s", robot=session.robot or "?", seconds=SILENT_S)
+                self.log.warn(
+                    "{robot}: no data from its client for {seconds} s; closing the connection",
+                    robot=session.robot or "?",
+                    seconds=SILENT_S,
+                )
                 session.link.close()
 
     # -- time -------------------------------------------------------------------------------------------------------
 
     def _now(self) -> float:
-        """The yard's time between the ticks too, in seconds since its start."""
+        """Return the simulator's time in seconds since its start, between ticks as well."""
         return self._clock.seconds() - self._origin
 
     def _schedule(self) -> None:
@@ -165,12 +167,12 @@ class PacedYard:
     def _turn(self) -> None:
         late = self._now() - (self._ticks + 1) * TICK
         if late > MAX_LATE_S:
-            # After a suspended machine nobody wants the lost minutes back at once, nor what was ordered before them.
+            # After the machine was suspended, skip the lost time and cancel all commands.
             self._origin += late
             late = 0.0
             for name in self._gates:
                 self._halt(name)
-        self._ticks += self._play(late)
+        self._ticks += self._simulate(late)
         self._schedule()
 
     # -- drivers ----------------------------------------------------------------------------------------------------
@@ -189,13 +191,13 @@ class PacedYard:
     def _on_hello(self, session: Session, hello: Hello) -> None:
         problem, is_lasting = "", True
         if hello.version != VERSION:
-            problem = f"the yard speaks version {VERSION} and not {hello.version}; update one of them"
+            problem = f"the simulator has protocol version {VERSION}, not {hello.version}; update one of them"
         elif hello.robot not in self._gates:
-            problem = f"no robot is named {hello.robot!r} in this yard; it has {self._listed()}"
-        elif hello.robot in self._lent:
+            problem = f"no robot is named {hello.robot!r} in this simulator; it has {self._list_names()}"
+        elif hello.robot in self._reserved:
             problem = f"{hello.robot} is reached as a robot of another kind here; correct the driver's kind"
         elif self._drivers.get(hello.robot, session) is not session:
-            problem, is_lasting = f"{hello.robot} is taken by another driver", False
+            problem, is_lasting = f"{hello.robot} is in use by another driver", False
         elif session.robot not in (None, hello.robot):
             problem = f"this connection holds {session.robot} already"
         if problem:
@@ -216,7 +218,7 @@ class PacedYard:
                 self._halt(name)
             case Drive() if session.has_motors:
                 now = self._now()
-                # A command that was held up has used up its time on the way; a stamp ahead of ours gains nothing.
+                # Delay on the network shortens a command; a time stamp in the future does not extend it.
                 deadline = min(message.sent, now) + min(message.ttl, MAX_TTL_S)
                 try:
                     self._gates[name].admit(Permit(message.token, deadline), now)
@@ -236,14 +238,14 @@ class PacedYard:
             del self._drivers[session.robot]
             self._halt(session.robot)
 
-    def _listed(self) -> str:
-        """The names of the robots, or the first and the last of many."""
+    def _list_names(self) -> str:
+        """Return the names of the robots, or the first and the last of many."""
         names = list(self._gates)
         return ", ".join(names) if len(names) <= NAMED else f"{names[0]} to {names[-1]}"
 
 
 class Session:
-    """A driver that holds ``robot``, or an operator, or somebody who has not said yet; a ``Receiver`` of the link."""
+    """A connection of a driver that holds ``robot``, of an operator, or of a client before its first message."""
 
     def __init__(
         self, link: Link, on_message: Callable[[Session, Message], None], on_down: Callable[[Session], None], now: float
@@ -262,7 +264,7 @@ class Session:
         self._on_down = on_down
 
     def send(self, message: Message) -> None:
-        """Send one message, whole and at once."""
+        """Send one complete message."""
         self.link.send(encoded(message))
 
     def received(self, data: bytes) -> None:
@@ -273,26 +275,26 @@ class Session:
             self._on_message(self, message)
 
     def link_down(self) -> None:
-        """Learn that the client is gone."""
+        """Handle the loss of the link."""
         if not self._is_down:
             self._is_down = True
             self._on_down(self)
 
 
 class Beat:
-    """A rhythm of ``rate`` a second on the yard's time; 0 never beats."""
+    """A timer with ``rate`` events per second of simulated time; none at rate 0."""
 
     def __init__(self, rate: float) -> None:
         self._period = 1.0 / rate if rate > 0 else 0.0
         self._next_at = 0.0
 
     def is_due(self, t: float) -> bool:
-        """Whether a beat falls due at ``t``; asked once each tick, it keeps the rate on average."""
-        # The tolerance keeps a beat that falls exactly on a tick from slipping to the next one by rounding.
+        """Return whether an event is due at ``t``; called once per tick, it keeps the average rate."""
+        # The tolerance prevents rounding from delaying an event that falls exactly on a tick.
         if not self._period or t < self._next_at - 1e-6:
             return False
         self._next_at += self._period
         if self._next_at < t:
-            # The first beat, or one after a pause: what was missed is not made up for.
+            # The first event, or one after a pause: missed events are skipped.
             self._next_at = t + self._period
         return True

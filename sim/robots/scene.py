@@ -1,4 +1,4 @@
-"""Scene: what a yard holds at the start, read from JSON and checked.
+"""The initial state of a simulated world, read from JSON and checked.
 
 Lengths are in metres, angles in degrees in the file and in radians here; the origin is the lower left corner.
 """
@@ -13,17 +13,17 @@ from importlib import resources
 from pathlib import Path
 
 FOOTPRINT = 0.12
-"""The radius of the circle on the floor that an ERS-7 needs, in metres."""
+"""Radius of the circle that an ERS-7 occupies on the floor, in metres."""
 MAX_STRIPES = 5
 
 
 class SceneError(ValueError):
-    """The scene cannot be used as it is; the message says which file and key, and what to write instead."""
+    """The scene is invalid; the message names the file, the key and the remedy."""
 
 
 @dataclass(frozen=True)
 class Kennel:
-    """Where one dog stands at the start; ``stripes`` yellow stripes on its head tell it from the others."""
+    """Initial pose of one dog, and the number of yellow ``stripes`` on its head, which distinguish it."""
 
     name: str
     x: float
@@ -34,7 +34,7 @@ class Kennel:
 
 @dataclass(frozen=True)
 class Scene:
-    """A walled rectangle of ``width`` by ``height`` with dogs; the target is put there later, on demand."""
+    """A walled rectangle of ``width`` by ``height`` with dogs; the target is placed later, on demand."""
 
     name: str
     width: float
@@ -46,20 +46,20 @@ class Scene:
 
 
 def scene_names() -> list[str]:
-    """The scenes that are installed."""
+    """Return the installed scenes."""
     folder = resources.files("sim.robots") / "scenes"
     return sorted(item.name.removesuffix(".json") for item in folder.iterdir() if item.name.endswith(".json"))
 
 
 def loaded(name: str) -> Scene:
-    """The installed scene ``name``, or the scene in the file ``name`` where that ends in ``.json``."""
+    """Load the installed scene ``name``, or the file ``name`` if it ends with ``.json``."""
     if name.endswith(".json"):
         try:
             text = Path(name).read_text(encoding="utf-8")
         except OSError as error:
             raise SceneError(f"scene {name}: cannot be read ({error.strerror}); check the path") from error
         except UnicodeDecodeError as error:
-            raise SceneError(f"scene {name}: is not UTF-8 text") from error
+            raise SceneError(f"scene {name}: is not UTF-8 text; convert the file") from error
         return parsed(text, name)
     if name not in scene_names():
         raise SceneError(
@@ -69,7 +69,7 @@ def loaded(name: str) -> Scene:
 
 
 def parsed(text: str, source: str) -> Scene:
-    """The scene that the JSON ``text`` describes; ``source`` names it in errors."""
+    """Parse the scene in the JSON ``text``; ``source`` names it in errors."""
     try:
         fields = json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -118,7 +118,7 @@ def _check_apart(kennels: tuple[Kennel, ...], source: str) -> None:
 
 
 class _Table:
-    """A JSON object whose fields are asked for by name, with errors that say where."""
+    """A JSON object with typed access to its fields, and errors that name the position."""
 
     def __init__(self, fields: object, where: str) -> None:
         if not isinstance(fields, Mapping):

@@ -1,7 +1,7 @@
-"""Sensor: what one dog feels, from the world alone: rangers, accelerometer, odometry, power.
+"""Sensors of one simulated dog: rangers, accelerometer, odometry, compass, power.
 
-Geometry and ranges are those of the ERS-7 in the stance of its stock walk (body 0.105 m above the floor, neck drawn
-back so that the nose stays inside the footprint).  The compass is no part of an ERS-7: it rides on the back.
+Geometry and ranges are the ERS-7's in the stance of its stock walk (body 0.105 m above the floor, neck drawn back, so
+that the nose is inside the footprint).  The compass, which an ERS-7 lacks, is mounted on the back.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from sim.robots.dog import Dog
 from sim.robots.world import SUBSTEP, World
 
 NOSE = 0.105
-"""Where the rangers and the camera sit, metres before the middle of the dog."""
+"""Distance of the rangers and the camera from the centre of the dog, in metres."""
 NEAR = (0.05, 0.5)
 FAR = (0.2, 1.5)
 CHEST = (0.1, 0.9)
@@ -28,7 +28,7 @@ CHEST_REACH = CHEST_HEIGHT / math.tan(CHEST_PITCH)
 
 
 class Sensors:
-    """The senses of ``dog``; ``sample`` once each substep, ``values`` once each sensor frame."""
+    """The sensors of ``dog``; call ``sample`` once per substep, ``values`` once per sensor frame."""
 
     def __init__(self, rng: Random, world: World, dog: Dog) -> None:
         self._rng = rng
@@ -37,15 +37,15 @@ class Sensors:
         self._samples: dict[str, list[float]] = {key: [] for key in SAMPLED}
         self._newest = dict.fromkeys(SAMPLED, math.nan)
         self._odometry = [0.0, 0.0, 0.0]
-        # Each dog's legs are a little longer or shorter than the table says: dead reckoning drifts steadily.
+        # Each dog's stride differs slightly from its nominal length, so its odometry drifts steadily.
         self._stride_error = 1.0 + rng.gauss(0.0, 0.01)
         self._turn_error = 1.0 + rng.gauss(0.0, 0.01)
         self._power = 1.0
-        # Iron in the legs turns the needle, each dog's a little and always alike.
+        # A constant compass deviation for each dog.
         self._deviation = Random(f"compass of {dog.name}").gauss(0.0, math.radians(2.0))
 
     def sample(self) -> None:
-        """Take one sample of everything, 8 ms after the one before."""
+        """Take one sample of every sensor, 8 ms after the previous one."""
         dog, gauss = self._dog, self._rng.gauss
         moving = dog.is_moving
         ahead = self._world.distance_ahead(dog, NOSE, FAR[1] * 1.1)
@@ -53,20 +53,20 @@ class Sensors:
         slant = FLOOR if chest is None else chest / math.cos(CHEST_PITCH)
         shake = 0.25 if moving else 0.04
         for key, value in (
-            ("range.near", self._ranged(ahead, NEAR)),
-            ("range.far", self._ranged(ahead, FAR)),
-            ("range.chest", self._ranged(slant, CHEST)),
+            ("range.near", self._read_ranger(ahead, NEAR)),
+            ("range.far", self._read_ranger(ahead, FAR)),
+            ("range.chest", self._read_ranger(slant, CHEST)),
             ("imu.ax", dog.felt[0] + gauss(0.0, shake)),
             ("imu.ay", dog.felt[1] + gauss(0.0, shake)),
             ("imu.az", GRAVITY + gauss(0.0, shake)),
         ):
             self._samples[key].append(value)
             self._newest[key] = value
-        self._reckon(moving)
+        self._update_odometry(moving)
         self._power = max(0.0, self._power - SUBSTEP / BATTERY_S * (1.0 if moving else 0.5))
 
     def values(self) -> dict[str, float | bool]:
-        """The newest of each value under the flat keys of the driver contract, NaN for nothing in range."""
+        """Return the newest values under the keys of an observation, NaN for nothing in range."""
         vx, vy, wz = self._dog.motion
         x, y, yaw = self._odometry
         return {
@@ -83,21 +83,21 @@ class Sensors:
         }
 
     def taken_samples(self) -> dict[str, tuple[float, ...]]:
-        """The samples since this was last asked, oldest first."""
+        """Return the samples since the last call, oldest first."""
         taken = {key: tuple(samples) for key, samples in self._samples.items()}
         for samples in self._samples.values():
             samples.clear()
         return taken
 
-    def _ranged(self, distance: float | None, limits: tuple[float, float]) -> float:
-        """What an infrared ranger says: noise grows with distance, too near reads as the shortest, too far as NaN."""
+    def _read_ranger(self, distance: float | None, limits: tuple[float, float]) -> float:
+        """Return an infrared reading: noise grows with distance, too near reads as the minimum, too far as NaN."""
         noise = self._rng.gauss(0.0, 1.0)
         if distance is None:
             return math.nan
         measured = distance + noise * (0.001 + 0.004 * distance)
         return math.nan if measured > limits[1] else max(measured, limits[0])
 
-    def _reckon(self, moving: bool) -> None:
+    def _update_odometry(self, moving: bool) -> None:
         if not moving:
             return
         vx, vy, wz = self._dog.motion

@@ -1,4 +1,4 @@
-"""Server: the yard as a process of its own, behind one TCP port: ``python -m sim.robots.server``."""
+"""The robot simulator as a process behind one TCP port: ``python -m sim.robots.server``."""
 
 from __future__ import annotations
 
@@ -32,35 +32,35 @@ USAGE = 2
 
 
 def main(arguments: list[str] | None = None, output: TextIO = sys.stdout, errors: TextIO = sys.stderr) -> int:
-    """Run a yard until it is interrupted; returns the exit code: 0, or 2 with one line on what to change."""
+    """Run a simulator until it is interrupted; return the exit code: 0, or 2 with one line that names the remedy."""
     parser = argparse.ArgumentParser(
-        prog="swarm yard", description="A yard of three dogs, reached as simulated dogs or as robots."
+        prog="swarm yard", description='Simulate robot dogs for the driver "sim" and for emulators.'
     )
     parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default %(default)s)")
     parser.add_argument("--port", type=int, default=DEFAULT_PORT, help="TCP port, 0 for any (default %(default)s)")
-    parser.add_argument("--seed", type=int, default=1, help="the same seed gives the same yard (default %(default)s)")
+    parser.add_argument("--seed", type=int, default=1, help="seed of the random generator (default %(default)s)")
     parser.add_argument("--scene", default="three-dogs", help="a scene's name or a .json file (default %(default)s)")
     parser.add_argument(
         "--robots",
         type=Path,
         metavar="FILE",
-        help="a TOML file: a table for each dog that is reached as a robot of another kind, as its driver has it "
+        help="a TOML file with the driver settings of each dog that emulates another kind of robot "
         "(docs/how-to/simulate-robots.md)",
     )
-    chosen = parser.parse_args(arguments)
-    if not 0 <= chosen.port <= 65535:
-        return _refused(errors, f"port {chosen.port} is no port; choose one from 1 to 65535, or 0 for any")
+    args = parser.parse_args(arguments)
+    if not 0 <= args.port <= 65535:
+        return _print_error(errors, f"port {args.port} is invalid; choose one from 1 to 65535, or 0 for any")
     try:
-        scene = loaded(chosen.scene)
-        table = _table(chosen.robots)
+        scene = loaded(args.scene)
+        table = _read_table(args.robots)
     except (SceneError, UsageError) as error:
-        return _refused(errors, str(error))
-    # Twisted's timers run on the wall clock by default: a step of that clock would freeze the yard, or race it.  What
-    # was ordered before the machine was suspended must be over when it wakes.
+        return _print_error(errors, str(error))
+    # Twisted's timers use the wall clock by default: a step of it would freeze or race the simulation.  Commands from
+    # before a suspension of the machine must have expired when it resumes.
     ReactorBase.seconds = staticmethod(
         partial(time.clock_gettime, time.CLOCK_BOOTTIME) if hasattr(time, "CLOCK_BOOTTIME") else time.monotonic
     )
-    # Twisted would load pyOpenSSL where it is installed (13 MiB); the yard speaks no TLS.
+    # Prevent Twisted from importing pyOpenSSL (13 MiB); the simulator has no TLS.
     sys.modules.setdefault("OpenSSL", None)  # type: ignore[arg-type]
     from twisted.internet import reactor as running
 
@@ -69,18 +69,18 @@ def main(arguments: list[str] | None = None, output: TextIO = sys.stdout, errors
     globalLogBeginner.beginLoggingTo(
         [FilteringLogObserver(textFileLogObserver(errors), [warnings])], redirectStandardIO=False
     )
-    yard = Yard(reactor, Random(chosen.seed), scene)
+    yard = Yard(reactor, Random(args.seed), scene)
     try:
-        robots = _robots(reactor, chosen.seed, yard, table)
+        robots = _make_emulators(reactor, args.seed, yard, table)
     except UsageError as error:
-        return _refused(errors, f"{chosen.robots}: {error}")
+        return _print_error(errors, f"{args.robots}: {error}")
     try:
-        port = reactor.listenTCP(chosen.port, TcpLinkFactory(yard.attach), interface=chosen.host)
+        port = reactor.listenTCP(args.port, TcpLinkFactory(yard.attach), interface=args.host)
     except CannotListenError as error:
         why: OSError = error.socketError
         is_taken = why.errno in (errno.EADDRINUSE, errno.EACCES)
         remedy = "try another --port" if is_taken else "give --host an address of this machine"
-        return _refused(errors, f"cannot listen on {chosen.host}:{chosen.port}: {why.strerror or why}; {remedy}")
+        return _print_error(errors, f"cannot listen on {args.host}:{args.port}: {why.strerror or why}; {remedy}")
     address = port.getHost()
     try:
         if robots is not None:
@@ -88,19 +88,18 @@ def main(arguments: list[str] | None = None, output: TextIO = sys.stdout, errors
             reactor.addSystemEventTrigger("before", "shutdown", robots.stop)
     except UsageError as error:
         robots.stop()
-        return _refused(errors, f"{chosen.robots}: {error}")
+        return _print_error(errors, f"{args.robots}: {error}")
     yard.start()
     reactor.addSystemEventTrigger("before", "shutdown", yard.stop)
     dogs = ", ".join(yard.world.dogs)
     line = f"yard {scene.name} ready on {address.host}:{address.port}: {dogs}"
-    # Said only once signals are heard: who reads it may at once ask the yard to end.
+    # Printed after signal handlers are installed: a reader of this line may end the process at once.
     reactor.callWhenRunning(print, line, file=output, flush=True)
     reactor.run()
     return 0
 
 
-def _table(path: Path | None) -> dict[str, Any]:
-    """The robots in the file ``path``; raises ``UsageError`` where it is none."""
+def _read_table(path: Path | None) -> dict[str, Any]:
     if path is None:
         return {}
     try:
@@ -110,8 +109,8 @@ def _table(path: Path | None) -> dict[str, Any]:
     return table
 
 
-def _robots(reactor: Any, seed: int, yard: Yard, table: dict[str, Any]) -> Any:
-    """What serves the robots of ``table``; a yard without any is spared the memory of their emulators."""
+def _make_emulators(reactor: Any, seed: int, yard: Yard, table: dict[str, Any]) -> Any:
+    """Return the emulators of ``table``; without any, their modules are not imported, to save memory."""
     if not table:
         return None
     from sim.robots.table import Robots
@@ -119,7 +118,7 @@ def _robots(reactor: Any, seed: int, yard: Yard, table: dict[str, Any]) -> Any:
     return Robots(reactor, Random(seed), yard, table)
 
 
-def _refused(errors: TextIO, problem: str) -> int:
+def _print_error(errors: TextIO, problem: str) -> int:
     print(f"swarm yard: {problem}", file=errors)
     return USAGE
 

@@ -1,7 +1,7 @@
-"""Robots: dogs of the yard that are reached as robots of other kinds are, each over its own wire.
+"""Dogs of the simulator that emulate other kinds of robot, each with the kind's own protocol.
 
-A robot is given as the table that its driver gets (``kind``, ``options``, ``parts``): the yard serves what that driver
-will call, at the same addresses.  ``dialect`` says of an "aibo" which Tekkotsu it has, "T4" or "T2".
+A robot is given as the settings of its driver (``kind``, ``options``, ``parts``): the emulator listens at the
+addresses to which that driver connects.  ``dialect`` is the version of an "aibo"'s Tekkotsu, "T4" or "T2".
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ def emulated_kinds() -> list[str]:
 
 
 class Robots:
-    """What the robots of ``table`` (a dog's name to what its driver gets) are reached by.
+    """The emulated robots of ``table``, which maps names of dogs to settings of drivers.
 
-    Raises ``UsageError`` where the yard has no such dog, or no emulator of such a robot.
+    Raises ``UsageError`` if the simulator has no such dog, or no emulator of such a robot.
     """
 
     def __init__(self, reactor: Any, rng: random.Random, yard: Yard, table: Mapping[str, Table]) -> None:
         self._wires: dict[str, list[Wire]] = {}
         for name, robot in table.items():
-            (kind, options), *parts = _checked(name, robot)
+            (kind, options), *parts = _check_robot(name, robot)
             try:
                 body = yard.lend(name, describe(kind, options, name, parts).limits)
                 own = random.Random(rng.getrandbits(64))
@@ -52,28 +52,28 @@ class Robots:
         yard.learn("plug", self.plug, (str,))
 
     def start(self) -> None:
-        """Serve all of them; raises ``UsageError`` that names the robot whose address cannot be had."""
+        """Start all servers; raise ``UsageError`` that names the robot if an address is not available."""
         for name, wires in self._wires.items():
             for wire in wires:
                 try:
                     wire.start()
                 except FileExistsError as error:
                     raise UsageError(
-                        f"[{name}] {error.filename2} is there already; end what made it, or choose another port"
+                        f"[{name}] {error.filename2} is there already; end its program, or choose another port"
                     ) from None
                 except (CannotListenError, OSError) as error:
                     raise UsageError(f"[{name}] it cannot be served: {error}; choose another address") from None
 
     def stop(self) -> Deferred[Any]:
-        """Serve them no more; fires when every address is free."""
+        """Stop all servers; fires when every address is free."""
         return gatherResults([wire.stop() for wire in self._all])
 
     def unplug(self, name: str) -> None:
-        """Break what leads to this robot: nothing is heard and nothing said, though no connection is closed."""
+        """Break the links to this robot: no data passes, and no connection is closed."""
         self._set_silent(name, True)
 
     def plug(self, name: str) -> None:
-        """Mend it."""
+        """Restore the links to this robot."""
         self._set_silent(name, False)
 
     @property
@@ -82,13 +82,13 @@ class Robots:
 
     def _set_silent(self, name: str, is_silent: bool) -> None:
         if name not in self._wires:
-            raise NotPossible(f"{name!r} has no wire of its own; here are {', '.join(self._wires)}")
+            raise NotPossible(f"{name!r} does not emulate a robot; these do: {', '.join(self._wires)}")
         for wire in self._wires[name]:
             wire.faults.half_open = is_silent
 
 
-def _checked(name: str, robot: Any) -> list[tuple[str, Table]]:
-    """Kind and options of the robot and of each of its parts; raises ``UsageError`` where ``robot`` has others."""
+def _check_robot(name: str, robot: Any) -> list[tuple[str, Table]]:
+    """Return kind and options of the robot and of each of its parts; raise ``UsageError`` if ``robot`` is invalid."""
     if not isinstance(robot, Mapping) or not isinstance(robot.get("kind"), str):
         raise UsageError(f'[{name}] must name a kind, as in kind = "aibo"')
     for key in robot:
@@ -105,9 +105,9 @@ def _checked(name: str, robot: Any) -> list[tuple[str, Table]]:
 
 def _make_wire(reactor: Any, body: Body, rng: random.Random, kind: str, options: Table, dialect: str = "T4") -> Wire:
     if kind not in emulated_kinds():
-        raise UsageError(f"the yard has no robot of kind {kind!r}; it has {', '.join(emulated_kinds())}")
+        raise UsageError(f"the simulator has no robot of kind {kind!r}; it has {', '.join(emulated_kinds())}")
     if dialect not in DIALECTS:
         raise UsageError(f"dialect is {dialect!r}, but must be one of {', '.join(DIALECTS)}")
-    # Imported here: a yard of dogs alone does not load the others.
+    # Import only the emulators that are used.
     serve: Serve = import_module(f"sim.robots.emulator.{kind}").serve
     return serve(reactor, body, rng, options, dialect)

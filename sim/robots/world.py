@@ -1,6 +1,6 @@
-"""World: the walled yard as physics, stepped 8 ms at a time and the same for the same seed.
+"""Physics of the walled world, in steps of 8 ms; deterministic for a given seed.
 
-It knows no sensor, no picture and no connection.  Metres, radians, seconds; x to the right, y up.
+Has no sensors, pictures or connections.  Metres, radians, seconds; x to the right, y up.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ from sim.robots.dog import DOG, REST, TARGET, WALL, Dog, Motion
 from sim.robots.scene import FOOTPRINT, Scene
 
 SUBSTEP = 0.008
-"""Seconds of one ``step``; the ERS-7 samples its sensors as often."""
+"""Duration of one ``step`` in seconds; the ERS-7 samples its sensors at this interval."""
 SUBSTEPS = 4
 TICK = SUBSTEPS * SUBSTEP
-"""Seconds by which a yard goes on at a time: one sensor frame of the ERS-7."""
+"""Duration of one tick in seconds: one sensor frame of the ERS-7."""
 WALL_THICKNESS = 0.04
 TRIES = 2000
 CLEARANCE, APART, FROM_WALLS = 0.75, 0.25, 0.25
-"""Metres that a target at random keeps from the dogs, between its distances to two of them, and from the walls."""
+"""Metres that a random target keeps from the dogs, between its distances to two of them, and from the walls."""
 LATEST = 3600.0
-"""Seconds within which a target can be placed later."""
+"""Longest delay in seconds of placing a target later."""
 
 
 class NotPossible(ValueError):
-    """The operator asked for something that the yard cannot hold; the message says why and what would be possible."""
+    """The operator's command is not possible; the message names the reason and the remedy."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Target:
 
 
 class World:
-    """The arena of ``scene``: dogs that push each other and bump into walls, and at most one fixed target."""
+    """The arena of ``scene``: dogs that collide with each other and with walls, and at most one fixed target."""
 
     def __init__(self, rng: Random, scene: Scene) -> None:
         self.scene = scene
@@ -53,7 +53,7 @@ class World:
         self._steps = 0
         self._placing_at = math.inf
         self._space = pymunk.Space()
-        # The library's default slop is meant for pixels: in metres, bodies would sink 10 cm into each other.
+        # The library's default slop is for pixels: in metres, bodies would overlap by 10 cm.
         self._space.collision_slop = 0.001
         self._target_shape: pymunk.Shape | None = None
         self._build_walls()
@@ -66,7 +66,7 @@ class World:
 
     @property
     def t(self) -> float:
-        """Seconds of simulated time since the start."""
+        """Simulated time in seconds since the start."""
         return self._steps * SUBSTEP
 
     @property
@@ -77,10 +77,10 @@ class World:
         return [(*corners[i], *corners[(i + 1) % 4]) for i in range(4)]
 
     def step(self) -> None:
-        """Let ``SUBSTEP`` seconds pass."""
+        """Simulate ``SUBSTEP`` seconds."""
         if self.t >= self._placing_at:
             self._placing_at = math.inf
-            with suppress(NotPossible):  # no place is free: nobody waits for an answer any more
+            with suppress(NotPossible):  # no place is free, and no caller waits for an answer
                 self.place_target_at_random()
         for dog in self.dogs.values():
             dog.strive(SUBSTEP)
@@ -90,22 +90,22 @@ class World:
         self._steps += 1
 
     def drive(self, name: str, vx: float, vy: float, wz: float) -> None:
-        """Let the dog ``name`` walk with this velocity in its own frame until told otherwise."""
+        """Set the dog's velocity in its frame, until the next command."""
         self.dogs[name].drive(Motion(vx, vy, wz))
 
     def halt(self, name: str) -> None:
-        """Let the dog ``name`` stand still, as fast as its legs can brake."""
+        """Stop the dog, braking as hard as it can."""
         self.dogs[name].command = REST
 
     def distance_ahead(self, dog: Dog, forward: float, reach: float) -> float | None:
-        """Metres to what stands ahead of the point ``forward`` metres before the middle, None beyond ``reach``."""
+        """Return metres from the point ``forward`` metres ahead of the centre to an obstacle; None beyond ``reach``."""
         cos, sin = math.cos(dog.body.angle), math.sin(dog.body.angle)
         x, y = dog.x + forward * cos, dog.y + forward * sin
         hit = self._space.segment_query_first((x, y), (x + reach * cos, y + reach * sin), 0.0, dog.shape.filter)
         return None if hit is None else hit.alpha * reach
 
     def place_target(self, x: float, y: float) -> None:
-        """Put the target here, in place of an older one; raises ``NotPossible`` where a dog or a wall is."""
+        """Move the target to this place; raise ``NotPossible`` if a dog or a wall is in the way."""
         radius = self.scene.target_radius
         self._check_inside("the target", x, y, radius)
         for dog in self.dogs.values():
@@ -120,10 +120,10 @@ class World:
         self._space.add(shape)
 
     def place_target_at_random(self) -> None:
-        """Put the target at a free place, ``CLEARANCE`` from every dog, so that one dog is clearly the nearest.
+        """Move the target to a free place, ``CLEARANCE`` from every dog, so that one dog is clearly the nearest.
 
-        The distances to the dogs differ pairwise by ``APART``.  Where no place has both, the one that comes nearest to
-        both is taken; raises ``NotPossible`` in a yard with no free place at all.
+        The distances to the dogs differ pairwise by ``APART``.  If no place satisfies both, the best one is used;
+        raises ``NotPossible`` if no place is free.
         """
         best, best_fit = None, -math.inf
         for _ in range(TRIES):
@@ -142,23 +142,23 @@ class World:
         self.place_target(*best)
 
     def place_target_later(self, seconds: float) -> None:
-        """Put the target at a free place in ``seconds``, unless it is placed or taken away before."""
+        """Move the target to a free place after ``seconds``, unless it is placed or removed before."""
         if not 0.0 <= seconds <= LATEST:
-            raise NotPossible(f"the target is placed within {LATEST:g} s, not in {seconds:g}")
+            raise NotPossible(f"the delay of the target must be from 0 to {LATEST:g} s, not {seconds:g}")
         self._placing_at = self.t + seconds
 
     def clear_target(self) -> None:
-        """Take the target away, if there is one."""
+        """Remove the target, if there is one."""
         self._placing_at = math.inf
         if self._target_shape is not None:
             self._space.remove(self._target_shape)
         self.target = self._target_shape = None
 
     def move_dog(self, name: str, x: float, y: float, heading: float) -> None:
-        """Lift a dog and set it down; raises ``NotPossible`` for an unknown dog or a taken place."""
+        """Move a dog to this place; raise ``NotPossible`` for an unknown dog or a place in use."""
         dog = self.dogs.get(name)
         if dog is None:
-            raise NotPossible(f"no dog is named {name!r}; here are {', '.join(self.dogs)}")
+            raise NotPossible(f"no dog is named {name!r}; known are {', '.join(self.dogs)}")
         self._check_inside(name, x, y, FOOTPRINT)
         if not math.isfinite(heading):
             raise NotPossible("a heading must be a finite number of radians")
@@ -173,7 +173,7 @@ class World:
         self._put(dog, x, y, heading)
 
     def scatter(self, seed: int, clearance: float = 0.45, from_walls: float = 0.3) -> None:
-        """Set all dogs down at rest at random free places; the same ``seed`` gives the same places."""
+        """Move all dogs to random free places, at rest; the same ``seed`` gives the same places."""
         rng = Random(seed)
         taken = [] if self.target is None else [(self.target.x, self.target.y)]
         places = []
@@ -184,14 +184,16 @@ class World:
                 if all(math.hypot(x - a, y - b) >= clearance for a, b in taken):
                     break
             else:
-                raise NotPossible(f"the yard is too small to keep {len(self.dogs)} dogs {clearance} m apart")
+                raise NotPossible(
+                    f"the world is too small to keep {len(self.dogs)} dogs {clearance} m apart; use a larger scene"
+                )
             taken.append((x, y))
             places.append((x, y, rng.uniform(-math.pi, math.pi)))
         for dog, place in zip(self.dogs.values(), places, strict=True):
             self._put(dog, *place)
 
     def snapshot(self) -> dict[str, object]:
-        """The truth about the yard as plain data, for the map and the referee."""
+        """Return the true state as plain data, for the map and the judge."""
         target = self.target
         return {
             "t": self.t,
@@ -226,7 +228,7 @@ class World:
     def _build_walls(self) -> None:
         half = WALL_THICKNESS / 2
         for x1, y1, x2, y2 in self.walls:
-            # A wall has thickness so that nothing tunnels; it lies outside, so that its inner face is the boundary.
+            # Thickness prevents tunnelling; the wall lies outside, so its inner face is the boundary.
             length = math.hypot(x2 - x1, y2 - y1)
             out_x, out_y = half * (y2 - y1) / length, -half * (x2 - x1) / length
             wall = pymunk.Segment(self._space.static_body, (x1 + out_x, y1 + out_y), (x2 + out_x, y2 + out_y), half)

@@ -1,4 +1,4 @@
-"""Yard: the world, its sensors and cameras tied to connections, paced by the clock it is given."""
+"""The robot simulator: the world with its sensors and cameras, connected to drivers and operators."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ MAX_RATE = 1.0 / TICK
 
 
 class Yard(PacedYard):
-    """The yard of a ``scene``.
+    """The simulator of a ``scene``.
 
-    The truth is in ``world``; whoever referees may look there, or ask as an operator over a link.
+    ``world`` is the true state; tests may read it directly, operators receive it over a link.
     """
 
     def __init__(self, clock: IReactorTime, rng: Random, scene: Scene) -> None:
@@ -45,7 +45,7 @@ class Yard(PacedYard):
         }
 
     def truth(self) -> dict[str, object]:
-        """The whole yard as seen from above, and of each dog what its gate has let through and refused."""
+        """Return the true state, and of each dog the numbers of commands that its gate accepted and refused."""
         snapshot = self.world.snapshot()
         counts = [
             {"token": gate.token or 0, "accepted": gate.accepted, "refused": sum(gate.refused.values())}
@@ -55,23 +55,23 @@ class Yard(PacedYard):
         return {**snapshot, "dogs": [{**dog, **count} for dog, count in zip(dogs, counts, strict=True)]}
 
     def lend(self, name: str, limits: Mapping[str, tuple[float, float]]) -> DogBody:
-        """Hand a dog over to an emulator, which moves it within ``limits`` from now on; no driver may hold it here.
+        """Transfer a dog to an emulator, which moves it within ``limits``; drivers can no longer hold it.
 
-        Raises ``UsageError`` where there is no such dog.
+        Raises ``UsageError`` if there is no such dog.
         """
-        self._withhold(name)
+        self._reserve_robot(name)
         dog = self.world.dogs[name]
         dog.limits = limits
         return DogBody(self.world, dog, self._senses[name], self._camera)
 
     def learn(self, verb: str, work: Callable[..., None], kinds: tuple[type, ...]) -> None:
-        """Have operators order ``verb`` as well, with arguments of ``kinds``."""
+        """Add the operator's order ``verb``, with arguments of ``kinds``."""
         self._orders[verb] = (work, kinds)
 
-    def _play(self, late: float) -> int:
+    def _simulate(self, late: float) -> int:
         due = 1 + max(0, math.floor(late / TICK + 1e-6))
         for left in range(due - 1, -1, -1):
-            # A late yard drops pictures, never physics.
+            # A late simulator drops pictures, never physics.
             self._tick(with_pictures=left == 0)
         return due
 
@@ -89,11 +89,11 @@ class Yard(PacedYard):
         for name, senses in self._senses.items():
             values, samples = senses.values(), senses.taken_samples()
             picture = partial(self._camera.jpeg, self.world.dogs[name]) if with_pictures else None
-            self._tell(name, t, values, samples, picture)
-        watchers = [one for one in self._sessions if one.is_operator and one.truths.is_due(t) and not one.link.is_busy]
-        if watchers:
+            self._report_sensors(name, t, values, samples, picture)
+        operators = [one for one in self._sessions if one.is_operator and one.truths.is_due(t) and not one.link.is_busy]
+        if operators:
             truth = Truth(self.truth())
-            for session in watchers:
+            for session in operators:
                 session.send(truth)
 
     def _on_other(self, session: Session, message: Message) -> None:
@@ -102,12 +102,12 @@ class Yard(PacedYard):
                 session.is_operator = message.version == VERSION
                 session.truths = Beat(min(max(message.rate, 0.1), MAX_RATE))
             case Order() if session.is_operator:
-                session.send(Done(message.number, self._carried_out(message)))
+                session.send(Done(message.number, self._execute(message)))
 
-    def _carried_out(self, order: Order) -> str:
-        """Do what the operator orders; the problem in words, or an empty text."""
+    def _execute(self, order: Order) -> str:
+        """Execute the operator's order; return the problem, or an empty string."""
         if order.verb not in self._orders:
-            return f"the yard knows no order {order.verb!r}; it knows {', '.join(self._orders)}"[:200]
+            return f"unknown order {order.verb!r}; known are {', '.join(self._orders)}"[:200]
         work, kinds = self._orders[order.verb]
         if len(order.arguments) != len(kinds) or not all(
             type(value) is kind for value, kind in zip(order.arguments, kinds, strict=True)

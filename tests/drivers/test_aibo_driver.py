@@ -105,7 +105,7 @@ class AiboDriverTests(Conformance, AiboCase):
             self.dog.stop()
             self.dog.start()
             self.pass_time(60.0)
-            self.assertEqual(len([line for line in ear.heard if "is no world state" in line]), lines)
+            self.assertEqual(len([line for line in ear.heard if "invalid world state" in line]), lines)
             del self.dog._send_state
             self.dog.stop()
             self.dog.start()

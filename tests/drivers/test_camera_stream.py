@@ -94,14 +94,14 @@ class StreamTests(Conformance, RobotCase):
         self.connector.is_open = False
         self.connector.cut()
         self.pass_time(0.1)
-        self.assertEqual((driver.state, driver.problem), ("stale", "it has hung up"))
+        self.assertEqual((driver.state, driver.problem), ("stale", "it closed the connection"))
         self.failureResultOf(driver.enable(), LinkLost)
         self.pass_time(60.0)
         self.assertLess(driver.diagnostics()["refused"], 12)
         self.assertEqual(
             log.lines,
             [
-                "robot: it has hung up; trying again",
+                "robot: it closed the connection; trying again",
                 "robot: nothing answers at 10.0.0.7:81; is it on, and in this network?; trying again",
             ],
         )
@@ -187,7 +187,7 @@ class StreamTests(Conformance, RobotCase):
         """What an earlier connection still brings while it closes is no word of the new one."""
         driver = self.ready()
         film = driver._film
-        old = film._call
+        old = film._attempt
         driver.set_camera_fps(0)
         driver.set_camera_fps(30)
         count = driver.diagnostics()["pictures"]

@@ -301,7 +301,7 @@ class Abandoned(Rover):
     """Does not close its link when its connect is cancelled."""
 
     def _on_cancelled_connecting(self, _connecting: object) -> None:
-        self._shut()
+        self._mark_closed()
 
 
 BREACHES: dict[str, list[Any]] = {

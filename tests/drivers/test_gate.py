@@ -26,7 +26,7 @@ class GateTests(SynchronousTestCase):
         gate = Gate()
         gate.admit(Permit(4, 2.0), now=1.0)
         error = self.assertRaises(StaleCommand, gate.admit, Permit(3, 9.0), 1.5)
-        self.assertIn("token 3 is older than token 4", str(error))
+        self.assertIn("token 3 is lower than token 4", str(error))
         self.assertEqual(gate.deadline, 2.0)
 
     def test_refuses_deadlines_that_are_no_future(self) -> None:

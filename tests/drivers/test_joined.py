@@ -287,7 +287,7 @@ class JoinedTests(Conformance, Create2Case):
         self.assertEqual(driver.state, "ready")
         self.successResultOf(driver.disconnect())
         self.successResultOf(driver.disconnect())
-        self.assertEqual(log.lines, ["vacuum: its part compass is given up: there is no such part"])
+        self.assertEqual(log.lines, ["vacuum: cannot connect to its part compass: there is no such part"])
         self.assertEqual((compass.opened, absent.opened, absent.closed), (1, 1, 1))
 
     def test_leaves_its_parts_with_its_robot(self) -> None:

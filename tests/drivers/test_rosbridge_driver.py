@@ -103,7 +103,7 @@ class RosbridgeDriverTests(Conformance, RobotCase):
         """A type that is set wrongly does not move the robot, and the warning names the option."""
         warnings: list[str] = []
         driver = self.make_driver(velocity_type="twist_stamped")
-        driver._warn = warnings.append
+        driver._warn_once = warnings.append
         driver.connect()
         self.pass_time(0.3)
         self.assertIn('velocity_type = "twist"', warnings[0])

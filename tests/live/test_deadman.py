@@ -298,7 +298,7 @@ class KeeperTests(TestCase):
         """Where none can be started, or all end at once, this is said once, and it is tried again until one does."""
         for program, words in (
             ("/nowhere/python", "no dead man's switch yet"),
-            ("/bin/false", "another one is started"),
+            ("/bin/false", "starting another one"),
         ):
             self.keeper = Keeper("robot", reactor)
             self.keeper.log = log = KeptLog()  # type: ignore[assignment]

@@ -87,7 +87,7 @@ class DriverCommandTests(TestCase):
         self.robot = ["--kind", "aibo", "--option", "host=127.0.0.1", "--option", "ports.main=1"]
         with out.open("wb") as file:
             self.assertEqual(await self.ended(self.started("probe", stdout=file)), 1)
-        self.assertIn("! 127.0.0.1:1: it is there, but nothing listens at this port", out.read_text())
+        self.assertIn("! 127.0.0.1:1: nothing listens at this port", out.read_text())
 
     async def test_interrupted(self) -> None:
         """Ctrl-C ends monitor and drive in order: without a traceback, the dog at rest, its motors off."""

@@ -112,7 +112,7 @@ class RobotsTests(YardCase):
             ({"dog1": {"kind": "aibo", "options": 7}}, r"\[dog1\] options must be a table"),
             ({"dog1": {**aibo, "parts": 7}}, r"\[dog1\] parts must be tables"),
             ({"dog1": {**aibo, "parts": [{"options": {}}]}}, r"\[dog1\] parts must be tables"),
-            ({"dog1": {**aibo, "parts": [{"kind": "camera"}]}}, r"\[dog1\] a camera of the yard needs the option url"),
+            ({"dog1": {**aibo, "parts": [{"kind": "camera"}]}}, r"\[dog1\] an emulated camera needs the option url"),
             ({"dog1": {**aibo, "parts": [{"kind": "compass"}]}}, r"\[dog1\] part 1: .* option host .* or device"),
             ({"dog1": {**aibo, "dialct": "T2"}}, r"\[dog1\] has an unknown key 'dialct'; known are kind, options"),
             ({"dog1": 7}, r"\[dog1\] must name a kind"),

@@ -1,1 +1,1 @@
-"""A yard for many: round robots by the thousand, whose rays, moves and controllers are computed as arrays."""
+"""A simulator for thousands of round robots; rays, motion and controllers are computed with arrays."""

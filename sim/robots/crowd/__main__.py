@@ -1,4 +1,4 @@
-"""``python -m sim.robots.crowd``: the yard for many alone, without agents."""
+"""Entry point of ``python -m sim.robots.crowd``: a crowd without agents."""
 
 import sys
 

@@ -1,4 +1,7 @@
-"""Controllers: what many robots do, each a function of what all of them sense, as arrays with a row for each."""
+"""Batch controllers: functions from the sensor values of all robots to their velocities, as arrays.
+
+Each array has one row per robot.
+"""
 
 from __future__ import annotations
 
@@ -14,15 +17,15 @@ from sim.robots.scene import FOOTPRINT
 
 VIEW = math.radians(56.9) / 2
 SIGHT = 3.0
-"""Metres within which a robot sees the target, where nobody stands between."""
+"""Distance in metres at which a robot has_target the target, unless another robot hides it."""
 AWAY = 0.45
-"""Metres from the middle at which something ahead is in the way."""
+"""Distance in metres from the centre within which something ahead is an obstacle."""
 ARRIVED = 0.35
 WALK, TURN = 0.16, 1.6
 
 
 class Senses:
-    """What the robots from number ``first`` on sense now; nothing that a robot could not know of itself."""
+    """Sensor values of the robots from number ``first`` on; contains nothing that a robot could not measure itself."""
 
     def __init__(self, crowd: Crowd, first: int = 0) -> None:
         self._crowd = crowd
@@ -35,16 +38,16 @@ class Senses:
 
     @property
     def number(self) -> NDArray[np.int64]:
-        """The number of each, by which robots that sense the same may differ."""
+        """The number of each robot, which lets robots with equal sensor values differ."""
         return np.arange(self._crowd.ground.bodies)[self._own]
 
     @property
     def ranges(self) -> Floats:
-        """Metres from the middle along each ray, counter-clockwise from straight ahead; ``REACH`` for nothing."""
+        """Metres from the centre along each ray, counter-clockwise from straight ahead; ``REACH`` for nothing."""
         return self._crowd.ranges[self._own]
 
     def scent(self) -> tuple[Floats, Floats]:
-        """How strong the target's scent is to the left and to the right ahead: 1 at it, 0 without one."""
+        """Return the strength of the target's scent ahead on the left and the right: 1 at the target, 0 without it."""
         crowd, target = self._crowd, self._crowd.target
         x, y, heading = crowd.x[self._own], crowd.y[self._own], crowd.heading[self._own]
         if target is None:
@@ -57,78 +60,80 @@ class Senses:
         return sides[0], sides[1]
 
     def sight(self) -> tuple[Floats, Floats]:
-        """The bearing (left positive) and the distance of the target's axis, from the middle; NaN where not in view."""
+        """Return bearing (left positive) and distance of the target's axis from the centre; NaN if not in view."""
         crowd, target = self._crowd, self._crowd.target
         bearing = np.full(len(crowd.x), math.nan)
         distance = bearing.copy()
         if target is not None:
             dx, dy = target.x - crowd.x, target.y - crowd.y
-            # Whoever hides the target from somebody within sight of it is nearer to it, and so within sight as well.
+            # A robot that hides the target from one within ``SIGHT`` is nearer, so it is in this set as well.
             near = np.flatnonzero(dx * dx + dy * dy < SIGHT * SIGHT)
             dx, dy = dx[near], dy[near]
             far, towards = np.hypot(dx, dy), np.arctan2(dy, dx)
             off = np.remainder(towards - crowd.heading[near] + math.pi, math.tau) - math.pi
-            # As seen from the target: who stands before another hides it within the angle that it covers.
+            # Seen from the target, a nearer robot hides those behind it within the angle that it covers.
             apart = np.abs(np.remainder(towards[:, None] - towards + math.pi, math.tau) - math.pi)
             covers = np.arcsin(np.minimum(FOOTPRINT / far, 1.0))
             is_hidden = ((apart < covers) & (far < far[:, None])).any(axis=1)
-            seers = (np.abs(off) < VIEW) & ~is_hidden
-            bearing[near[seers]], distance[near[seers]] = off[seers], far[seers]
+            observers = (np.abs(off) < VIEW) & ~is_hidden
+            bearing[near[observers]], distance[near[observers]] = off[observers], far[observers]
         return bearing[self._own], distance[self._own]
 
 
 Controller = Callable[[Senses], Floats]
-"""What each is to do now: metres a second forward and to the left, radians a second to the left."""
+"""Returns the velocity of each robot: m/s forward and to the left, rad/s to the left."""
 
 
 def stand(senses: Senses) -> Floats:
-    """Nobody does anything."""
+    """Stand still."""
     return np.zeros((len(senses.ranges), 3))
 
 
 def disperse(senses: Senses) -> Floats:
-    """Walk away from whatever is near, and stand where nothing is."""
+    """Move away from anything near; stand if nothing is."""
     ranges = senses.ranges
     angle = np.arange(ranges.shape[1]) * (math.tau / ranges.shape[1])
     press = 1.0 - ranges / REACH
     ahead, left = -press @ np.cos(angle), -press @ np.sin(angle)
     bearing = np.arctan2(left, ahead)
     is_pressed = np.hypot(ahead, left) > 0.05
-    return _wishes(np.where(is_pressed & (np.abs(bearing) < 0.8), WALK, 0.0), np.where(is_pressed, 2.0 * bearing, 0.0))
+    return _velocities(
+        np.where(is_pressed & (np.abs(bearing) < 0.8), WALK, 0.0), np.where(is_pressed, 2.0 * bearing, 0.0)
+    )
 
 
 def climb(senses: Senses) -> Floats:
-    """Follow the scent of the target to where it is strongest; without one, wander."""
+    """Follow the scent of the target to its maximum; without a scent, wander."""
     left, right = senses.scent()
     both = left + right
     turn = 40.0 * (left - right) / np.maximum(both, 1e-9) * (1.0 + np.sqrt(2.0 / np.maximum(both, 1e-9)))
-    wishes = wander(senses)
+    velocities = wander(senses)
     is_free = (both > 0.0) & (_ahead(senses.ranges) > AWAY)
-    wishes[is_free] = _wishes(np.where(np.abs(turn) < 2.0, WALK, WALK / 4), turn)[is_free]
-    return wishes
+    velocities[is_free] = _velocities(np.where(np.abs(turn) < 2.0, WALK, WALK / 4), turn)[is_free]
+    return velocities
 
 
 def wander(senses: Senses) -> Floats:
-    """Walk straight on, and turn to the more open side where something is ahead."""
+    """Drive straight, and turn to the more open side if something is ahead."""
     ranges = senses.ranges
     half = ranges.shape[1] // 2
     left, right = ranges[:, 1 : half + 1].sum(axis=1), ranges[:, -half:].sum(axis=1)
-    # Who finds both sides alike turns as its number says, or two would dance before each other.
+    # If both sides are equal, the number decides, or two robots would mirror each other for ever.
     side = np.where(left == right, np.where(senses.number % 2 == 0, 1.0, -1.0), np.sign(left - right))
     is_free = _ahead(ranges) > AWAY
-    return _wishes(np.where(is_free, WALK, 0.0), np.where(is_free, 0.0, TURN * side))
+    return _velocities(np.where(is_free, WALK, 0.0), np.where(is_free, 0.0, TURN * side))
 
 
 def search(senses: Senses) -> Floats:
-    """Search and approach: wander until the target is in view, walk up to it, and stand before it."""
+    """Wander until the target is in view, approach it, and stop in front of it."""
     bearing, distance = senses.sight()
-    wishes = wander(senses)
-    sees = ~np.isnan(distance)
-    is_aimed = sees & (np.abs(bearing) < 0.3)
+    velocities = wander(senses)
+    has_target = ~np.isnan(distance)
+    is_aimed = has_target & (np.abs(bearing) < 0.3)
     is_free = (distance < AWAY + 0.1) | (_ahead(senses.ranges) > FOOTPRINT * 2.2)
     walk = np.where(is_aimed & is_free & (distance > ARRIVED), WALK, 0.0)
-    wishes[sees] = _wishes(walk, 2.2 * bearing)[sees]
-    return wishes
+    velocities[has_target] = _velocities(walk, 2.2 * bearing)[has_target]
+    return velocities
 
 
 CONTROLLERS: dict[str, Controller] = {
@@ -141,9 +146,9 @@ CONTROLLERS: dict[str, Controller] = {
 
 
 def _ahead(ranges: Floats) -> Floats:
-    """The least of the ray ahead and, shortened to the width of the robot, of the two beside it."""
+    """Return the smallest of the ray ahead and its two neighbours, which are shortened to the width of the robot."""
     return np.minimum(ranges[:, 0], np.minimum(ranges[:, 1], ranges[:, -1]) * 1.2)
 
 
-def _wishes(forward: Floats, turn: Floats) -> Floats:
+def _velocities(forward: Floats, turn: Floats) -> Floats:
     return np.stack((forward, np.zeros_like(forward), np.clip(turn, -TURN, TURN)), axis=1)

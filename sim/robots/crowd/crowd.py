@@ -1,7 +1,8 @@
-"""Crowd: many round robots in one walled yard as arrays, moved and sensed 32 ms at a time, the same for the same seed.
+"""Many round robots in a walled world, computed with arrays in steps of 32 ms; deterministic for a given seed.
 
-The robots have the size, the speeds and the legs of the yard's dogs (``sim.robots.dog``).  Contact is geometry: who
-overlaps is pushed apart, and its velocity is what became of it.  Metres, radians, seconds; x to the right, y up.
+The robots have the size, the speeds and the acceleration of the simulated dogs (``sim.robots.dog``).  Contact is
+geometric: overlapping robots are pushed apart, and their velocities follow from their positions.  Metres, radians,
+seconds; x to the right, y up.
 """
 
 from __future__ import annotations
@@ -20,32 +21,32 @@ from sim.robots.world import TICK, NotPossible, Target
 
 RAYS = 8
 REACH = 1.7
-"""Metres of a ray from the middle of a robot: a little more than its far ranger reaches from the nose."""
+"""Length of a ray from the centre of a robot, in metres; slightly more than its far ranger reaches from the nose."""
 PUSHES = 12
-"""How often in a step those that overlap are pushed apart, at most; only in a throng more than once."""
+"""Most iterations of pushing overlapping robots apart in one step; only dense crowds need more than one."""
 SHARE = 0.9
-"""How much of an overlap a push takes away: those in the middle of a throng are pushed from all sides."""
+"""Fraction of an overlap that an iteration removes; in a dense crowd robots are pushed from all sides."""
 SLOP = 0.0001
-"""Metres of an overlap that is left as it is."""
+"""Overlap in metres that is not corrected."""
 CLOSE = 2 * FOOTPRINT + 0.03
-"""Metres between the middles of two robots that may come to overlap in the pushing of one step."""
+"""Distance in metres between the centres of two robots that may overlap within one step."""
 SKIN = 0.1
 _SPANS = [LIMITS[key] for key in ("base.vx", "base.vy", "base.wz")]
 
 
 class Crowd:
-    """The robots of ``ground``, numbered from 0; the dice of ``seed`` place them.
+    """The robots of ``ground``, numbered from 0; ``seed`` determines their initial positions.
 
-    ``x y heading`` are their places, ``vx vy wz`` their velocities (of the yard, not of the robot), ``ax ay`` what they
-    felt in the newest step, ``wish`` what each is to do (forward, left, turn), ``ranges`` what each ray met.
+    ``x y heading`` are their poses, ``vx vy wz`` their velocities in the world's frame, ``ax ay`` their accelerations
+    in the last step, ``wish`` their commanded velocities (forward, left, turn), ``ranges`` the length of each ray.
     """
 
     def __init__(self, seed: int, ground: Ground) -> None:
         self.ground = ground
         self.target: Target | None = None
         self.ticks = 0
-        self._dice = np.random.default_rng(seed)
-        self.x, self.y, self.heading = ground.places(self._dice)
+        self._rng = np.random.default_rng(seed)
+        self.x, self.y, self.heading = ground.places(self._rng)
         count = ground.bodies
         self.vx, self.vy, self.wz = np.zeros(count), np.zeros(count), np.zeros(count)
         self.ax, self.ay = np.zeros(count), np.zeros(count)
@@ -56,29 +57,29 @@ class Crowd:
 
     @property
     def t(self) -> float:
-        """Seconds of simulated time since the start."""
+        """Simulated time in seconds since the start."""
         return self.ticks * TICK
 
     def step(self) -> None:
-        """Let ``TICK`` seconds pass."""
+        """Simulate ``TICK`` seconds."""
         before_x, before_y, before_vx, before_vy = self.x, self.y, self.vx, self.vy
-        self._strive()
+        self._accelerate()
         self.x, self.y = self.x + self.vx * TICK, self.y + self.vy * TICK
         self.heading = np.remainder(self.heading + self.wz * TICK + math.pi, math.tau) - math.pi
-        self._push()
+        self._resolve_overlaps()
         self.vx, self.vy = (self.x - before_x) / TICK, (self.y - before_y) / TICK
         self.ax, self.ay = (self.vx - before_vx) / TICK, (self.vy - before_vy) / TICK
         self.ranges = self.cast()
         self.ticks += 1
 
     def cast(self) -> Floats:
-        """What each ray of each robot meets now."""
+        """Return the length of each ray of each robot."""
         target = self.target
         discs: list[Disc] = [] if target is None else [(target.x, target.y, target.radius)]
         return self._rays.cast(self.x, self.y, self.heading, discs)
 
     def place_target(self, x: float, y: float) -> None:
-        """Put the target here, in place of an older one; raises ``NotPossible`` where a robot or a wall is."""
+        """Move the target to this place; raise ``NotPossible`` if a robot or a wall is in the way."""
         ground = self.ground
         radius = ground.target_radius
         if not (radius <= x <= ground.width - radius and radius <= y <= ground.height - radius):
@@ -93,16 +94,16 @@ class Crowd:
         self.ranges = self.cast()
 
     def place_target_at_random(self) -> None:
-        """Put the target at a free place about the middle; raises ``NotPossible`` where there is none."""
+        """Move the target to a free place near the centre; raise ``NotPossible`` if there is none."""
         width, height = self.ground.width, self.ground.height
         for _ in range(1000):
-            x, y = (float(self._dice.uniform(0.35, 0.65)) * side for side in (width, height))
+            x, y = (float(self._rng.uniform(0.35, 0.65)) * side for side in (width, height))
             if np.hypot(self.x - x, self.y - y).min() >= FOOTPRINT + 2 * self.ground.target_radius:
                 return self.place_target(x, y)
-        raise NotPossible("no place is free about the middle; give the robots more room")
+        raise NotPossible("no place is free near the centre; give the robots more room")
 
     def move(self, body: int, x: float, y: float, heading: float) -> None:
-        """Lift a robot and set it down at rest; raises ``NotPossible`` where another robot or a wall is."""
+        """Move a robot to this place, at rest; raise ``NotPossible`` if another robot or a wall is in the way."""
         ground = self.ground
         inside = FOOTPRINT <= x <= ground.width - FOOTPRINT and FOOTPRINT <= y <= ground.height - FOOTPRINT
         gap = np.hypot(self.x - x, self.y - y)
@@ -116,32 +117,32 @@ class Crowd:
         self.ranges = self.cast()
 
     def digest(self) -> str:
-        """The hash, in hex, of the moment and of all places and velocities: two runs that are alike have the same."""
+        """Return a hash, in hex, of the time and of all poses and velocities; equal runs have equal hashes."""
         state = hashlib.blake2b(struct.pack("<q", self.ticks), digest_size=32)
         for row in (self.x, self.y, self.heading, self.vx, self.vy, self.wz, self.ranges):
             state.update(np.ascontiguousarray(row).tobytes())
         return state.hexdigest()
 
     def overlap(self) -> float:
-        """Metres by which the two robots overlap that do so the most; 0 where none do."""
+        """Return the largest overlap of two robots in metres; 0 without any."""
         one, other = self._neighbours.pairs(self.x, self.y)
         gaps = np.hypot(self.x[other] - self.x[one], self.y[other] - self.y[one])
         return max(0.0, 2 * FOOTPRINT - float(gaps.min(initial=math.inf)))
 
-    def _strive(self) -> None:
-        """Bring the velocities as near to the wishes as the legs can in one step, as ``Dog.strive`` does for one."""
+    def _accelerate(self) -> None:
+        """Accelerate all robots towards their commands for one step, as ``Dog.strive`` does for one robot."""
         forward, left, turn = (np.clip(self.wish[:, n], low, high) for n, (low, high) in enumerate(_SPANS))
         cos, sin = np.cos(self.heading), np.sin(self.heading)
-        lack_x, lack_y = cos * forward - sin * left - self.vx, sin * forward + cos * left - self.vy
-        lack = np.hypot(lack_x, lack_y)
-        can = np.where((forward == 0.0) & (left == 0.0) & (turn == 0.0), BRAKING * TICK, ACCELERATION * TICK)
-        share = can / np.maximum(lack, can)
-        self.vx, self.vy = self.vx + share * lack_x, self.vy + share * lack_y
-        most = ANGULAR_ACCELERATION * TICK
-        self.wz = self.wz + np.clip(turn - self.wz, -most, most)
+        error_x, error_y = cos * forward - sin * left - self.vx, sin * forward + cos * left - self.vy
+        error = np.hypot(error_x, error_y)
+        most = np.where((forward == 0.0) & (left == 0.0) & (turn == 0.0), BRAKING * TICK, ACCELERATION * TICK)
+        share = most / np.maximum(error, most)
+        self.vx, self.vy = self.vx + share * error_x, self.vy + share * error_y
+        most_turn = ANGULAR_ACCELERATION * TICK
+        self.wz = self.wz + np.clip(turn - self.wz, -most_turn, most_turn)
 
-    def _push(self) -> None:
-        """Push apart who overlaps, away from the target and back from the walls; the walls have the last word."""
+    def _resolve_overlaps(self) -> None:
+        """Push overlapping robots apart, away from the target and back from the walls; the walls take precedence."""
         x, y = self.x, self.y
         one, other = self._neighbours.pairs(x, y)
         close = np.flatnonzero((x[other] - x[one]) ** 2 + (y[other] - y[one]) ** 2 < CLOSE * CLOSE)
@@ -163,7 +164,7 @@ class Crowd:
         self._keep_inside()
 
     def _push_from_target(self) -> bool:
-        """Whether somebody was in the target."""
+        """Push robots out of the target; return whether there was any."""
         if self.target is None:
             return False
         dx, dy = self.x - self.target.x, self.y - self.target.y

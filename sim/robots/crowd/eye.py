@@ -1,4 +1,4 @@
-"""Eye: what a robot of a crowd sees, painted far to near: walls, the red target, and the others as grey drums."""
+"""Rendering of the cameras of a crowd: walls, the red target, and the other robots as grey cylinders."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ from sim.robots.lens import (
 from sim.robots.scene import FOOTPRINT
 
 CLEAR = 4.0
-"""Metres within which the others are drawn; farther ones only where they may hide the target."""
+"""Distance in metres within which other robots are drawn; farther ones are drawn only if they may hide the target."""
 FARTHEST = 12.0
 WEDGE, SIDE = 0.6, 0.35
-"""How far aside something may be to be in the picture: this share of how far ahead it is, and so many metres."""
+"""Bounds of the lateral distance of objects in the picture: this fraction of the distance ahead, plus these metres."""
 _SEAMS = np.array([1.0, 0.55, -0.35, -1.0])
 _GREYS: tuple[Colour, ...] = ((118, 114, 108), (172, 168, 162), (138, 134, 128))
 _STEEPEST = 1.4
@@ -38,18 +38,18 @@ _MIDDLE = WIDTH / 2 - 0.5, HEIGHT / 2 - 0.5
 
 
 class Eyes:
-    """The cameras of the robots of ``crowd``; ``rng`` are the dice of their noise."""
+    """The cameras of the robots of ``crowd``; ``rng`` generates their noise."""
 
     def __init__(self, rng: Random, crowd: Crowd) -> None:
         self._crowd = crowd
         self._room = Room(rng, crowd.ground.width, crowd.ground.height, crowd.ground.wall_height)
 
     def jpeg(self, body: int, is_halved: bool = False) -> bytes:
-        """What the robot of that number sees as a JPEG, 208x160 or half of that each way."""
+        """Return the picture of the robot ``body`` as a JPEG, 208x160 pixels, or 104x80 if ``is_halved``."""
         return encoded(self.image(body), is_halved)
 
     def image(self, body: int) -> Image:
-        """The same as blue, green and red bytes."""
+        """Return the picture as blue, green and red bytes."""
         crowd = self._crowd
         view = View(float(crowd.x[body]), float(crowd.y[body]), float(crowd.heading[body]))
         image = self._room.floor()
@@ -60,18 +60,18 @@ class Eyes:
             target_at = math.hypot(ahead, left)
             if ahead > 0.0 and abs(left) < WEDGE * ahead + SIDE:
                 far = min(max(CLEAR, target_at), FARTHEST)
-        others, drums = self._drums(body, view, far)
+        others, cylinders = self._find_visible(body, view, far)
         behind = int((others > target_at).sum())
-        _draw(image, drums[:behind])
+        _draw(image, cylinders[:behind])
         if target is not None:
             draw_target(image, view, target.x, target.y, target.radius, target.height)
-        _draw(image, drums[behind:])
+        _draw(image, cylinders[behind:])
         return self._room.noisy(image)
 
-    def _drums(self, body: int, view: View, far: float) -> tuple[Floats, list[list[int]]]:
-        """How far the others in view are, the farthest first, and the columns and the lowest row of their strips.
+    def _find_visible(self, body: int, view: View, far: float) -> tuple[Floats, list[list[int]]]:
+        """Return the distances of the robots in view, farthest first, with the columns and lowest row of their strips.
 
-        They are as high as the lens, so that nobody looks onto their tops.
+        The cylinders are as high as the lens, so their tops are never visible.
         """
         crowd = self._crowd
         dx, dy = crowd.x - view.x, crowd.y - view.y
@@ -91,7 +91,7 @@ class Eyes:
         return distance, strips
 
 
-def _draw(image: Image, drums: list[list[int]]) -> None:
-    for *columns, lowest in drums:
+def _draw(image: Image, cylinders: list[list[int]]) -> None:
+    for *columns, lowest in cylinders:
         for left, right, colour in zip(columns, columns[1:], _GREYS, strict=False):
             cv2.rectangle(image, (left, HEIGHT // 2), (right, lowest), colour, cv2.FILLED)

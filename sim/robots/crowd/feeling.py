@@ -1,6 +1,6 @@
-"""Feeling: what those robots of a crowd that have a driver feel, under the keys of a dog of the yard, as arrays.
+"""Sensors of those robots of a crowd that have a driver, under the keys of a simulated dog, computed with arrays.
 
-The same noise, drift and battery as ``sim.robots.sensor`` gives one dog; one sample a step where that takes four.
+Noise, drift and battery are as in ``sim.robots.sensor``; one sample per step instead of four.
 """
 
 from __future__ import annotations
@@ -23,33 +23,33 @@ _KEYS = (
     "power.level",
 )
 _STEADY = 0.05 * math.sqrt(SUBSTEP / TICK)
-"""How much a stride differs from the next; where one is counted that the yard counts as four, by as much less."""
+"""Standard deviation of a stride, reduced because one step here counts for four."""
 
 
 class Feelings:
-    """What the first robots of ``crowd``, named ``names``, feel; ``sample`` once each step."""
+    """Sensor values of the first robots of ``crowd``, named ``names``; call ``sample`` once per step."""
 
     def __init__(self, seed: int, crowd: Crowd, names: Sequence[str]) -> None:
         self._crowd = crowd
-        self._dice = np.random.default_rng(seed)
+        self._rng = np.random.default_rng(seed)
         count = len(names)
         self._odometry = np.zeros((3, count))
-        self._stride_error, self._turn_error = 1.0 + self._dice.normal(0.0, 0.01, (2, count))
+        self._stride_error, self._turn_error = 1.0 + self._rng.normal(0.0, 0.01, (2, count))
         self._power = np.ones(count)
         self._deviation = np.array([Random(f"compass of {name}").gauss(0.0, math.radians(2.0)) for name in names])
         self._rows: list[list[float]] = [[math.nan] * len(_KEYS)] * count
         self._moving: list[bool] = [False] * count
 
     def sample(self) -> None:
-        """Feel once, ``TICK`` after the time before."""
+        """Take a sample, ``TICK`` seconds after the previous one."""
         crowd, first = self._crowd, slice(0, len(self._power))
         heading, wz = crowd.heading[first], crowd.wz[first]
         cos, sin = np.cos(heading), np.sin(heading)
         vx = cos * crowd.vx[first] + sin * crowd.vy[first]
         vy = cos * crowd.vy[first] - sin * crowd.vx[first]
         moving = (crowd.wish[first] != 0.0).any(axis=1) | (np.hypot(vx, vy) > 0.005) | (np.abs(wz) > 0.02)
-        noise = self._dice.normal(size=(8, len(vx)))
-        self._reckon(moving, vx, vy, wz, noise[:2])
+        noise = self._rng.normal(size=(8, len(vx)))
+        self._update_odometry(moving, vx, vy, wz, noise[:2])
         self._power = np.maximum(0.0, self._power - TICK / BATTERY_S * np.where(moving, 1.0, 0.5))
         ahead = crowd.ranges[first, 0]
         ahead = np.where(ahead < REACH, ahead - NOSE, math.nan)
@@ -57,9 +57,9 @@ class Feelings:
         shake = np.where(moving, 0.25, 0.04)
         x, y, yaw = self._odometry
         columns = (
-            *(vx, vy, wz, x, y, _turned(yaw), _turned(heading + self._deviation)),
-            *(_ranged(gap, limits, n) for gap, limits, n in ((ahead, NEAR, noise[2]), (ahead, FAR, noise[3]))),
-            _ranged(slant, CHEST, noise[4]),
+            *(vx, vy, wz, x, y, _normalize_angle(yaw), _normalize_angle(heading + self._deviation)),
+            *(_read_ranger(gap, limits, n) for gap, limits, n in ((ahead, NEAR, noise[2]), (ahead, FAR, noise[3]))),
+            _read_ranger(slant, CHEST, noise[4]),
             cos * crowd.ax[first] + sin * crowd.ay[first] + shake * noise[5],
             cos * crowd.ay[first] - sin * crowd.ax[first] + shake * noise[6],
             GRAVITY + shake * noise[7],
@@ -69,10 +69,10 @@ class Feelings:
         self._moving = moving.tolist()
 
     def values(self, body: int) -> dict[str, Value]:
-        """The newest of each value of the robot of that number, NaN for nothing in range."""
+        """Return the newest values of the robot ``body``, NaN for nothing in range."""
         return {**dict(zip(_KEYS, self._rows[body], strict=True)), "base.moving": self._moving[body]}
 
-    def _reckon(self, moving: Floats, vx: Floats, vy: Floats, wz: Floats, noise: Floats) -> None:
+    def _update_odometry(self, moving: Floats, vx: Floats, vy: Floats, wz: Floats, noise: Floats) -> None:
         x, y, yaw = self._odometry
         slip = self._stride_error * (1.0 + _STEADY * noise[0]) * moving * TICK
         cos, sin = np.cos(yaw), np.sin(yaw)
@@ -82,17 +82,16 @@ class Feelings:
 
 
 def sampled(values: dict[str, Value]) -> dict[str, tuple[float, ...]]:
-    """The samples since the frame before: there is one of each."""
+    """Return the samples of one frame: one of each sensor."""
     return {key: (float(values[key]),) for key in SAMPLED}
 
 
-def _turned(angle: Floats) -> Floats:
-    """The same directions within -pi and pi."""
-    turned: Floats = np.remainder(angle + math.pi, math.tau) - math.pi
-    return turned
+def _normalize_angle(angle: Floats) -> Floats:
+    normalized: Floats = np.remainder(angle + math.pi, math.tau) - math.pi
+    return normalized
 
 
-def _ranged(gap: Floats, limits: tuple[float, float], noise: Floats) -> Floats:
-    """What an infrared ranger says: noise grows with distance, too near reads as the shortest, too far as NaN."""
+def _read_ranger(gap: Floats, limits: tuple[float, float], noise: Floats) -> Floats:
+    """Return infrared readings: noise grows with distance, too near reads as the minimum, too far as NaN."""
     measured = gap + noise * (0.001 + 0.004 * gap)
     return np.where(measured > limits[1], math.nan, np.maximum(measured, limits[0]))

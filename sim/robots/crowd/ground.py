@@ -1,4 +1,4 @@
-"""Ground: how many robots a yard for many holds, how large it is, and where they stand at the start."""
+"""Size of a crowd's world, number of its robots, and their initial poses."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ Floats = NDArray[np.float64]
 MAX_BODIES = 100_000
 LONGEST = 2000.0
 APART = 0.02
-"""Metres that are left at least between two robots at the start."""
+"""Smallest gap in metres between two robots at the start."""
 CELL = 2 * FOOTPRINT + APART
 ROOM = 4.0
-"""Square metres for each robot, where nobody says how large the yard is."""
+"""Default area per robot in square metres."""
 
 
 @dataclass(frozen=True)
 class Ground:
     """A walled rectangle of ``width`` by ``height`` metres with ``bodies`` round robots of an ERS-7's footprint.
 
-    Raises ``SceneError`` for what cannot be, with the remedy.
+    Raises ``SceneError`` with the remedy for invalid values.
     """
 
     bodies: int
@@ -53,27 +53,27 @@ class Ground:
             side = math.ceil(10 * CELL * math.ceil(math.sqrt(self.bodies))) / 10
             raise SceneError(
                 f"{self.bodies} robots of {200 * FOOTPRINT:.0f} cm do not fit into {self.width:g} x {self.height:g} m: "
-                f"there is room for {places}; take so many, or {side:g} x {side:g} m"
+                f"there is room for {places}; use at most {places} robots, or {side:g} x {side:g} m"
             )
 
-    def places(self, dice: np.random.Generator) -> tuple[Floats, Floats, Floats]:
-        """Where everybody stands at the start, x, y and heading: spread evenly, by chance, and nobody near another."""
+    def places(self, rng: np.random.Generator) -> tuple[Floats, Floats, Floats]:
+        """Return the initial x, y and heading of all robots: random, evenly spread, without overlap."""
         pitch = math.sqrt(self.width * self.height / self.bodies)
         while math.floor(self.width / pitch) * math.floor(self.height / pitch) < self.bodies:
             pitch = max(CELL, 0.99 * pitch)
         columns, rows = math.floor(self.width / pitch), math.floor(self.height / pitch)
-        cells = dice.permutation(columns * rows)[: self.bodies]
+        cells = rng.permutation(columns * rows)[: self.bodies]
         across, up = self.width / columns, self.height / rows
-        loose_x, loose_y = ((pitch - CELL) / 2 * dice.uniform(-1.0, 1.0, self.bodies) for pitch in (across, up))
-        heading = dice.uniform(-math.pi, math.pi, self.bodies)
+        loose_x, loose_y = ((pitch - CELL) / 2 * rng.uniform(-1.0, 1.0, self.bodies) for pitch in (across, up))
+        heading = rng.uniform(-math.pi, math.pi, self.bodies)
         return (cells % columns + 0.5) * across + loose_x, (cells // columns + 0.5) * up + loose_y, heading
 
 
 def roomy(bodies: int, room: float = ROOM) -> Ground:
-    """A square ground with ``room`` square metres for each robot; raises ``SceneError`` where that is too little."""
+    """Return a square ground with ``room`` square metres per robot; raise ``SceneError`` if that is too little."""
     if type(bodies) is not int or not 1 <= bodies <= MAX_BODIES:
         raise SceneError(f"bodies must be a whole number from 1 to {MAX_BODIES}, not {bodies!r}")
     if not (isinstance(room, int | float) and CELL**2 <= room <= 1000.0):
-        raise SceneError(f"room must be a number from {CELL**2:.2f} to 1000 square metres a robot, not {room!r}")
+        raise SceneError(f"room must be a number from {CELL**2:.2f} to 1000 square metres per robot, not {room!r}")
     side = round(max(3.0, math.sqrt(bodies * room)), 2)
     return Ground(bodies, side, side)

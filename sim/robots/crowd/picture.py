@@ -1,4 +1,4 @@
-"""Picture: a crowd from above as SVG, without a library."""
+"""A map of a crowd as SVG, without a library."""
 
 from __future__ import annotations
 
@@ -17,19 +17,22 @@ INK = {
     "agents that have found it": "#e08a1e",
     "the one that goes": "#1f8a4c",
 }
-"""What a robot is, and its colour; who is of no kind has the first."""
+"""Kinds of robots and their colours; a robot without a kind has the first."""
 TARGET = "#d02228"
 
 
 def drawn(
     crowd: Crowd, caption: str = "", kinds: Mapping[int, str] | None = None, trail: Sequence[tuple[float, float]] = ()
 ) -> str:
-    """The crowd with its target; ``kinds`` gives robots by number one of ``INK``, ``trail`` is where one came along."""
+    """Draw the crowd with its target.
+
+    ``kinds`` maps numbers of robots to keys of ``INK``; ``trail`` is the path of the selected robot.
+    """
     kinds = kinds or {}
     ground = crowd.ground
     scale = (WIDTH - 2 * MARGIN) / ground.width
     high = scale * ground.height
-    there = sorted({kinds.get(body, OTHER) for body in range(ground.bodies)}, key=list(INK).index)
+    present_kinds = sorted({kinds.get(body, OTHER) for body in range(ground.bodies)}, key=list(INK).index)
 
     def at(x: float, y: float) -> str:
         return f"{MARGIN + scale * x:.1f} {MARGIN + high - scale * y:.1f}"
@@ -44,8 +47,8 @@ def drawn(
     if len(trail) > 1:
         parts.append(f'<path d="M{" L".join(at(*place) for place in trail)}" fill="none" stroke="#1f8a4c"/>')
     rows = list(zip(crowd.x.tolist(), crowd.y.tolist(), crowd.heading.tolist(), strict=True))
-    for kind in there:
-        # One path for all of a kind: a disc is a stroke of no length with a round end, its nose a short line.
+    for kind in present_kinds:
+        # One path per kind: a disc is a stroke of zero length with round ends, its nose a short line.
         bodies = [rows[body] for body in range(ground.bodies) if kinds.get(body, OTHER) == kind]
         discs = "".join(f"M{at(x, y)}h0" for x, y, _ in bodies)
         wide = f'stroke-width="{2 * FOOTPRINT * scale:.2f}" stroke-linecap="round"'
@@ -60,7 +63,7 @@ def drawn(
         parts.append(f'<circle cx="{x}" cy="{y}" r="{size:.1f}" fill="{TARGET}"/>')
         parts.append(f'<circle cx="{x}" cy="{y}" r="{size + 8:.1f}" fill="none" stroke="{TARGET}"/>')
     left, line = MARGIN, high + 2 * MARGIN + 4
-    for kind in there:
+    for kind in present_kinds:
         parts.append(f'<circle cx="{left + 5:.0f}" cy="{line:.0f}" r="5" fill="{INK[kind]}"/>')
         parts.append(f'<text x="{left + 15:.0f}" y="{line + 4:.0f}">{escape(kind)}</text>')
         left += 40 + 7 * len(kind)

@@ -1,4 +1,4 @@
-"""Rays: how far it is from every robot to whatever stands around it, and which robots are near each other."""
+"""Distances from every robot to its surroundings along rays, and pairs of robots that are near each other."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from sim.robots.scene import FOOTPRINT
 Places = NDArray[np.int64]
 SKIN = 0.3
 Disc = tuple[float, float, float]
-"""Something round that stands still: x, y and radius in metres."""
+"""A fixed round obstacle: x, y and radius in metres."""
 
 
 class Rays:
-    """``count`` rays of ``reach`` metres from the middle of each robot, evenly around it; ray 0 looks ahead.
+    """``count`` rays of ``reach`` metres from the centre of each robot, at equal angles; ray 0 points ahead.
 
-    A disc is asked which of the rays meet it, and not each ray what it meets: so the work grows with what is there, and
-    not with the number of rays.
+    The rays that meet a disc are computed for each disc, so the cost grows with the number of obstacles and not with
+    the number of rays.
     """
 
     def __init__(self, width: float, height: float, count: int, reach: float) -> None:
@@ -33,7 +33,7 @@ class Rays:
         self._neighbours = Neighbours(reach + FOOTPRINT, SKIN)
 
     def cast(self, x: Floats, y: Floats, heading: Floats, discs: Sequence[Disc] = ()) -> Floats:
-        """Metres along each ray, a row for each robot, counter-clockwise; ``reach`` where nothing is met."""
+        """Return metres along each ray, a row per robot, counter-clockwise; ``reach`` if the ray meets nothing."""
         ranges = np.full((len(x), self._count), self._reach)
         self._meet_walls(ranges, x, y, heading)
         one, other = self._neighbours.pairs(x, y)
@@ -42,7 +42,7 @@ class Rays:
         is_near = np.flatnonzero(square < (self._reach + FOOTPRINT) ** 2)
         one, other = one[is_near], other[is_near]
         distance, towards = np.sqrt(square[is_near]), np.arctan2(dy[is_near], dx[is_near])
-        # What one sees of the other, the other sees of the one in the opposite direction.
+        # Each pair is used in both directions.
         self._meet(
             ranges,
             np.concatenate((one, other)),
@@ -53,13 +53,13 @@ class Rays:
         for disc_x, disc_y, radius in discs:
             dx, dy = disc_x - x, disc_y - y
             square = dx * dx + dy * dy
-            seers = np.flatnonzero(square < (self._reach + radius) ** 2)
-            towards = np.arctan2(dy[seers], dx[seers]) - heading[seers]
-            self._meet(ranges, seers, towards, np.sqrt(square[seers]), radius)
+            observers = np.flatnonzero(square < (self._reach + radius) ** 2)
+            towards = np.arctan2(dy[observers], dx[observers]) - heading[observers]
+            self._meet(ranges, observers, towards, np.sqrt(square[observers]), radius)
         return ranges
 
-    def _meet(self, ranges: Floats, seers: Places, bearing: Floats, distance: Floats, radius: float) -> None:
-        """Shorten the rays of ``seers`` that meet a disc each, ``bearing`` radians from ahead and ``distance`` away."""
+    def _meet(self, ranges: Floats, observers: Places, bearing: Floats, distance: Floats, radius: float) -> None:
+        """Shorten the rays of ``observers`` that meet one disc each, at ``bearing`` (0 is ahead) and ``distance``."""
         half = np.arcsin(np.minimum(radius / distance, 1.0)) / self._between
         middle = bearing / self._between
         first = np.ceil(middle - half)
@@ -71,10 +71,10 @@ class Rays:
             ray = first[met] + nth
             off = (ray - middle[met]) * self._between
             far = distance[met]
-            beside = far * np.sin(off)
-            along = far * np.cos(off) - np.sqrt(np.maximum(radius * radius - beside * beside, 0.0))
-            # A robot that is met by the same ray as another is no nearer for having been looked at later.
-            np.minimum.at(flat, seers[met] * self._count + ray.astype(np.int64) % self._count, along)
+            lateral = far * np.sin(off)
+            along = far * np.cos(off) - np.sqrt(np.maximum(radius * radius - lateral * lateral, 0.0))
+            # Several robots can shorten the same ray; the smallest distance wins.
+            np.minimum.at(flat, observers[met] * self._count + ray.astype(np.int64) % self._count, along)
             nth += 1
             met = met[count[met] > nth]
 
@@ -86,40 +86,40 @@ class Rays:
         x, y = x[close, None], y[close, None]
         angle = heading[close, None] + np.arange(self._count) * self._between
         cos, sin = np.cos(angle), np.sin(angle)
-        with np.errstate(divide="ignore"):  # who looks along a wall never meets it
+        with np.errstate(divide="ignore"):  # a ray parallel to a wall never meets it
             across = np.where(cos > 0.0, self._width - x, x) / np.abs(cos)
             up = np.where(sin > 0.0, self._height - y, y) / np.abs(sin)
         ranges[close] = np.minimum(ranges[close], np.minimum(across, up))
 
 
 class Neighbours:
-    """The pairs of bodies whose middles are within ``reach`` metres of each other.
+    """The pairs of bodies with centres within ``reach`` metres of each other.
 
-    They are looked for ``skin`` metres farther, so that the list holds until somebody has gone half of that: a search
-    in cells of the whole yard becomes one in some dozens of steps.
+    The search radius is larger by ``skin`` metres, so the list stays valid until a body has moved half of that: the
+    search is needed only once in some dozens of steps.
     """
 
     def __init__(self, reach: float, skin: float) -> None:
         self._reach = reach
         self._skin = skin
-        self._found: tuple[Floats, Floats, Places, Places] | None = None
+        self._cached_pairs: tuple[Floats, Floats, Places, Places] | None = None
 
     def pairs(self, x: Floats, y: Floats) -> tuple[Places, Places]:
-        """Each pair once, as two rows of numbers of bodies; some of them may be farther apart than ``reach``."""
-        if self._found is not None:
-            then_x, then_y, one, other = self._found
-            gone = (x - then_x) ** 2 + (y - then_y) ** 2
-            if gone.max() <= (self._skin / 2) ** 2:
+        """Return each pair once, as two rows of numbers; some may be farther apart than ``reach``."""
+        if self._cached_pairs is not None:
+            then_x, then_y, one, other = self._cached_pairs
+            moved = (x - then_x) ** 2 + (y - then_y) ** 2
+            if moved.max() <= (self._skin / 2) ** 2:
                 return one, other
         one, other = near(x, y, self._reach + self._skin)
-        self._found = x.copy(), y.copy(), one, other
+        self._cached_pairs = x.copy(), y.copy(), one, other
         return one, other
 
 
 def near(x: Floats, y: Floats, reach: float) -> tuple[Places, Places]:
-    """The pairs within ``reach``, each once."""
-    # Sorted by cells of that size, whoever may be near lies in two runs: the rest of its own cell with the next one
-    # above, and the three cells beside those in the next column.
+    """Return the pairs within ``reach``, each once."""
+    # In an array sorted by cells of that size, candidates lie in two runs: the rest of the cell with the next one
+    # above, and the three adjacent cells in the next column.
     column = np.floor(x / reach).astype(np.int64)
     row = np.floor(y / reach).astype(np.int64)
     rows = int(row.max()) + 3

@@ -1,6 +1,6 @@
-"""Search: the thesis' experiment by the hundred: agents among many others search a red target, one walks up to it.
+"""The thesis' experiment with hundreds of agents: they search a red target, and one of them approaches it.
 
-The team is handed in by the front door; what is judged here is what stands in the yard and what the agents say.
+The caller provides the team; this module measures the positions of the robots and the statements of the agents.
 """
 
 from __future__ import annotations
@@ -15,50 +15,50 @@ import numpy as np
 from sim.robots.crowd.yard import CrowdYard
 
 LOOK_S = 0.5
-"""Virtual seconds between two looks at the team."""
+"""Interval between two measurements in virtual seconds."""
 SLICES = 10
 PLACING_S = 5.0
-"""Seconds after the task's assignment at which the target is placed, while they search."""
+"""Seconds after the task's assignment at which the target is placed, during the search."""
 SLACK = 0.1
-"""By this share somebody else may be nearer than the one that was chosen: the reports are measurements."""
+"""Fraction by which another agent may be nearer than the selected one: reports contain measurement errors."""
 
 
 @dataclass(frozen=True)
 class Word:
-    """What one agent says: how far the target is (None: it knows of none), and who is to go, by name."""
+    """The statement of one agent: its distance to the target (None if unknown), and the name of the assigned agent."""
 
     cost: float | None
     assigned: str
 
 
 class Team(Protocol):
-    """Agents with bodies in a crowd, on one turned clock."""
+    """Agents with robots in a crowd, on one clock in virtual time."""
 
     clock: Any
     board: Any
     yard: CrowdYard
 
     def assign(self) -> None:
-        """Assign the task to whoever can do it."""
+        """Assign the task to all able agents."""
 
     def words(self) -> Mapping[str, Word]:
-        """What each agent that takes part says, by its name."""
+        """Return the statement of each participating agent, by its name."""
 
     def done_by(self) -> str | None:
-        """Who ended the task, None while it is open."""
+        """Return the agent that completed the task, None while it is open."""
 
     def stop(self) -> None:
-        """End everything."""
+        """Stop all nodes."""
 
 
 @dataclass
 class Outcome:
-    """What came of it, and what it cost; times in virtual seconds since the task was assigned, cost in CPU seconds.
+    """Results and cost of a search; times in virtual seconds since the task was assigned, cost in CPU seconds.
 
-    ``found`` counts the agents that knew the target when they agreed, or at the end; ``right`` says whether nobody of
-    those was much nearer than the one that was chosen.  ``cost`` has parts: ``moving`` all robots with their rays and
-    controllers, ``telling`` the drivers what is felt and seen, and ``agents``: nodes, drivers and agents.  ``trail`` is
-    where the one came along that goes now.
+    ``found`` is the number of agents that knew the target at the time of the agreement, or at the end; ``right`` says
+    whether none of them was much nearer than the selected agent.  Parts of ``cost``: ``moving`` for robots, rays and
+    controllers, ``telling`` for sensor frames and pictures, ``agents`` for nodes, drivers and agents.  ``trail`` is the
+    path of the selected robot.
     """
 
     seed: int
@@ -86,24 +86,24 @@ def search(
     show: Callable[[Outcome], None] = lambda outcome: None,
     is_over: Callable[[], bool] = lambda: False,
 ) -> Outcome:
-    """Let ``team`` search until somebody stands at the target, at most ``limit`` virtual seconds.
+    """Let ``team`` search until a robot reaches the target, at most ``limit`` virtual seconds.
 
-    ``show`` is called at each look; once ``is_over`` the search ends with what is known by then.
+    ``show`` is called after each measurement; when ``is_over`` returns True, the search ends with the results so far.
     """
     yard = team.yard
     outcome = Outcome(seed, len(yard.names), yard.crowd.ground.bodies)
-    began, sent = team.clock.seconds(), team.board.counters["sent"]
+    started_at, sent = team.clock.seconds(), team.board.counters["sent"]
     before = stopwatch(), yard.moving, yard.telling
     team.assign()
     while outcome.seconds < limit and outcome.reach is None and not is_over():
         for _ in range(SLICES):
             if not is_over():  # half a second of a large team may take a minute
                 team.clock.advance(LOOK_S / SLICES)
-        outcome.seconds = round(team.clock.seconds() - began, 3)
+        outcome.seconds = round(team.clock.seconds() - started_at, 3)
         outcome.datagrams = team.board.counters["sent"] - sent
         if yard.crowd.target is None and outcome.seconds >= PLACING_S:
             yard.crowd.place_target_at_random()
-        _notice(outcome, team)
+        _measure(outcome, team)
         show(outcome)
     spent, moving, telling = stopwatch() - before[0], yard.moving - before[1], yard.telling - before[2]
     outcome.cost = {"moving": moving, "telling": telling, "agents": spent - moving - telling}
@@ -111,7 +111,7 @@ def search(
     return outcome
 
 
-def _notice(outcome: Outcome, team: Team) -> None:
+def _measure(outcome: Outcome, team: Team) -> None:
     words, now = team.words(), outcome.seconds
     if outcome.engaged is None and len(words) == outcome.agents:
         outcome.engaged = now
@@ -130,7 +130,7 @@ def _notice(outcome: Outcome, team: Team) -> None:
     if done is not None:
         outcome.reach, outcome.by = now, done
     if outcome.by != before:
-        outcome.trail.clear()  # it is another that goes now
+        outcome.trail.clear()  # another robot was selected
     if outcome.by:
         body = team.yard.names.index(outcome.by)
         outcome.trail.append((float(team.yard.crowd.x[body]), float(team.yard.crowd.y[body])))
@@ -146,14 +146,14 @@ def _is_nearest(yard: CrowdYard, chosen: str, finders: list[str]) -> bool:
 
 
 def table(outcome: Outcome) -> str:
-    """What came of it, line by line."""
+    """Return the results as text, one line each."""
 
     def at(moment: float | None) -> str:
         return "-" if moment is None else f"{moment:.1f} s"
 
     seconds = max(outcome.seconds, 1e-9)
-    yard = outcome.cost["moving"] + outcome.cost["telling"]
-    whole = yard + outcome.cost["agents"]
+    alone = outcome.cost["moving"] + outcome.cost["telling"]
+    whole = alone + outcome.cost["agents"]
     rows = [
         ("robots, agents among them", f"{outcome.bodies:,}, {outcome.agents:,}"),
         ("all agents take part", at(outcome.engaged)),
@@ -162,7 +162,10 @@ def table(outcome: Outcome) -> str:
         ("it was the nearest of those", {True: "yes", False: "NO", None: "-"}[outcome.right]),
         ("the target is reached", f"{at(outcome.reach)} by {outcome.by or 'nobody'}"),
         ("datagrams for each agent and second", f"{outcome.datagrams / seconds / max(1, outcome.agents):.1f}"),
-        ("the yard alone", f"{1e3 * yard / seconds:8.1f} ms a second: {seconds / max(yard, 1e-9):.1f} x real time"),
+        (
+            "the simulator alone",
+            f"{1e3 * alone / seconds:8.1f} ms a second: {seconds / max(alone, 1e-9):.1f} x real time",
+        ),
         ("  rays, moves and controllers", f"{1e3 * outcome.cost['moving'] / seconds:8.1f} ms"),
         ("  sensor frames and pictures", f"{1e3 * outcome.cost['telling'] / seconds:8.1f} ms"),
         ("nodes, drivers and agents", f"{1e3 * outcome.cost['agents'] / seconds:8.1f} ms"),
@@ -173,7 +176,7 @@ def table(outcome: Outcome) -> str:
 
 
 def kinds(team: Team, outcome: Outcome) -> dict[int, str]:
-    """What each robot of an agent is, for the picture."""
+    """Return the kind of each robot that has an agent, for the map."""
     words, names = team.words(), team.yard.names
     found = {name for name, word in words.items() if word.cost is not None}
     every = {

@@ -1,4 +1,4 @@
-"""CrowdYard: a crowd whose first robots are driven over the yard's own wire; a controller has the others."""
+"""A crowd in which the first robots have drivers, over the simulator's protocol, and a controller moves the others."""
 
 from __future__ import annotations
 
@@ -21,16 +21,17 @@ from sim.robots.reception import PacedYard
 from sim.robots.scene import FOOTPRINT, SceneError
 
 SPARE = 8
-"""Connections beside one for each robot that can be driven."""
+"""Number of connections in addition to one per robot with a driver."""
 TOUCHING = 0.001
-"""Metres between two robots that touch, at most."""
+"""Largest gap in metres between two robots in contact."""
 
 
 class CrowdYard(PacedYard):
-    """A yard for many, on ``ground``.
+    """A simulator of many robots, on ``ground``.
 
-    The first ``driven`` robots, ``robot1`` and so on, obey drivers and stand while nobody holds them; the others do
-    what ``controller`` says.  ``stopwatch`` counts what was spent in ``moving`` and in ``telling`` the drivers.
+    The first ``driven`` robots, ``robot1`` and so on, obey drivers and stand still without one; ``controller`` moves
+    the others.  ``stopwatch`` measures the time spent in ``moving`` robots and in ``telling`` drivers the sensor
+    values.
     """
 
     def __init__(
@@ -58,24 +59,24 @@ class CrowdYard(PacedYard):
         super().__init__(clock, self.names, self, driven + SPARE)
 
     def lend(self, name: str) -> CrowdBody:
-        """Hand a robot over to an emulator, which moves it from now on; no driver may hold it here.
+        """Transfer a robot to an emulator; drivers can no longer hold it.
 
-        Raises ``UsageError`` where there is no such robot to be driven.
+        Raises ``UsageError`` if no such robot can have a driver.
         """
-        self._withhold(name)
+        self._reserve_robot(name)
         return CrowdBody(self._numbers[name], self.crowd, self._feelings, self._eyes)
 
     def drive(self, name: str, vx: float, vy: float, wz: float) -> None:
-        """Let the robot ``name`` walk with this velocity in its own frame until told otherwise."""
+        """Set the robot's velocity in its frame, until the next command."""
         self.crowd.wish[self._numbers[name]] = (vx, vy, wz)
 
     def halt(self, name: str) -> None:
-        """Let the robot ``name`` stand still, as fast as its legs can brake."""
+        """Stop the robot, braking as hard as it can."""
         self.crowd.wish[self._numbers[name]] = 0.0
 
-    def _play(self, late: float) -> int:
-        """One tick, however late: the next one, with all that drivers say till then, comes at once."""
-        began = self._stopwatch()
+    def _simulate(self, late: float) -> int:
+        """Simulate one tick, even if several are late: the next one follows at once, with newly received commands."""
+        started_at = self._stopwatch()
         self._expire(self.crowd.t)
         self.crowd.wish[len(self.names) :] = self._controller(self._others)
         self.crowd.step()
@@ -84,15 +85,15 @@ class CrowdYard(PacedYard):
         for number, name in enumerate(self.names):
             if name in self._drivers:
                 values = self._feelings.values(number)
-                self._tell(name, self.crowd.t, values, sampled(values), partial(self._eyes.jpeg, number))
+                self._report_sensors(name, self.crowd.t, values, sampled(values), partial(self._eyes.jpeg, number))
         self._drop_silent()
-        self.moving += moved - began
+        self.moving += moved - started_at
         self.telling += self._stopwatch() - moved
         return 1
 
 
 class CrowdBody:
-    """The robot ``number`` of ``crowd``; without a gate, as a robot is that knows no tokens."""
+    """The robot ``number`` of ``crowd``; without a gate, like a robot that does not know tokens."""
 
     def __init__(self, number: int, crowd: Crowd, feelings: Feelings, eyes: Eyes) -> None:
         self._number = number
@@ -101,29 +102,29 @@ class CrowdBody:
         self._eyes = eyes
 
     def drive(self, vx: float, vy: float, wz: float) -> None:
-        """Move with this velocity in its own frame until told otherwise, as fast as the legs can.
+        """Set the velocity in the robot's frame, until the next command.
 
-        Where one of them is no number, it stands.
+        The robot stands still if a value is not finite.
         """
         is_motion = all(map(math.isfinite, (vx, vy, wz)))
         self._crowd.wish[self._number] = (vx, vy, wz) if is_motion else 0.0
 
     def halt(self) -> None:
-        """Stand still as fast as it can."""
+        """Stop, braking as hard as it can."""
         self._crowd.wish[self._number] = 0.0
 
     def sense(self) -> Mapping[str, Value]:
-        """What is known of it, and ``bump.left``, ``bump.right`` for what touches its front."""
+        """Return the sensor values, with ``bump.left`` and ``bump.right`` for contacts at the front."""
         touches = [angle for angle in self._touches() if abs(angle) < math.pi / 2]
         left, right = any(angle > -BESIDE for angle in touches), any(angle < BESIDE for angle in touches)
         return {**self._feelings.values(self._number), "bump.left": left, "bump.right": right}
 
     def picture(self, is_halved: bool = False) -> bytes | None:
-        """What it sees now as a JPEG, 208x160 or half of that each way."""
+        """Return the camera picture as a JPEG, 208x160 pixels, or 104x80 if ``is_halved``."""
         return self._eyes.jpeg(self._number, is_halved)
 
     def _touches(self) -> list[float]:
-        """Where something touches it: radians from straight ahead, left positive."""
+        """Return the directions of contacts: radians from straight ahead, left positive."""
         crowd, number = self._crowd, self._number
         x, y, heading = (float(row[number]) for row in (crowd.x, crowd.y, crowd.heading))
         dx, dy = crowd.x - x, crowd.y - y

@@ -1,1 +1,1 @@
-"""Emulators: the robots' side of the wire, over bodies that the yard moves."""
+"""Emulators: the robots' side of each protocol, for simulated robots."""

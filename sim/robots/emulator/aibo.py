@@ -1,4 +1,4 @@
-"""AiboServer: an emulated dog on real sockets; its ports open and close as those of the dog do."""
+"""An emulated AIBO on real sockets; its ports open and close like the real dog's."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from sim.robots.emulator.body import Body
 from sim.robots.emulator.wire import Table, Wire
 
 RETRY_S = 0.1
-"""A port that cannot be opened again, as another program has its number for a moment, is tried again after so long."""
+"""Seconds until the next attempt to open a port that another program uses temporarily."""
 
 
 class AiboServer:
-    """Serves ``dog`` on ``interface`` of ``reactor``, under the port numbers that the dog has."""
+    """Serves ``dog`` on ``interface`` of ``reactor``, under the dog's port numbers."""
 
     def __init__(self, reactor: Any, dog: AiboEmulator, interface: str = "127.0.0.1") -> None:
         self.faults = dog.faults
@@ -32,10 +32,10 @@ class AiboServer:
         self._closing: dict[int, Deferred[Any]] = {}
         self._retry: Any = None
         self._udp: Any = None
-        dog.on_ports.add(self._sync)
+        dog.on_ports.add(self._update_ports)
 
     def start(self) -> None:
-        """Switch the dog on and open what it serves from the start; raises ``CannotListenError`` for a taken port."""
+        """Start the dog and open its initial ports; raise ``CannotListenError`` if a port is in use."""
         self._udp = self._reactor.listenUDP(self._dog.ports["camera"], _Camera(self._dog), self._interface, 65536)
         for number in self._dog.ports.values():
             if self._dog.listens(number):
@@ -43,7 +43,7 @@ class AiboServer:
         self._dog.start()
 
     def stop(self) -> Deferred[None]:
-        """Switch it off; fires when every port is free."""
+        """Stop the dog; fires when every port is free."""
         ports, self._udp = [*self._open.values(), self._udp], None
         self._dog.stop()
         self._open.clear()
@@ -57,11 +57,11 @@ class AiboServer:
         factory = TcpLinkFactory(partial(self._dog.accept, number))
         self._open[number] = self._reactor.listenTCP(number, factory, interface=self._interface)
 
-    def _sync(self) -> None:
-        """Listen where the dog listens now, and nowhere else: a port with a client takes no second one.
+    def _update_ports(self) -> None:
+        """Open and close ports to match the dog: a port with a client accepts no second one.
 
-        The dog calls this while a link is made or lost, so nothing is raised: a port whose socket is not closed yet,
-        or whose number another program has, is opened later.
+        The dog calls this while a link opens or closes, so it does not raise: a port that is still closing, or that
+        another program uses, is opened later.
         """
         if self._udp is None:
             return
@@ -79,11 +79,11 @@ class AiboServer:
 
     def _on_closed(self, _result: object, number: int) -> None:
         del self._closing[number]
-        self._sync()
+        self._update_ports()
 
     def _on_retry(self) -> None:
         self._retry = None
-        self._sync()
+        self._update_ports()
 
 
 class _Camera(DatagramProtocol):
@@ -101,7 +101,7 @@ class _Camera(DatagramProtocol):
 
 
 def serve(reactor: Any, body: Body, rng: random.Random, options: Table, dialect: str) -> Wire:
-    """Return the wire of an AIBO; ``dialect`` is its Tekkotsu, "T4" or "T2"."""
+    """Return the server of an AIBO; ``dialect`` is its version of Tekkotsu, "T4" or "T2"."""
     chosen = checked(options)
     dog = AiboEmulator(reactor, body, rng, dialect, dict(chosen.ports) | {"gains": 0})
     return AiboServer(reactor, dog, chosen.host)

@@ -1,7 +1,7 @@
-"""AiboEmulator: the dog's side of Tekkotsu's wire, over a body that it is given.
+"""The dog's side of Tekkotsu's protocol, for a simulated robot.
 
-It serves main control and the e-stop from the start and the rest once they are selected, takes one client a port,
-starts with its motors stopped, and stands still 3 s after the last walk command.
+It serves main control and the emergency stop from the start and the other ports after they are selected, accepts one
+client per port, starts with its motors off, and stops 3 s after the last walk command.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ FRAME_S = 0.032
 CAMERA_S = 1.0 / 30.0
 DEAD_MAN_S = 3.0
 NATIVE = (208, 160)
-"""The camera's own size; it sends half of it each way unless it is asked for more."""
+"""Native size of the camera; the default is half the width and height."""
 DARK = b"\xff\xd8\xff\xc0\x00\x0b\x08\x00\x50\x00\x68\x01\x01\x11\x00" + bytes(64) + b"\xff\xd9"
-"""What a body without a picture shows: a JPEG of 104 x 80 pixels, as far as its header goes."""
+"""The picture of a simulated robot without a camera: the header of a JPEG of 104 x 80 pixels."""
 EMULATED = {**PORTS, "gains": 10032}
 
 
 class AiboEmulator:
-    """One emulated dog; ``accept`` takes its TCP links, ``datagram`` what comes by UDP.
+    """One emulated dog; ``accept`` takes its TCP links, ``datagram`` its UDP datagrams.
 
-    ``on_ports`` is notified when the ports that listen may have changed, for a server on real sockets.
+    ``on_ports`` is notified when the listening ports may have changed, for a server on real sockets.
     """
 
     def __init__(
@@ -67,24 +67,24 @@ class AiboEmulator:
         self._frame = self._picture = 0
         self._peer: Callable[[bytes], None] | None = None
         self._timers = {"state": Timer(clock), "camera": Timer(clock)}
-        self._dead_man = Timer(clock)
+        self._walk_timeout = Timer(clock)
 
     def start(self) -> None:
         """Switch the dog on."""
-        self._every(FRAME_S, self._send_state, "state")
-        self._every(CAMERA_S, self._send_picture, "camera")
+        self._repeat(FRAME_S, self._send_state, "state")
+        self._repeat(CAMERA_S, self._send_picture, "camera")
 
     def stop(self) -> None:
-        """Switch the dog off: every link breaks."""
+        """Switch the dog off, which breaks every link."""
         for timer in self._timers.values():
             timer.cancel()
-        self._rest()
+        self._stop_walk()
         self._peer = None
         for client in list(self.clients.values()):
             client.link.close()
 
     def reboot(self) -> None:
-        """Off and on again: the motors are stopped, the servers have to be selected again, the time begins anew."""
+        """Restart: the motors are off, the servers are deselected, and the time starts at 0."""
         self.stop()
         self.menu.reset()
         self.is_engaged = True
@@ -94,19 +94,19 @@ class AiboEmulator:
         self.start()
 
     def press(self) -> None:
-        """Press its back twice: the e-stop turns over."""
+        """Press its back button twice, which toggles the emergency stop."""
         self._set_engaged(not self.is_engaged)
 
     def listens(self, port: int) -> bool:
-        """Whether a link to this port would be taken now."""
+        """Return whether a connection to this port would be accepted now."""
         return self._service(port) is not None
 
     def connector(self, delay: float = 0.0005) -> MemoryPorts:
-        """What opens links to this dog through memory."""
+        """Return a connector to this dog in memory."""
         return MemoryPorts(self._clock, self, delay)
 
     def accept(self, port: int, link: Link) -> Receiver:
-        """Take a link to ``port``; one that does not listen closes it at once."""
+        """Accept a link to ``port``; close it at once if the port does not listen."""
         service = self._service(port)
         client = _Client(self, service or "", Outlet(self._clock, self._rng, self.faults, link), link)
         if service is None:
@@ -119,19 +119,19 @@ class AiboEmulator:
         return client
 
     def datagram(self, data: bytes, answer: Callable[[bytes], None]) -> None:
-        """Take a datagram to the camera's port; ``answer`` sends one back."""
+        """Process a datagram to the camera's port; ``answer`` sends one back."""
         if data == picture.REQUEST and self._is_udp and "camera" in self.menu.running and not self.faults.half_open:
             self._peer = answer
 
-    # -- what the clients say ---------------------------------------------------------------------------------------
+    # -- from the clients -------------------------------------------------------------------------------------------
 
     def on_bytes(self, client: _Client, data: bytes) -> None:
-        """A client wrote."""
+        """Process data of a client."""
         if self.faults.half_open:
             return
         match client.service:
             case "main":
-                self._say(client, self.menu.answers(data))
+                self._send(client, self.menu.answers(data))
             case "estop":
                 for line in client.lines.read(data):
                     self._on_estop(client, line)
@@ -144,7 +144,7 @@ class AiboEmulator:
                         self.head[letter] = max(-1.0, min(value, 1.0))
 
     def on_gone(self, client: _Client) -> None:
-        """A client left: its port listens again; its walk goes on until the dead man's time."""
+        """Handle the loss of a client: its port listens again, and its walk continues until the time-out."""
         if self.clients.get(client.service) is client:
             del self.clients[client.service]
             self.on_ports()
@@ -153,54 +153,54 @@ class AiboEmulator:
         if line in ("start", "stop"):
             self._set_engaged(line == "stop")
         elif line == "refresh":
-            self._say(client, b"on\n" if self.is_engaged else b"off\n")
+            self._send(client, b"on\n" if self.is_engaged else b"off\n")
 
     def _set_engaged(self, is_engaged: bool) -> None:
         if is_engaged == self.is_engaged:
             return
         self.is_engaged = is_engaged
         if is_engaged:
-            self._rest()
+            self._stop_walk()
         client = self.clients.get("estop")
         if client is not None:
-            self._say(client, b"on\n" if is_engaged else b"off\n")
+            self._send(client, b"on\n" if is_engaged else b"off\n")
 
     def _on_walk(self, letter: str, value: float) -> None:
         self.heard = [*self.heard[-99:], (letter, value)]
         if self.is_engaged or letter not in "fsr0":
             return
         if letter != "0":
-            # What is no number cannot be walked; nor is it a reason to fall.
+            # Treat NaN and infinity as 0.
             self._walk[letter] = value if math.isfinite(value) else 0.0
         f, s, r = self._walk.values()
         self._body.drive(f * (FORWARD if f > 0 else BACKWARD), s * ASIDE, r * TURN)
-        self._dead_man.cancel()
+        self._walk_timeout.cancel()
         if any(self._walk.values()):
-            self._dead_man.set(DEAD_MAN_S, self._rest)
+            self._walk_timeout.set(DEAD_MAN_S, self._stop_walk)
 
-    def _rest(self) -> None:
-        self._dead_man.cancel()
+    def _stop_walk(self) -> None:
+        self._walk_timeout.cancel()
         self._walk = dict.fromkeys(self._walk, 0.0)
         self._body.halt()
 
-    # -- what the dog says ------------------------------------------------------------------------------------------
+    # -- to the clients ---------------------------------------------------------------------------------------------
 
     def _send_state(self) -> None:
         self._frame += 4
         client, gains = self.clients.get("state"), self.clients.get("gains")
         if client is not None and not client.link.is_busy:
-            self._say(
+            self._send(
                 client, encoded(sense.state(self._body.sense(), self._joints(), self._dialect, self._ms, self._frame))
             )
         if gains is not None and not gains.link.is_busy:
-            self._say(gains, encoded_gains(self._ms, ((10.0, 4.0, 2.0),) * 18))
+            self._send(gains, encoded_gains(self._ms, ((10.0, 4.0, 2.0),) * 18))
 
     def _send_picture(self) -> None:
         client = self.clients.get("camera")
         if client is None and self._peer is None:
             return
         self._picture += 1
-        data = self._pictured()
+        data = self._encode_picture()
         if self._is_udp:
             if self._peer is not None:
                 for piece in StreamFaults(self.faults.drop, self.faults.garbage, half_open=self.faults.half_open).wire(
@@ -208,9 +208,9 @@ class AiboEmulator:
                 ):
                     self._peer(piece)
         elif client is not None and not client.link.is_busy:
-            self._say(client, data)
+            self._send(client, data)
 
-    def _pictured(self) -> bytes:
+    def _encode_picture(self) -> bytes:
         is_halved = self.menu.settings.get("vision.rawcam.y_skip", "2") != "1"
         width, height = (side // 2 if is_halved else side for side in NATIVE)
         head = picture.header(picture.COLOUR, 1, width, height, self._ms, self._picture)
@@ -224,7 +224,7 @@ class AiboEmulator:
             joints[at] = value * high if value > 0 else -value * low
         return joints
 
-    def _say(self, client: _Client, data: bytes) -> None:
+    def _send(self, client: _Client, data: bytes) -> None:
         if data:
             client.outlet.send(data)
 
@@ -249,24 +249,24 @@ class AiboEmulator:
             if self._peer is not None:
                 self._peer(picture.CLOSING)
             elif client is not None:
-                self._say(client, picture.CLOSING)
+                self._send(client, picture.CLOSING)
             self._peer = None
         if not runs and client is not None:
             client.link.close()
         if not runs and service == "walk":
-            self._rest()
+            self._stop_walk()
         self.on_ports()
 
     def _on_setting(self, key: str, value: str) -> None:
         if key == "vision.rawcam.interval":
             wait_s = float(value) / 1000.0 if value.isdecimal() else 0.0
-            # The dog looks at its camera's own frames only: the first one after the wait is sent.
-            self._every(CAMERA_S * (int(wait_s / CAMERA_S) + 1), self._send_picture, "camera")
+            # The dog sends the first frame of its camera after the wait.
+            self._repeat(CAMERA_S * (int(wait_s / CAMERA_S) + 1), self._send_picture, "camera")
         elif key == "vision.rawcam.transport":
             self.on_ports()
 
-    def _every(self, seconds: float, act: Callable[[], None], name: str) -> None:
-        # Counted from the beginning, so that late turns of the clock do not add up.
+    def _repeat(self, seconds: float, act: Callable[[], None], name: str) -> None:
+        # Times are computed from the start, so delays do not accumulate.
         due = self._clock.seconds() + seconds
 
         def turn() -> None:
@@ -280,8 +280,6 @@ class AiboEmulator:
 
 
 class _Client:
-    """Who holds a port."""
-
     def __init__(self, dog: AiboEmulator, service: str, outlet: Outlet, link: Link) -> None:
         self.service = service
         self.outlet = outlet
@@ -298,7 +296,7 @@ class _Client:
 
 
 class MemoryPorts:
-    """Opens links through memory to whichever port is called; ``is_open`` False turns all away, ``cut`` breaks all."""
+    """Opens links in memory to any port; ``is_open`` False refuses all, ``cut`` breaks links."""
 
     def __init__(self, clock: IReactorTime, dog: AiboEmulator, delay: float) -> None:
         self.is_open = True
@@ -308,30 +306,30 @@ class MemoryPorts:
         self._ports: dict[int, _MemoryPort] = {}
 
     def call(self, host: str, port: int, caller: Any) -> Any:
-        """Keep ``caller`` connected, with back-off, until the line hangs up."""
+        """Keep ``caller`` connected, with back-off, until ``hang_up``."""
         if port not in self._ports:
             self._ports[port] = _MemoryPort(self._clock, self, port, self._delay)
         return self._ports[port].call(host, port, caller)
 
     def cut(self, port: int | None = None) -> None:
-        """Break the links to ``port``, or all, as a lost network does."""
+        """Break the links to ``port``, or all links."""
         for number, one in self._ports.items():
             if port in (None, number):
                 one.cut()
 
     def takes(self, port: int) -> bool:
-        """Whether a call would be answered."""
+        """Return whether a connection would be accepted."""
         return self.is_open and self._dog.listens(port)
 
     def accept(self, port: int, link: Link) -> Receiver:
-        """Hand a link to the dog."""
+        """Pass a link to the dog."""
         return self._dog.accept(port, link)
 
 
 class _MemoryPort(MemoryConnector):
     def __init__(self, clock: IReactorTime, ports: MemoryPorts, port: int, delay: float) -> None:
         super().__init__(clock, lambda link: ports.accept(port, link), delay)
-        self._takes = lambda: ports.takes(port)
+        self._is_accepting = lambda: ports.takes(port)
 
     def opened(self, caller: Receiver) -> Any:
-        return super().opened(caller) if self._takes() else None
+        return super().opened(caller) if self._is_accepting() else None

@@ -1,4 +1,4 @@
-"""AiboMenu: main control of an emulated dog: which servers run, what they are called, and what it says of that."""
+"""Main control of an emulated AIBO: the menu of its servers."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ CLASSES = {
     "head": ("org.tekkotsu.mon.HeadPointGUI", "HeadPointGUI"),
     "camera": ("org.tekkotsu.mon.VisionGUI", "RawVisionGUI"),
 }
-"""What the dog has a client load for each server, and the name of that."""
+"""Java class and name that a client loads for each server."""
 NAMES = {
     "estop": "EStopControllerBehavior",
     "state": "World State Serializer",
@@ -27,7 +27,7 @@ OLD_NAMES = {**NAMES, "estop": "EStop Remote Control"}
 
 
 class AiboMenu:
-    """Answers lines; ``on_server`` is told of each server that starts or stops, ``on_setting`` of each setting."""
+    """Answers commands; calls ``on_server`` when a server starts or stops, and ``on_setting`` for each setting."""
 
     def __init__(
         self,
@@ -49,21 +49,21 @@ class AiboMenu:
         self.reset()
 
     def reset(self) -> None:
-        """The dog was switched on: only the e-stop runs, and on an old dog not even that."""
+        """Restore the state after power-on: only the emergency stop runs, and nothing on an old dog."""
         self.running = set() if self._is_old else {"estop"}
         self.settings.clear()
 
     def client(self) -> None:
-        """Somebody connected."""
+        """Count a new client."""
         self._lines = LineReader()
         self.clients += 1
 
     def answers(self, data: bytes) -> bytes:
-        """What the dog writes upon these bytes."""
-        written = b""
+        """Return the answer to these bytes."""
+        output = b""
         for line in self._lines.read(data):
-            written += b"".join(encoded(message, self._is_old) for message in self._answer(line))
-        return written
+            output += b"".join(encoded(message, self._is_old) for message in self._answer(line))
+        return output
 
     def _answer(self, line: str) -> list[Message]:
         try:
@@ -76,9 +76,9 @@ class AiboMenu:
             case ["!dump_stack"]:
                 return [Stack(("Root Control",))]
             case ["!refresh" | "!reset"]:
-                return [self._menu()]
+                return [self._make_menu()]
             case ["!select", name]:
-                return self._selected(name)
+                return self._select(name)
             case ["!set", *rest]:
                 key, _, value = " ".join(rest).partition("=")
                 self.settings[key] = value
@@ -86,7 +86,7 @@ class AiboMenu:
                 return []
         return [Status(f"unknown command\n{line}")]
 
-    def _selected(self, name: str) -> list[Message]:
+    def _select(self, name: str) -> list[Message]:
         for service, title in self._names.items():
             java, instance = CLASSES[service]
             if name == title and service not in self.running:
@@ -97,16 +97,16 @@ class AiboMenu:
                     transport = self.settings.get("vision.rawcam.transport", "udp").lower()
                     arguments = f'"raw" "{self._ports[service]}" "{transport}"' if service == "camera" else ""
                     loads = [Load(java, instance, self._ports[service], arguments)]
-                return [Word("push"), *loads, Word("pop"), self._menu(), self._menu()]
+                return [Word("push"), *loads, Word("pop"), self._make_menu(), self._make_menu()]
             if name == "#" + title and service in self.running:
                 self.running.discard(service)
                 self._on_server(service, False)
-                return [Close(instance), self._menu()]
+                return [Close(instance), self._make_menu()]
         if name.endswith((".WAV", ".MOT")):
             self.played.append(name)
-        return [self._menu()]
+        return [self._make_menu()]
 
-    def _menu(self) -> Refresh:
+    def _make_menu(self) -> Refresh:
         items = [Item(0, False, EMPTY_SLOT), Item(2, True, "Mode Switch", 'Contains\nthe "major"\nmodes')]
         for service, title in self._names.items():
             shown = ("#" if service in self.running else "") + title

@@ -1,4 +1,4 @@
-"""Bittle: the robot's side of OpenCat, on a cable or behind its web server, over a body that the yard moves."""
+"""The robot's side of OpenCat, on a cable or behind its web server, for a simulated robot."""
 
 from __future__ import annotations
 
@@ -25,25 +25,25 @@ from sim.robots.emulator.wire import CableWire, Table, TcpWire, Wire
 
 VERSIONS = {"biboard": "B10_250712", "nyboard": "N_250224"}
 UNFINISHED_S = 0.01
-"""A command without its end is taken after so long a silence."""
+"""Seconds after which a command without its end is executed."""
 BOOT_S = 1.5
 POSTURE_S, BEHAVIOUR_S = 0.1, 1.0
 NYBOARD_S = 0.04
-"""The web server of a NyBoard returns what was said within so long."""
+"""Seconds of output that the web server of a NyBoard returns."""
 MAX_REQUEST = 4096
 MAX_TASKS = 50
-"""So many tasks are remembered; asking for an older one is an error, as on the board."""
+"""Number of tasks that the board stores; a query for an older one is an error."""
 FAR_DEGREES = 270
-"""No joint is asked to turn farther; the firmware clips what it is told."""
+"""Limit of joint angles; the firmware clips commands."""
 NEVER = frozenset("csa!")
-"""Tokens that change the robot for good, which a driver never sends."""
+"""Tokens that change the robot permanently, which a driver never sends."""
 
 
 class Bittle:
     """One dog; ``accept`` is its serial port, ``accept_http`` its web server.
 
-    ``faults`` spoils what it says; ``resets`` says whether opening the port starts the board anew, as most do.
-    ``heard`` are the commands that it took, in their order.
+    ``faults`` corrupts its output; with ``resets`` opening the port restarts the board, as with most boards.  ``heard``
+    are the received commands in order.
     """
 
     def __init__(
@@ -70,98 +70,98 @@ class Bittle:
         self._gaits = gaits
         self._outlet = Outlet(clock, rng, self.faults)
         self._rest = bytearray()
-        self._unfinished, self._boot, self._busy = Timer(clock), Timer(clock), Timer(clock)
+        self._unfinished_timer, self._boot_timer, self._busy_timer = Timer(clock), Timer(clock), Timer(clock)
         self._queue: deque[tuple[bytes, Callable[[str], None]]] = deque()
 
     def accept(self, link: Link) -> Bittle:
-        """Plug a cable in."""
+        """Connect a cable."""
         self._outlet.link = link
         if self._resets:
             self.reboot()
         return self
 
     def accept_http(self, link: Link) -> BittlePage:
-        """Take a connection to its web server."""
+        """Accept a connection to the web server."""
         return BittlePage(self, link, self._rng)
 
     def received(self, data: bytes) -> None:
-        """Hear what comes over the cable."""
-        if self._boot.is_set:
+        """Process data from the cable."""
+        if self._boot_timer.is_set:
             return
         self._rest += data
-        self._unfinished.cancel()
+        self._unfinished_timer.cancel()
         while self._rest:
             end = END_BYTES if 65 <= self._rest[0] <= 90 else END_TEXT
             at = self._rest.find(end)
             if at < 0:
-                self._unfinished.set(UNFINISHED_S, self._on_unfinished)
+                self._unfinished_timer.set(UNFINISHED_S, self._on_unfinished)
                 return
             command = bytes(self._rest[:at])
             del self._rest[: at + 1]
-            self.execute(command, self._say)
+            self.execute(command, self._send_line)
 
     def link_down(self) -> None:
-        """The cable is out; a gait goes on."""
+        """Disconnect the cable; a gait continues."""
         self._outlet.link = None
 
     def reboot(self) -> None:
-        """Start anew: it lies down at once, is deaf for a while, and greets."""
+        """Restart: lie down at once, ignore data during ``BOOT_S``, and send the banner."""
         self.stop()
         self._rest.clear()
         self._queue.clear()
-        self._boot.set(BOOT_S, self._on_booted)
+        self._boot_timer.set(BOOT_S, self._on_booted)
 
     def stop(self) -> None:
-        """End; nothing is left on the clock."""
+        """Stop, and cancel all timers."""
         self._body.halt()
         self.is_limp = True
-        for timer in (self._unfinished, self._boot, self._busy):
+        for timer in (self._unfinished_timer, self._boot_timer, self._busy_timer):
             timer.cancel()
 
     def execute(self, command: bytes, say: Callable[[str], None]) -> None:
-        """Do a command, after those before it; ``say`` gets each line of the answer."""
-        if self._boot.is_set:
+        """Execute a command after the queued ones; ``say`` gets each line of the answer."""
+        if self._boot_timer.is_set:
             return
         self._queue.append((command, say))
-        if not self._busy.is_set:
-            self._next()
+        if not self._busy_timer.is_set:
+            self._execute_next()
 
     def _on_unfinished(self) -> None:
         command = bytes(self._rest)
         self._rest.clear()
-        self.execute(command, self._say)
+        self.execute(command, self._send_line)
 
     def _on_booted(self) -> None:
         for line in ("k", "* Start *", "Bittle", f"Software version: {VERSIONS[self.board]}"):
-            self._say(line)
+            self._send_line(line)
 
-    def _say(self, line: str) -> None:
+    def _send_line(self, line: str) -> None:
         self._outlet.send(line.encode() + b"\r\n")
 
-    def _next(self) -> None:
-        while self._queue and not self._busy.is_set:
+    def _execute_next(self) -> None:
+        while self._queue and not self._busy_timer.is_set:
             command, say = self._queue.popleft()
             if command:
                 self.heard.append(command)
-                self._do(chr(command[0]), command[1:], say)
+                self._execute_now(chr(command[0]), command[1:], say)
 
-    def _later(self, seconds: float, say: Callable[[str], None], *lines: str) -> None:
+    def _finish_later(self, seconds: float, say: Callable[[str], None], *lines: str) -> None:
         def done() -> None:
             for line in lines:
                 say(line)
-            self._next()
+            self._execute_next()
 
-        self._busy.set(seconds, done)
+        self._busy_timer.set(seconds, done)
 
-    def _do(self, token: str, argument: bytes, say: Callable[[str], None]) -> None:
+    def _execute_now(self, token: str, argument: bytes, say: Callable[[str], None]) -> None:
         answer: list[str] = []
         if token == "k":
-            self._do_skill(argument.decode("latin-1").strip(), say)
+            self._execute_skill(argument.decode("latin-1").strip(), say)
             return
         if token == "d":
             self._body.halt()
             self.is_limp = True
-            self._later(POSTURE_S, say, "g", "d")
+            self._finish_later(POSTURE_S, say, "g", "d")
             return
         if token in "im":
             numbers = [int(one) for one in re.findall(rb"-?\d+", argument)]
@@ -175,9 +175,9 @@ class Bittle:
         elif token == "L" and len(argument) == 16:
             self.joints = [angle - 256 if angle > 127 else angle for angle in argument]
         elif token == "j":
-            answer = self._told_joints()
+            answer = self._format_joints()
         elif (token == "g" and argument == b"p") or (token == "v" and self.board == "nyboard"):
-            answer = [self._told_attitude()]
+            answer = [self._format_attitude()]
         elif token == "P" and self.board == "biboard":
             level = float(self._body.sense().get("power.level", 1.0))
             answer = [f"Voltage: {6.8 + 1.6 * level:.2f} V"]
@@ -189,7 +189,7 @@ class Bittle:
         for line in (*answer, token):
             say(line)
 
-    def _do_skill(self, name: str, say: Callable[[str], None]) -> None:
+    def _execute_skill(self, name: str, say: Callable[[str], None]) -> None:
         velocity = self._gaits.get(name)
         if velocity is not None:
             self.is_limp = False
@@ -199,21 +199,21 @@ class Bittle:
         elif name in POSTURES:
             self.is_limp = False
             self._body.halt()
-            self._later(POSTURE_S, say, name, "k")
+            self._finish_later(POSTURE_S, say, name, "k")
         elif name in BEHAVIOURS:
             self.is_limp = False
             self._body.halt()
-            self._later(BEHAVIOUR_S, say, name, "k")
+            self._finish_later(BEHAVIOUR_S, say, name, "k")
         else:
             say(f"?{name}?")
             say("k")
 
-    def _told_joints(self) -> list[str]:
+    def _format_joints(self) -> list[str]:
         numbers = "\t".join(str(one) for one in range(16))
         angles = "".join(f"{angle},\t" for angle in self.joints)
         return ["=", numbers, angles] if self.board == "biboard" else [f"={numbers}", angles]
 
-    def _told_attitude(self) -> str:
+    def _format_attitude(self) -> str:
         sensed = self._body.sense()
 
         def degrees(key: str) -> float:
@@ -236,7 +236,7 @@ class BittlePage:
         self._data = b""
 
     def received(self, data: bytes) -> None:
-        """Hear a request."""
+        """Process a request."""
         self._data += data
         if b"\r\n\r\n" not in self._data:
             if len(self._data) > MAX_REQUEST:
@@ -244,38 +244,38 @@ class BittlePage:
             return
         words, self._data = self._data.split(b" ", 2), b""
         try:
-            where = urlsplit(words[1].decode("latin-1"))
+            url = urlsplit(words[1].decode("latin-1"))
         except (IndexError, ValueError):
             self._respond("400 Bad Request", "")
             return
-        raw = where.query.partition("=")[2].partition("&")[0]
-        if self._robot.board == "nyboard" and where.path == "/action":
-            self._act(unquote_to_bytes(raw))
-        elif self._robot.board == "biboard" and where.path == "/cmd" and raw:
-            self._begin(unquote_to_bytes(raw))
-        elif self._robot.board == "biboard" and where.path == "/status":
-            self._tell(parse_qs(where.query).get("taskId", [""])[0])
+        raw = url.query.partition("=")[2].partition("&")[0]
+        if self._robot.board == "nyboard" and url.path == "/action":
+            self._run_command(unquote_to_bytes(raw))
+        elif self._robot.board == "biboard" and url.path == "/cmd" and raw:
+            self._start_task(unquote_to_bytes(raw))
+        elif self._robot.board == "biboard" and url.path == "/status":
+            self._respond_status(parse_qs(url.query).get("taskId", [""])[0])
         else:
             self._respond(
-                "400 Bad Request" if where.path == "/cmd" and self._robot.board == "biboard" else "404 Not Found", ""
+                "400 Bad Request" if url.path == "/cmd" and self._robot.board == "biboard" else "404 Not Found", ""
             )
 
     def link_down(self) -> None:
-        """The client has gone."""
+        """Ignore the loss of the connection."""
 
-    def _act(self, command: bytes) -> None:
-        # What comes later waits in the dongle for the next request.
-        said = self._robot.said
-        self._robot.execute(command.removesuffix(END_BYTES), said.append)
-        self._robot.clock.callLater(NYBOARD_S, self._tell_all)
+    def _run_command(self, command: bytes) -> None:
+        # Later output stays in the dongle until the next request.
+        output = self._robot.said
+        self._robot.execute(command.removesuffix(END_BYTES), output.append)
+        self._robot.clock.callLater(NYBOARD_S, self._respond_output)
 
-    def _tell_all(self) -> None:
-        said = self._robot.said
-        text = "\r\n".join([*said, ""])
-        said.clear()
+    def _respond_output(self) -> None:
+        output = self._robot.said
+        text = "\r\n".join([*output, ""])
+        output.clear()
         self._respond("200 OK", text)
 
-    def _begin(self, command: bytes) -> None:
+    def _start_task(self, command: bytes) -> None:
         tasks = self._robot.tasks
         number = str(1000 + self._robot.begun)
         self._robot.begun += 1
@@ -293,7 +293,7 @@ class BittlePage:
         self._robot.execute(command.removesuffix(END_BYTES), say)
         self._respond("200 OK", f"TASK_ID:{number}")
 
-    def _tell(self, number: str) -> None:
+    def _respond_status(self, number: str) -> None:
         lines = self._robot.tasks.get(number)
         if lines is None:
             self._respond("200 OK", "error\nERROR: Task not found")
@@ -311,7 +311,7 @@ class BittlePage:
 
 
 def serve(reactor: Any, body: Body, rng: random.Random, options: Table, dialect: str) -> Wire:
-    """Return the wire of a Bittle: a pseudo-terminal, or HTTP."""
+    """Return the server of a Bittle: a pseudo-terminal, or HTTP."""
     chosen = checked(options)
     board = "biboard" if chosen.board == "auto" else chosen.board
     dog = Bittle(body, reactor, rng, board=board, gaits=dict(chosen.gaits))

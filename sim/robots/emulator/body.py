@@ -1,4 +1,4 @@
-"""Body: what an emulator moves and senses; the yard's dogs are such, and ``MemoryBody`` for tests."""
+"""The interface through which emulators move and sense, for simulated dogs, and ``MemoryBody`` for tests."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from drivers.reading import Value
 
 
 class Body(Protocol):
-    """One body in SI units; x forward, y left, counter-clockwise positive."""
+    """One simulated robot in SI units; x forward, y left, counter-clockwise positive."""
 
     def drive(self, vx: float, vy: float, wz: float) -> None:
-        """Move with this velocity in the body's own frame (m/s, m/s, rad/s) until told otherwise."""
+        """Set the velocity in the robot's frame (m/s, m/s, rad/s), until the next command."""
 
     def halt(self) -> None:
-        """Stand still as fast as it can."""
+        """Stop, braking as hard as it can."""
 
     def sense(self) -> Mapping[str, Value]:
-        """What is known of it now, under the keys of an observation: ``odom.x``, ``range.near``, ``power.level`` ..."""
+        """Return current values under the keys of an observation: ``odom.x``, ``range.near``, ``power.level`` ..."""
 
     def picture(self, is_halved: bool = False) -> bytes | None:
-        """What its camera sees now as a JPEG, with half the width and height if asked for; None without a camera."""
+        """Return the camera picture as a JPEG, optionally at half the width and height; None without a camera."""
 
 
 @dataclass
 class MemoryBody:
-    """A body on an endless floor; ``pass_time`` moves it exactly as it was told."""
+    """A simulated robot on an endless floor; ``pass_time`` moves it exactly as commanded."""
 
     x: float = 0.0
     y: float = 0.0
@@ -38,7 +38,7 @@ class MemoryBody:
     jpeg: bytes | None = None
 
     def drive(self, vx: float, vy: float, wz: float) -> None:
-        """Move with this velocity."""
+        """Set the velocity."""
         self.motion = (vx, vy, wz)
 
     def halt(self) -> None:
@@ -46,18 +46,18 @@ class MemoryBody:
         self.motion = (0.0, 0.0, 0.0)
 
     def sense(self) -> Mapping[str, Value]:
-        """Its place, its speed, and ``values``."""
+        """Return its pose, its velocity, and ``values``."""
         vx, vy, wz = self.motion
         moving = any(self.motion)
-        place: dict[str, Value] = {"odom.x": self.x, "odom.y": self.y, "odom.yaw": self.yaw, "base.moving": moving}
-        return {**place, "base.vx": vx, "base.vy": vy, "base.wz": wz, **self.values}
+        pose: dict[str, Value] = {"odom.x": self.x, "odom.y": self.y, "odom.yaw": self.yaw, "base.moving": moving}
+        return {**pose, "base.vx": vx, "base.vy": vy, "base.wz": wz, **self.values}
 
     def picture(self, is_halved: bool = False) -> bytes | None:
-        """``jpeg``, whatever size is asked for."""
+        """Return ``jpeg``, for any size."""
         return self.jpeg
 
     def pass_time(self, seconds: float) -> None:
-        """Let so much time pass, in one step along a straight line."""
+        """Simulate ``seconds`` in one step along a straight line."""
         vx, vy, wz = self.motion
         cos, sin = math.cos(self.yaw), math.sin(self.yaw)
         self.x += (vx * cos - vy * sin) * seconds

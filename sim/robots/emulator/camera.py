@@ -1,4 +1,4 @@
-"""MjpegCamera: a camera board that serves what a body sees as MJPEG over HTTP, as an ESP32-CAM does."""
+"""An emulated camera board on a simulated robot, which serves MJPEG over HTTP like an ESP32-CAM."""
 
 from __future__ import annotations
 
@@ -16,37 +16,35 @@ from sim.robots.emulator.outlet import Broadcast, Client, Outlet
 from sim.robots.emulator.wire import Table, TcpWire, Wire
 
 MOST_REQUEST = 8192
-"""Bytes of a request."""
+"""Largest request in bytes."""
 
 
 class _Client(Client):
-    """One connection."""
-
     def __init__(self, device: Broadcast[Client], link: Link, outlet: Outlet) -> None:
         super().__init__(device, link, outlet)
         self.is_watching = False
         self._camera: Any = device
-        self._asked: bytes | None = b""
+        self._request: bytes | None = b""
 
     def received(self, data: bytes) -> None:
-        """Hear a request; what comes after the first is ignored."""
-        if self._asked is None:
+        """Process a request; further data is ignored."""
+        if self._request is None:
             return
-        self._asked += data
-        method = codec.method_of(self._asked)
+        self._request += data
+        method = codec.method_of(self._request)
         if method is not None:
-            self._asked = None
+            self._request = None
             self._camera.answer(self, method)
-        elif len(self._asked) > MOST_REQUEST:
+        elif len(self._request) > MOST_REQUEST:
             self.link.close()
 
 
 class MjpegCamera(Broadcast[_Client]):
-    """One camera, on whatever path its clients ask for.
+    """One camera, which serves any path.
 
-    ``faults`` spoils what it says.  ``status`` other than ``200 OK`` turns clients away; without ``has_length`` the
-    boundaries alone tell the pictures apart; ``is_chunked`` is the way of an ESP32-CAM.  Pictures for a client that
-    does not take them are dropped, and those of a body without one left out.
+    ``faults`` corrupts its data.  ``status`` other than ``200 OK`` refuses clients; without ``has_length`` only
+    boundaries separate the pictures; ``is_chunked`` selects chunked encoding, as on an ESP32-CAM.  Pictures are dropped
+    for a client that does not read them, and omitted if the body has none.
     """
 
     make_client = _Client
@@ -69,7 +67,7 @@ class MjpegCamera(Broadcast[_Client]):
             client.outlet.send(codec.answer(self.kind, is_chunked=self.is_chunked))
             client.is_watching = True
 
-    def _tell(self) -> None:
+    def _broadcast(self) -> None:
         watching = [client for client in self.clients if client.is_watching]
         jpeg = self._body.picture() if watching else None
         if jpeg is None:
@@ -84,10 +82,10 @@ class MjpegCamera(Broadcast[_Client]):
 
 
 def serve(reactor: Any, body: Body, rng: random.Random, options: Table, dialect: str) -> Wire:
-    """Return the wire of a camera; raises ``UsageError`` where ``options`` have no url."""
+    """Return the server of a camera; raise ``UsageError`` if ``options`` have no url."""
     chosen = checked(options)
     if not chosen.url:
-        raise UsageError('a camera of the yard needs the option url, as in url = "http://127.0.0.1:8081/"')
+        raise UsageError('an emulated camera needs the option url, as in url = "http://127.0.0.1:8081/"')
     place = place_of(chosen.url)
     camera = MjpegCamera(reactor, body, float(options.get("fps", 15.0)))
     return TcpWire(reactor, camera, camera.accept, place.host, place.port)

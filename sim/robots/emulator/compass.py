@@ -1,4 +1,4 @@
-"""NmeaCompass: a digital compass that tells a body's heading by NMEA 0183, to a cable or to any number of clients."""
+"""An emulated compass that sends a simulated robot's heading as NMEA 0183, to a cable or any number of clients."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from sim.robots.emulator.wire import CableWire, Table, TcpWire, Wire
 
 
 class NmeaCompass(Broadcast[Client]):
-    """One compass, at a cable or on the network.  North is along the yard's y axis.
+    """One compass, on a cable or on the network.  North is along the map's y axis.
 
-    ``kinds`` are the sentences that it sends each time.  Its needle is off by ``deviation``, and the place's magnetic
-    north by ``variation``, degrees to the east; ``HDG`` tells both, ``HDM`` the needle without its deviation.  A body
-    without ``compass.heading`` has an empty field.  ``faults`` spoils what it says.
+    ``kinds`` are the sentences of each report.  The sensor is off by ``deviation``, magnetic north by ``variation``, in
+    degrees to the east; ``HDG`` contains both, ``HDM`` is corrected by the deviation.  For a body without
+    ``compass.heading`` the field is empty.  ``faults`` corrupts the data.
     """
 
     make_client = Client
@@ -31,17 +31,17 @@ class NmeaCompass(Broadcast[Client]):
         self.deviation = 0.0
         self.variation = 0.0
 
-    def _tell(self) -> None:
+    def _broadcast(self) -> None:
         heading = self._body.sense().get("compass.heading")
         true = math.nan if heading is None else 90.0 - math.degrees(float(heading))
-        said = b"".join(self._sentence(kind, true) for kind in self.kinds)
+        sentences = b"".join(self._sentence(kind, true) for kind in self.kinds)
         for client in self.clients:
             if not client.link.is_busy:
-                client.outlet.send(said)
+                client.outlet.send(sentences)
 
     def _sentence(self, kind: str, true: float) -> bytes:
         off = {"HDG": self.variation + self.deviation, "HDM": self.variation}.get(kind, 0.0)
-        # Rounded first: 359.96 is 0.0, and not 360.0.
+        # Round first, so that 359.96 becomes 0.0 and not 360.0.
         degrees = "" if math.isnan(true) else f"{round(true - off, 1) % 360.0:.1f}"
         if kind == "HDG":
             return sentence("HCHDG", degrees, *eastward(self.deviation), *eastward(self.variation))
@@ -49,7 +49,7 @@ class NmeaCompass(Broadcast[Client]):
 
 
 def serve(reactor: Any, body: Body, rng: random.Random, options: Table, dialect: str) -> Wire:
-    """Return the wire of a compass: a pseudo-terminal, or TCP."""
+    """Return the server of a compass: a pseudo-terminal, or TCP."""
     chosen = checked(options)
     compass = NmeaCompass(reactor, body)
     if chosen.device:

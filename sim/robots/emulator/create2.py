@@ -1,4 +1,4 @@
-"""Create2: the robot's side of the Open Interface, over a body that the yard moves."""
+"""The robot's side of the Open Interface, for a simulated robot."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ CAPACITY = 2696
 BOOT_S = 1.0
 BOOT_TEXT = b"bl-start\r\nSTR730\r\nbootloader id: #x47175347 6C7C0BFF\r\nr3_robot/tags/release-3.5.4\r\n"
 LIGHT_REACH = 0.35
-"""Metres within which the light bumpers see a wall."""
+"""Range of the light bumpers in metres."""
 DOCKING_SPEED = 0.1
 OFF, PASSIVE, SAFE, FULL = range(4)
 
 
 class Create2:
-    """One robot; ``accept`` is its serial port.  Without a cable it goes on as it was, as the real one does.
+    """One robot; ``accept`` is its serial port.  Without a cable it keeps its motion, like the real one.
 
-    ``faults`` spoils what it says; ``reboot`` is a power cut; ``left`` and ``right`` are its wheel counters, in counts.
+    ``faults`` corrupts its output; ``reboot`` is a power cut; ``left`` and ``right`` are its wheel encoders, in counts.
     """
 
     def __init__(self, body: Body, clock: IReactorTime, rng: random.Random) -> None:
@@ -44,48 +44,48 @@ class Create2:
         self._outlet = Outlet(clock, rng, self.faults)
         self._reader = codec.CommandReader()
         self._ids: tuple[int, ...] = ()
-        self._streams = False
+        self._is_streaming = False
         self._is_docking = False
         self._songs: set[int] = set()
         self._wheels = (0, 0)
-        self._place = self._pose()
-        self._boot, self._tick = Timer(clock), Timer(clock)
-        self._tick.set(codec.FRAME_S, self._on_tick)
+        self._last_pose = self._read_pose()
+        self._boot_timer, self._tick_timer = Timer(clock), Timer(clock)
+        self._tick_timer.set(codec.FRAME_S, self._on_tick)
 
     def accept(self, link: Link) -> Create2:
-        """Plug a cable in."""
+        """Connect a cable."""
         self._outlet.link = link
         return self
 
     def received(self, data: bytes) -> None:
-        """Hear what comes over the cable."""
-        if not self._boot.is_set:
+        """Process data from the cable."""
+        if not self._boot_timer.is_set:
             for command in self._reader.read(data):
                 self._on_command(command)
 
     def link_down(self) -> None:
-        """The cable is out."""
+        """Disconnect the cable."""
         self._outlet.link = None
 
     def reboot(self) -> None:
-        """Cut its power for a moment: it stands, says its boot text, is off, and has forgotten its stream."""
-        self._rest()
-        self.mode, self._ids, self._streams = OFF, (), False
+        """Interrupt its power: it stops, sends its boot text, is off, and forgets its stream."""
+        self._halt()
+        self.mode, self._ids, self._is_streaming = OFF, (), False
         self.left = self.right = 0.0
         self._reader = codec.CommandReader()
-        self._boot.set(BOOT_S, self._outlet.send, BOOT_TEXT)
+        self._boot_timer.set(BOOT_S, self._outlet.send, BOOT_TEXT)
 
     def stop(self) -> None:
-        """End; nothing is left on the clock."""
-        self._rest()
-        self._tick.cancel()
-        self._boot.cancel()
+        """Stop, and cancel all timers."""
+        self._halt()
+        self._tick_timer.cancel()
+        self._boot_timer.cancel()
 
     def _on_command(self, command: codec.Command) -> None:
         if command.opcode == codec.RESET:
             self.reboot()
         elif command.opcode == codec.START:
-            self._rest()
+            self._halt()
             self.mode = PASSIVE
         elif self.mode != OFF:
             self._on_interface(command)
@@ -93,27 +93,27 @@ class Create2:
     def _on_interface(self, command: codec.Command) -> None:
         match command.opcode:
             case 130 | codec.SAFE:
-                self._rest()
+                self._halt()
                 self.mode = SAFE
-                self._guard(self._body.sense())
+                self._check_safety(self._body.sense())
             case codec.FULL:
-                self._rest()
+                self._halt()
                 self.mode = FULL
             case codec.STOP:
-                self._rest()
-                self.mode, self._streams = OFF, False
+                self._halt()
+                self.mode, self._is_streaming = OFF, False
             case codec.DOCK:
-                self._rest()
+                self._halt()
                 self.mode, self._is_docking = PASSIVE, True
                 self._body.drive(DOCKING_SPEED, 0.0, 0.0)
             case 133 | 134 | codec.CLEAN | 136:
-                self._rest()
+                self._halt()
                 self.mode = PASSIVE
             case codec.STREAM:
                 self._ids = tuple(one for one in command.data[1:] if one in codec.PACKETS)
-                self._streams = bool(self._ids)
+                self._is_streaming = bool(self._ids)
             case codec.PAUSE:
-                self._streams = bool(command.data[0]) and bool(self._ids)
+                self._is_streaming = bool(command.data[0]) and bool(self._ids)
             case codec.SENSORS:
                 self._answer(command.data)
             case codec.QUERY:
@@ -125,27 +125,27 @@ class Create2:
 
     def _on_actuators(self, command: codec.Command) -> None:
         if command.opcode == codec.DIRECT:
-            self._turn(*command.words)
+            self._drive_wheels(*command.words)
         elif command.opcode == codec.DRIVE:
             velocity, radius = command.words
             if radius in (codec.STRAIGHT, 0x7FFF):
-                self._turn(velocity, velocity)
+                self._drive_wheels(velocity, velocity)
             elif radius in (1, -1):
-                self._turn(velocity * radius, -velocity * radius)
+                self._drive_wheels(velocity * radius, -velocity * radius)
             elif radius:
                 bend = WHEEL_BASE / 2.0 / radius
-                self._turn(round(velocity * (1.0 + bend)), round(velocity * (1.0 - bend)))
+                self._drive_wheels(round(velocity * (1.0 + bend)), round(velocity * (1.0 - bend)))
         elif command.opcode == codec.PLAY and command.data[0] in self._songs:
             self.played.append(command.data[0])
 
-    def _turn(self, right: int, left: int) -> None:
+    def _drive_wheels(self, right: int, left: int) -> None:
         top = codec.TOP_SPEED
         right, left = (min(max(wheel, -top), top) for wheel in (right, left))
         self._wheels = (right, left)
         self._body.drive((right + left) / 2000.0, 0.0, (right - left) / WHEEL_BASE)
-        self._guard(self._body.sense())
+        self._check_safety(self._body.sense())
 
-    def _rest(self) -> None:
+    def _halt(self) -> None:
         self._wheels = (0, 0)
         self._is_docking = False
         self._body.halt()
@@ -156,35 +156,35 @@ class Create2:
         self._outlet.send(b"".join(codec.packed(one, packets) for one in known))
 
     def _on_tick(self) -> None:
-        self._tick.set(codec.FRAME_S, self._on_tick)
-        self._roll()
+        self._tick_timer.set(codec.FRAME_S, self._on_tick)
+        self._update_encoders()
         sensed = self._body.sense()
-        self._guard(sensed)
+        self._check_safety(sensed)
         if self._is_docking and sensed.get("power.charging", False):
-            self._rest()
-        if self._streams and not self._boot.is_set:
+            self._halt()
+        if self._is_streaming and not self._boot_timer.is_set:
             self._outlet.send(codec.stream_frame(self._ids, self._packets(sensed)))
 
-    def _guard(self, sensed: Mapping[str, Value]) -> None:
-        """Leave safe mode where a real one does: a ledge ahead, a wheel in the air, a charger."""
+    def _check_safety(self, sensed: Mapping[str, Value]) -> None:
+        """Leave safe mode like the real robot: a cliff ahead, a lifted wheel, a charger."""
         if self.mode != SAFE:
             return
         ahead = sum(self._wheels) > 0
         ledge = any(sensed.get(f"cliff.{name}", False) for name in ("left", "front_left", "front_right", "right"))
         drop = any(sensed.get(f"wheeldrop.{name}", False) for name in ("left", "right"))
         if drop or (ledge and ahead) or sensed.get("power.charging", False):
-            self._rest()
+            self._halt()
             self.mode = PASSIVE
 
-    def _pose(self) -> tuple[float, float, float]:
+    def _read_pose(self) -> tuple[float, float, float]:
         sensed = self._body.sense()
         x, y, yaw = (float(sensed.get(key, 0.0)) for key in ("odom.x", "odom.y", "odom.yaw"))
         return x, y, yaw
 
-    def _roll(self) -> None:
-        """Count what the wheels have turned since the tick before."""
-        (old_x, old_y, old_yaw), self._place = self._place, self._pose()
-        x, y, yaw = self._place
+    def _update_encoders(self) -> None:
+        """Add the movement since the last tick to the encoders."""
+        (old_x, old_y, old_yaw), self._last_pose = self._last_pose, self._read_pose()
+        x, y, yaw = self._last_pose
         turn = math.remainder(yaw - old_yaw, math.tau)
         middle = old_yaw + turn / 2.0
         ahead = 1000.0 * ((x - old_x) * math.cos(middle) + (y - old_y) * math.sin(middle))
@@ -225,5 +225,5 @@ class Create2:
 
 
 def serve(reactor: Any, body: Body, rng: random.Random, options: Table, dialect: str) -> Wire:
-    """Return the wire of a Create 2, a pseudo-terminal."""
+    """Return the server of a Create 2, a pseudo-terminal."""
     return CableWire(reactor, Create2(body, reactor, rng), checked(options).port)

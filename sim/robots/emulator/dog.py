@@ -1,4 +1,4 @@
-"""DogBody: a dog of the yard as the body that an emulator moves and senses with."""
+"""A simulated dog behind the interface that emulators use."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from sim.robots.sensor import Sensors
 from sim.robots.world import World
 
 BESIDE = math.radians(10.0)
-"""What touches no farther than this beyond the middle presses both halves of a bumper."""
+"""Angle in radians: contacts within it on either side of the centre press both halves of a bumper."""
 
 
 class DogBody:
-    """``dog`` of ``world``, with its senses and its eye; without a gate, as a robot is that knows no tokens."""
+    """``dog`` of ``world``, with its sensors and its camera; without a gate, like a robot that does not know tokens."""
 
     def __init__(self, world: World, dog: Dog, senses: Sensors, camera: Camera) -> None:
         self._world = world
@@ -25,9 +25,9 @@ class DogBody:
         self._camera = camera
 
     def drive(self, vx: float, vy: float, wz: float) -> None:
-        """Move with this velocity in its own frame until told otherwise, as fast as the kind of robot can.
+        """Set the velocity in the dog's frame, until the next command, within the limits of the robot's kind.
 
-        Where one of them is no number, it stands.
+        The dog stands still if a value is not finite.
         """
         if not all(map(math.isfinite, (vx, vy, wz))):
             self.halt()
@@ -35,15 +35,15 @@ class DogBody:
         self._dog.drive(Motion(vx, vy, wz))
 
     def halt(self) -> None:
-        """Stand still as fast as it can."""
+        """Stop, braking as hard as it can."""
         self._world.halt(self._dog.name)
 
     def sense(self) -> Mapping[str, Value]:
-        """What the yard knows of it, and ``bump.left``, ``bump.right`` for what touches its front."""
+        """Return the sensor values, with ``bump.left`` and ``bump.right`` for contacts at the front."""
         touches = [angle for angle in self._dog.touches if abs(angle) < math.pi / 2]
         left, right = any(angle > -BESIDE for angle in touches), any(angle < BESIDE for angle in touches)
         return {**self._senses.values(), "bump.left": left, "bump.right": right}
 
     def picture(self, is_halved: bool = False) -> bytes | None:
-        """What it sees now as a JPEG, 208x160 or half of that each way."""
+        """Return the camera picture as a JPEG, 208x160 pixels, or 104x80 if ``is_halved``."""
         return self._camera.jpeg(self._dog, is_halved)

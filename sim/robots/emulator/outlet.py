@@ -1,4 +1,4 @@
-"""Outlet: where an emulator's bytes leave, with the faults that its switches say; and what says them to any number."""
+"""Output of emulators with fault injection, and a base class for devices that send to several clients."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sim.robots.emulator.body import Body
 
 
 class Outlet:
-    """One link to a driver, or none; what is sent without one is lost."""
+    """One link to a driver, or none; without a link data is lost."""
 
     def __init__(self, clock: IReactorTime, rng: random.Random, faults: StreamFaults, link: Link | None = None) -> None:
         self.link = link
@@ -23,20 +23,20 @@ class Outlet:
         self._faults = faults
 
     def send(self, data: bytes) -> None:
-        """Send ``data``, or what is left of it."""
+        """Send ``data``, subject to the injected faults."""
         for piece in self._faults.wire(data, self._rng):
             if self._faults.delay > 0.0:
-                self._clock.callLater(self._faults.delay, self._leave, piece)
+                self._clock.callLater(self._faults.delay, self._send_now, piece)
             else:
-                self._leave(piece)
+                self._send_now(piece)
 
-    def _leave(self, data: bytes) -> None:
+    def _send_now(self, data: bytes) -> None:
         if self.link is not None:
             self.link.send(data)
 
 
 class Client:
-    """A client of ``device``; what it says is not heard."""
+    """A client of ``device``; its data is ignored."""
 
     def __init__(self, device: Broadcast[Client], link: Link, outlet: Outlet) -> None:
         self.link = link
@@ -44,10 +44,10 @@ class Client:
         self._device = device
 
     def received(self, data: bytes) -> None:
-        """Hear nothing."""
+        """Ignore the data."""
 
     def link_down(self) -> None:
-        """The client has gone."""
+        """Remove the client from the device."""
         self.outlet.link = None
         if self in self._device.clients:
             self._device.clients.remove(self)
@@ -57,9 +57,9 @@ AnyClient = TypeVar("AnyClient", bound=Client)
 
 
 class Broadcast(Generic[AnyClient]):
-    """A device that says something ``rate`` times a second (``_tell``) to ``clients``; ``faults`` spoils what it says.
+    """A device that sends data ``rate`` times per second (``_broadcast``) to ``clients``; ``faults`` corrupts it.
 
-    ``accept`` takes a client, any number.
+    ``accept`` adds a client.
     """
 
     make_client: type[AnyClient]
@@ -75,29 +75,29 @@ class Broadcast(Generic[AnyClient]):
         self._timer = Timer(clock)
 
     def accept(self, link: Link) -> AnyClient:
-        """Take a client."""
+        """Add a client."""
         client = self.make_client(self, link, Outlet(self._clock, self._rng, self.faults, link))  # type: ignore[arg-type]
         self.clients.append(client)
         return client
 
     def start(self) -> None:
-        """Switch it on; does nothing while it is on."""
+        """Start to send; does nothing if already started."""
         if not self._timer.is_set:
             self._due = self._clock.seconds() + self._interval
-            self._timer.set(self._interval, self._beat)
+            self._timer.set(self._interval, self._on_time)
 
     def stop(self) -> None:
-        """Switch it off: every link breaks, and nothing is left on the clock."""
+        """Stop: close every link and cancel the timer."""
         self._timer.cancel()
         for client in list(self.clients):
             client.link.close()
 
-    def _tell(self) -> None:
+    def _broadcast(self) -> None:
         raise NotImplementedError
 
-    def _beat(self) -> None:
-        # Counted from the beginning, so that late turns of the clock do not add up.
+    def _on_time(self) -> None:
+        # Times are computed from the start, so delays do not accumulate.
         now = self._clock.seconds()
         self._due = max(self._due + self._interval, now)
-        self._timer.set(self._due - now, self._beat)
-        self._tell()
+        self._timer.set(self._due - now, self._on_time)
+        self._broadcast()

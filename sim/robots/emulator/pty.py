@@ -1,4 +1,4 @@
-"""Pty: an emulator's serial port as a pseudo-terminal, which any program opens like a robot's own."""
+"""An emulator's serial port as a pseudo-terminal, which programs open like a real port."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from twisted.python.failure import Failure
 from drivers.link import Accept, Receiver
 
 BACKLOG = 512
-"""Bytes that wait to be taken; about as many as a real adapter keeps."""
+"""Number of unread bytes above which the port is busy; about the buffer of a real adapter."""
 TERMINALS = "/dev/pts/"
-"""Where a link leads that was left behind by a port which could not remove it."""
+"""Target of links left behind by a port that could not remove them."""
 
 
 class PtyPort(abstract.FileDescriptor):
-    """A port at ``path``; what ``accept`` returns hears what is written to the path, until ``unplug``.
+    """A port at ``path``; the receiver that ``accept`` returns gets the data written to it, until ``close``.
 
-    ``link`` names the path: a symbolic link that is made, and removed again.  One that was left behind is replaced;
-    anything else there, as a real device, stays: then ``FileExistsError`` is raised.
+    ``link`` is the path of a symbolic link, which is created and later removed.  A link left behind by another port is
+    replaced; any other file there, such as a real device, raises ``FileExistsError``.
     """
 
     def __init__(self, reactor: Any, accept: Accept, link: str = "") -> None:
@@ -30,7 +30,7 @@ class PtyPort(abstract.FileDescriptor):
         self._master, slave = pty.openpty()
         tty.setraw(self._master)
         self.path = os.ttyname(slave)
-        # Held open, so that a program which closes the port can open it again, as with a real cable.
+        # Keep the slave open, so that a program can close and reopen the port, as with a real cable.
         self._slave = slave
         self._device = self.path
         self._link = link
@@ -50,16 +50,16 @@ class PtyPort(abstract.FileDescriptor):
 
     @property
     def is_busy(self) -> bool:
-        """Whether nobody takes what the robot says."""
+        """Whether too much output is unread."""
         return len(self.dataBuffer) + self._tempDataLen > BACKLOG
 
     def send(self, data: bytes) -> None:
-        """Say something; lost where nobody takes what was said before, as on a cable."""
+        """Send data; it is lost while the port is busy, as on a cable."""
         if self.connected and not self.is_busy:
             self.write(data)
 
     def close(self) -> None:
-        """Pull the cable: who has the port open loses it."""
+        """Unplug the cable: programs lose the open port."""
         if self.connected:
             self.stopReading()
             self.stopWriting()
@@ -79,14 +79,14 @@ class PtyPort(abstract.FileDescriptor):
         self.connected = 0
         os.close(self._master)
         os.close(self._slave)
-        if self._link and _target(self._link) == self._device:
+        if self._link and _read_link(self._link) == self._device:
             os.unlink(self._link)
         receiver, self._receiver = self._receiver, None
         if receiver is not None:
             receiver.link_down()
 
     def _make_link(self) -> None:
-        if _target(self._link).startswith(TERMINALS):
+        if _read_link(self._link).startswith(TERMINALS):
             os.unlink(self._link)
         os.symlink(self._device, self._link)
 
@@ -95,8 +95,8 @@ class PtyPort(abstract.FileDescriptor):
             self._receiver.received(data)
 
 
-def _target(link: str) -> str:
-    """Where a symbolic link leads; empty where there is none."""
+def _read_link(link: str) -> str:
+    """Return the target of a symbolic link; empty if there is none."""
     try:
         return os.readlink(link)
     except OSError:

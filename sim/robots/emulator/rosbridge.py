@@ -1,4 +1,4 @@
-"""A ROS robot's side of the wire: a rosbridge server with a base, a scanner, a battery and a camera behind it."""
+"""The server side of rosbridge, with a base, a scanner, a battery and a camera."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from sim.robots.emulator.outlet import Outlet
 from sim.robots.emulator.wire import Table, TcpWire, Wire
 
 BASE_STOPS_S = 0.5
-"""A base that hears no velocity for so long stands still, as those of most robots do."""
+"""Seconds without a velocity after which the base stops, like most robots' bases."""
 TICK_S = 0.02
 TYPE_SERVICE = "/rosapi/topic_type"
 BEAMS = 24
 RANGE_MIN, RANGE_MAX = 0.05, 3.5
 ASIDE = {"left": math.pi / 2, "right": -math.pi / 2, "back": math.pi}
-"""Where a body's ranger of that name looks; the others look ahead."""
+"""Directions of a simulated robot's rangers by name; others point ahead."""
 DOWN = "chest"
-"""A body's ranger that looks at the floor: what it sees stands in nobody's way."""
+"""A ranger that points at the floor and is not part of the scan."""
 TOPICS: Mapping[str, tuple[str, float]] = {
     "/odom": ("nav_msgs/Odometry", 25.0),
     "/scan": ("sensor_msgs/LaserScan", 5.0),
@@ -39,15 +39,15 @@ TOPICS: Mapping[str, tuple[str, float]] = {
     "/battery_state": ("sensor_msgs/BatteryState", 1.0),
     "/camera/image_raw/compressed": ("sensor_msgs/CompressedImage", 12.5),
 }
-"""What the robot publishes: its type, and how often a second."""
+"""Published topics: type and rate in Hz."""
 
 
 class RosbridgeRobot:
-    """One robot; ``accept`` is what a listening port or a ``MemoryConnector`` calls.
+    """One robot; ``accept`` is called by a listening port or a ``MemoryConnector``.
 
-    ``velocity_type`` is what its base listens to on ``/cmd_vel``; any other is silently ignored, as ROS does.
-    ``has_rosapi`` says whether somebody may ask for that, ``rosapi_s`` how long that takes; ``ignored`` counts what
-    the base did not understand.
+    ``velocity_type`` is the type of ``/cmd_vel``; messages of another type are silently ignored, as in ROS.
+    ``has_rosapi`` enables the query of that type, which takes ``rosapi_s`` seconds; ``ignored`` counts ignored
+    messages.
     """
 
     def __init__(
@@ -70,25 +70,25 @@ class RosbridgeRobot:
         self._clients: list[_Client] = []
         self._ticks = 0
         self._booted_at = clock.seconds()
-        self._pending, self._stop = Timer(clock), Timer(clock)
+        self._pending, self._stop_timer = Timer(clock), Timer(clock)
 
     def start(self) -> None:
-        """Begin to publish."""
+        """Start to publish."""
         self._pending.set(TICK_S, self._on_tick)
 
     def stop(self) -> None:
-        """End for good."""
-        self._hang_up()
+        """Close all connections and stop."""
+        self._close_clients()
         self._pending.cancel()
 
     def reboot(self) -> None:
-        """Lose all connections, the motion, and the clock, which begins again at 0."""
-        self._hang_up()
+        """Close all connections, stop the motion, and restart the clock at 0."""
+        self._close_clients()
         self._booted_at = self._clock.seconds()
         self._ticks = 0
 
     def accept(self, link: Link) -> Receiver:
-        """Take a client; a rosbridge serves many."""
+        """Accept a client; several are possible."""
         client = _Client(self, Outlet(self._clock, self._rng, self.faults, link))
         self._clients.append(client)
         return client
@@ -96,12 +96,12 @@ class RosbridgeRobot:
     # -- for its clients --------------------------------------------------------------------------------------------
 
     def call(self, client: _Client, name: str, arguments: Any, number: object) -> None:
-        """Answer a call, as late as this service does."""
+        """Answer a service call after the service's delay."""
 
         def answer() -> None:
             is_done, values = self.service(name, arguments)
-            said = {"op": "service_response", "service": name, "values": values, "result": is_done}
-            client.say(said if number is None else {**said, "id": number})
+            response = {"op": "service_response", "service": name, "values": values, "result": is_done}
+            client.say(response if number is None else {**response, "id": number})
 
         if name == TYPE_SERVICE and self.rosapi_s > 0:
             self._clock.callLater(self.rosapi_s, answer)
@@ -109,12 +109,12 @@ class RosbridgeRobot:
             answer()
 
     def forget(self, client: _Client) -> None:
-        """A client has gone; the base learns nothing of that."""
+        """Remove a client; the base is not notified."""
         if client in self._clients:
             self._clients.remove(client)
 
     def command(self, topic: str, kind: str, message: Mapping[str, Any]) -> None:
-        """Somebody has published a message of this type."""
+        """Process a message of type ``kind`` from a client."""
         if topic != "/cmd_vel" or kind.replace("/msg/", "/") != self.velocity_type.replace("/msg/", "/"):
             self.ignored += 1
             return
@@ -125,16 +125,16 @@ class RosbridgeRobot:
         except (KeyError, TypeError, ValueError, AttributeError):
             self.ignored += 1
             return
-        self._stop.cancel()
+        self._stop_timer.cancel()
         if not self.has_motor_power or not all(map(math.isfinite, (vx, vy, wz))):
             self._body.halt()
             return
         self._body.drive(vx, vy, wz)
         if vx or vy or wz:
-            self._stop.set(BASE_STOPS_S, self._on_no_command)
+            self._stop_timer.set(BASE_STOPS_S, self._on_no_command)
 
     def service(self, name: str, arguments: Any) -> tuple[bool, Any]:
-        """Whether a service answers, and what."""
+        """Run a service; return whether it succeeded, and its values."""
         if name == TYPE_SERVICE and self.has_rosapi:
             topic = str(arguments.get("topic")) if isinstance(arguments, dict) else ""
             if topic == "/cmd_vel":
@@ -149,8 +149,8 @@ class RosbridgeRobot:
             return True, {"success": True, "message": "docked"}
         return False, f"Service {name} does not exist"
 
-    def _hang_up(self) -> None:
-        self._stop.cancel()
+    def _close_clients(self) -> None:
+        self._stop_timer.cancel()
         self._body.halt()
         for client in list(self._clients):
             client.close()
@@ -164,34 +164,34 @@ class RosbridgeRobot:
         for topic, (_, rate) in TOPICS.items():
             every = round(1 / rate / TICK_S)
             if self._ticks % every == 0 or (self._ticks == 1 and rate <= 1):
-                wanting = [client for client in self._clients if client.wants(topic, self._clock.seconds())]
-                if wanting and (message := self._message(topic)) is not None:
-                    for client in wanting:
+                subscribers = [client for client in self._clients if client.wants(topic, self._clock.seconds())]
+                if subscribers and (message := self._message(topic)) is not None:
+                    for client in subscribers:
                         client.say({"op": "publish", "topic": topic, "msg": message})
 
     def _message(self, topic: str) -> dict[str, Any] | None:
-        seen = self._body.sense()
+        sensed = self._body.sense()
         nanos = round((self._clock.seconds() - self._booted_at) * 1e9)
         header = {"stamp": {"sec": nanos // 10**9, "nanosec": nanos % 10**9}, "frame_id": topic[1:5]}
         match topic:
             case "/odom":
-                return {"header": header, "child_frame_id": "base_footprint", **_odometry(seen)}
+                return {"header": header, "child_frame_id": "base_footprint", **_odometry(sensed)}
             case "/scan":
-                return {"header": header, **_scan(seen)}
+                return {"header": header, **_scan(sensed)}
             case "/imu":
-                pull = {axis: _real(seen.get(f"imu.a{axis}"), 9.8 if axis == "z" else 0.0) for axis in "xyz"}
-                turn = {"x": 0.0, "y": 0.0, "z": _real(seen.get("base.wz"))}
-                attitude = _quaternion(_real(seen.get("odom.yaw")))
+                acceleration = {axis: _real(sensed.get(f"imu.a{axis}"), 9.8 if axis == "z" else 0.0) for axis in "xyz"}
+                turn = {"x": 0.0, "y": 0.0, "z": _real(sensed.get("base.wz"))}
+                attitude = _quaternion(_real(sensed.get("odom.yaw")))
                 return {"header": header, "orientation": attitude, "orientation_covariance": [0.0] * 9} | {
                     "angular_velocity": turn,
-                    "linear_acceleration": pull,
+                    "linear_acceleration": acceleration,
                 }
             case "/battery_state":
-                level = _real(seen.get("power.level"), 1.0)
-                volts = _real(seen.get("power.volts"), 11.0 + 1.6 * level)
-                # The current is not measured: NaN, which goes over this wire as null.
+                level = _real(sensed.get("power.level"), 1.0)
+                volts = _real(sensed.get("power.volts"), 11.0 + 1.6 * level)
+                # The current is not measured: NaN, which rosbridge sends as null.
                 return {"header": header, "voltage": volts, "current": None, "percentage": level} | {
-                    "power_supply_status": 1 if seen.get("power.charging") else 2,
+                    "power_supply_status": 1 if sensed.get("power.charging") else 2,
                     "present": True,
                 }
         jpeg = self._body.picture()
@@ -201,8 +201,6 @@ class RosbridgeRobot:
 
 
 class _Client:
-    """One connection."""
-
     def __init__(self, robot: RosbridgeRobot, outlet: Outlet) -> None:
         self.outlet = outlet
         self._robot = robot
@@ -211,7 +209,6 @@ class _Client:
         self._types: dict[str, str] = {}
 
     def wants(self, topic: str, now: float) -> bool:
-        """Whether a message on ``topic`` is due for it."""
         due = False
         for sid, (period, next_at) in self._topics.get(topic, {}).items():
             if now >= next_at - 1e-6:
@@ -220,11 +217,9 @@ class _Client:
         return due
 
     def say(self, message: Mapping[str, Any]) -> None:
-        """Send one message."""
         self.outlet.send(self._socket.text(json.dumps(message).encode()))
 
     def received(self, data: bytes) -> None:
-        """Take bytes from the client."""
         if self._robot.faults.half_open:
             return
         messages, reply = self._socket.received(data)
@@ -237,35 +232,33 @@ class _Client:
             self.close()
 
     def close(self) -> None:
-        """Hang up."""
         if self.outlet.link is not None:
             self.outlet.link.close()
 
     def link_down(self) -> None:
-        """Learn that the client is gone."""
         self.outlet.link = None
         self._robot.forget(self)
 
     def _answers(self, payload: bytes) -> Iterator[dict[str, Any]]:
         try:
-            said = json.loads(payload)
-            op = said["op"]
+            operation = json.loads(payload)
+            op = operation["op"]
         except (ValueError, KeyError, TypeError, RecursionError):
             yield {"op": "status", "level": "error", "msg": f"Unable to deserialize message: {payload[:60]!r}"}
             return
-        self._robot.heard.append(said)
+        self._robot.heard.append(operation)
         del self._robot.heard[:-1000]
-        topic, sid = str(said.get("topic", "")), str(said.get("id", ""))
+        topic, sid = str(operation.get("topic", "")), str(operation.get("id", ""))
         match op:
             case "advertise":
-                self._types[topic] = str(said.get("type", ""))
+                self._types[topic] = str(operation.get("type", ""))
             case "unadvertise":
                 self._types.pop(topic, None)
             case "publish":
-                message = said.get("msg")
+                message = operation.get("msg")
                 self._robot.command(topic, self._types.get(topic, ""), message if isinstance(message, dict) else {})
             case "subscribe":
-                period = _real(said.get("throttle_rate")) / 1000
+                period = _real(operation.get("throttle_rate")) / 1000
                 self._topics.setdefault(topic, {})[sid] = (period, 0.0)
             case "unsubscribe":
                 if sid:
@@ -273,18 +266,18 @@ class _Client:
                 else:
                     self._topics.pop(topic, None)
             case "call_service":
-                self._robot.call(self, str(said.get("service", "")), said.get("args"), said.get("id"))
+                self._robot.call(self, str(operation.get("service", "")), operation.get("args"), operation.get("id"))
             case "set_level" | "status" | "auth":
                 pass
             case _:
                 yield {"op": "status", "level": "error", "msg": f"Unknown operation: {str(op)[:40]}.  Ignoring it."}
 
 
-def _odometry(seen: Mapping[str, Value]) -> dict[str, Any]:
-    place = {"x": _real(seen.get("odom.x")), "y": _real(seen.get("odom.y")), "z": 0.0}
-    linear = {"x": _real(seen.get("base.vx")), "y": _real(seen.get("base.vy")), "z": 0.0}
-    turn = {"x": 0.0, "y": 0.0, "z": _real(seen.get("base.wz"))}
-    pose = {"position": place, "orientation": _quaternion(_real(seen.get("odom.yaw")))}
+def _odometry(sensed: Mapping[str, Value]) -> dict[str, Any]:
+    place = {"x": _real(sensed.get("odom.x")), "y": _real(sensed.get("odom.y")), "z": 0.0}
+    linear = {"x": _real(sensed.get("base.vx")), "y": _real(sensed.get("base.vy")), "z": 0.0}
+    turn = {"x": 0.0, "y": 0.0, "z": _real(sensed.get("base.wz"))}
+    pose = {"position": place, "orientation": _quaternion(_real(sensed.get("odom.yaw")))}
     unknown = [0.0] * 36
     return {
         "pose": {"pose": pose, "covariance": unknown},
@@ -292,10 +285,10 @@ def _odometry(seen: Mapping[str, Value]) -> dict[str, Any]:
     }
 
 
-def _scan(seen: Mapping[str, Value]) -> dict[str, Any]:
+def _scan(sensed: Mapping[str, Value]) -> dict[str, Any]:
     beams = [math.inf] * BEAMS
     step = math.tau / BEAMS
-    for key, value in seen.items():
+    for key, value in sensed.items():
         name = key.removeprefix("range.")
         if name in (key, DOWN) or math.isnan(far := _real(value, math.nan)):
             continue
@@ -323,7 +316,7 @@ def _real(value: object, default: float = 0.0) -> float:
 
 
 def serve(reactor: Any, body: Body, rng: random.Random, options: Table, dialect: str) -> Wire:
-    """Return the wire of a rosbridge server."""
+    """Return the server of a rosbridge."""
     chosen = checked(options)
     robot = RosbridgeRobot(reactor, body, rng)
     return TcpWire(reactor, robot, robot.accept, chosen.host, chosen.port)

@@ -1,4 +1,4 @@
-"""Wires of emulators: a TCP port, or a pseudo-terminal in the place of a serial cable."""
+"""Transports of emulators: a TCP port, or a pseudo-terminal in place of a serial cable."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ Table = Mapping[str, Any]
 
 
 class Wire(Protocol):
-    """One thing that a driver calls: a robot, or a part of one."""
+    """The server of one robot or part, to which a driver connects."""
 
     faults: StreamFaults
 
     def start(self) -> None:
-        """Serve it; raises ``CannotListenError`` or ``OSError`` where its address is taken."""
+        """Start to serve; raise ``CannotListenError`` or ``OSError`` if the address is in use."""
 
     def stop(self) -> Deferred[None]:
-        """Serve it no more; fires when the address is free."""
+        """Stop; fires when the address is free."""
 
 
 class Serve(Protocol):
     """The function ``serve`` of an emulator's module."""
 
     def __call__(self, reactor: Any, body: Body, rng: random.Random, options: Table, dialect: str) -> Wire:
-        """Return the wire of a robot that moves ``body``, at the address that its driver's ``options`` name.
+        """Return the server of a robot that moves ``body``, at the address in its driver's ``options``.
 
-        Raises ``UsageError`` where the options name none.
+        Raises ``UsageError`` if the options contain no address.
         """
 
 
 class TcpWire:
-    """An emulator behind one TCP port; it is switched on and off with it."""
+    """An emulator behind one TCP port; both start and stop together."""
 
     def __init__(self, reactor: Any, emulator: Any, accept: Accept, host: str, port: int) -> None:
         self.faults = emulator.faults
@@ -50,19 +50,19 @@ class TcpWire:
         self._port: Any = None
 
     def start(self) -> None:
-        """Listen, and switch the emulator on."""
+        """Listen, and start the emulator."""
         host, port = self._address
         self._port = self._reactor.listenTCP(port, TcpLinkFactory(self._accept), interface=host)
-        _switch_on(self._emulator)
+        _start_emulator(self._emulator)
 
     def stop(self) -> Deferred[None]:
-        """Switch the emulator off; fires when the port is free."""
+        """Stop the emulator; fires when the port is free."""
         self._emulator.stop()
         return succeed(None) if self._port is None else maybeDeferred(self._port.stopListening)
 
 
 class CableWire:
-    """An emulator at the end of a cable: a pseudo-terminal whose path is the link ``path``."""
+    """An emulator on a cable: a pseudo-terminal at the symbolic link ``path``."""
 
     def __init__(self, reactor: Any, emulator: Any, path: str) -> None:
         self.faults = emulator.faults
@@ -72,18 +72,18 @@ class CableWire:
         self._port: PtyPort | None = None
 
     def start(self) -> None:
-        """Open the pseudo-terminal, and switch the emulator on."""
+        """Open the pseudo-terminal, and start the emulator."""
         self._port = PtyPort(self._reactor, self._emulator.accept, self._path)
-        _switch_on(self._emulator)
+        _start_emulator(self._emulator)
 
     def stop(self) -> Deferred[None]:
-        """Switch the emulator off and remove the pseudo-terminal."""
+        """Stop the emulator and remove the pseudo-terminal."""
         self._emulator.stop()
         if self._port is not None:
             self._port.close()
         return succeed(None)
 
 
-def _switch_on(emulator: Any) -> None:
-    """Start what tells something by itself; other emulators live from the beginning."""
+def _start_emulator(emulator: Any) -> None:
+    """Start an emulator that has a method ``start``; others run from their creation."""
     getattr(emulator, "start", lambda: None)()

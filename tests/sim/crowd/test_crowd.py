@@ -100,7 +100,7 @@ class GroundTests(SynchronousTestCase):
     def test_too_small_is_refused_with_the_remedy(self) -> None:
         """A yard too small says how many have room, and which size would do; that size does."""
         error = self.assertRaises(SceneError, Ground, 1000, 5.0, 5.0)
-        self.assertIn("there is room for 361; take so many, or 8.4 x 8.4 m", str(error))
+        self.assertIn("there is room for 361; use at most 361 robots, or 8.4 x 8.4 m", str(error))
         self.assertEqual(Ground(361, 5.0, 5.0).bodies, 361)
         self.assertEqual(Ground(1000, 8.4, 8.4).bodies, 1000)
 

@@ -159,7 +159,7 @@ class WitnessTests(SynchronousTestCase):
             (error.TCPTimedOutError(), "is it switched on"),
             (error.TimeoutError(), "is it switched on"),
             (error.NoRouteError(), "is this machine in its network"),
-            (error.DNSLookupError("dog1"), "write the address in figures"),
+            (error.DNSLookupError("dog1"), "write a numeric address"),
             (OSError("out of\nsorts"), "out of sorts"),
         ):
             line.clientConnectionFailed(told["connector"], Failure(problem))  # type: ignore[attr-defined]
