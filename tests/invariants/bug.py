@@ -259,7 +259,7 @@ _BUGS: dict[tuple[str, ...], dict[str, list[tuple[Any, str, Any]]]] = {
             (Handover, "is_sure", lambda self: True),
         ],
         "absent members do not count": [(Overlay, "voters", lambda self, key, targets: _voters(targets))],
-        "nothing instead of unavailable": [(Reader, "_nothing", lambda self, answers, voters: [])],
+        "nothing instead of unavailable": [(Reader, "_confirm_empty", lambda self, answers, voters: [])],
         "signature not checked": [(Replica, "is_lawful", lambda self, record, peer: True)],
         "sure before it has caught up": [(Handover, "is_sure", lambda self: True)],
         "a read from the own store counts as sure": [(Reader, "newest", _read_here)],
