@@ -91,7 +91,7 @@ _GENUINE = {
     for place, name in [
         (Greeter, "on_who"),
         (Session, "open"),
-        (Seat, "_claimed"),
+        (Seat, "_prepare"),
         (Seat, "_load"),
         (Log, "keep"),
         (Acceptor, "release"),
@@ -110,7 +110,7 @@ def _won_by_one(tally: Tally) -> Any:
 
 
 def _claimed_for_ever(self: Seat, place: Any, ballot: Any, lease: float, now: float) -> Any:
-    return _GENUINE[Seat, "_claimed"](self, place, ballot, lease + 1e6, now)
+    return _GENUINE[Seat, "_prepare"](self, place, ballot, lease + 1e6, now)
 
 
 def _let_go_as_if_at_rest(self: Lessee, ballot: Any, heirs: Any = ()) -> Any:
@@ -270,7 +270,7 @@ _BUGS: dict[tuple[str, ...], dict[str, list[tuple[Any, str, Any]]]] = {
     ("tuples",): {
         "one promise is a majority": [(takes, "conclude", _won_by_one)],
         "votes forgotten by a restart": [(Seat, "_load", _load_without_votes)],
-        "the lease of the dead never ends": [(Seat, "_claimed", _claimed_for_ever)],
+        "the lease of the dead never ends": [(Seat, "_prepare", _claimed_for_ever)],
         "a take is not noted": [(Keeper, "note", _nothing), (Keeper, "doubt", _idle)],
         "slots are used too early": [(Keeper, "_slot", _only_slot)],
         "who waits is not woken": [(Shelf, "_changed", _told_what_is_known)],
