@@ -84,7 +84,7 @@ class CommandTests(SynchronousTestCase):
         self.assertEqual((code, json.loads(output)), (0, [RECORD]))
         for line, answer, shown in (
             ("dht find a", [{"id": "00ff", "host": "h", "port": 7}], "00ff  h:7\n"),
-            ("dht put a b", {"replicas": 3}, "3 replicas have it\n"),
+            ("dht put a b", {"replicas": 3}, "stored at 3 replicas\n"),
             ("tuple get _", ["job", 7], '"job" 7\n'),
             ("tuple read _ --all", [["a"], [1]], '"a"\n1\n'),
             ("tuple put a", None, ""),
