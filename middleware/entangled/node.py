@@ -90,7 +90,7 @@ class EntangledNode:
         self.replica = Replica(store, self.endpoint, self.overlay, clock, chores)
         self._owner = Owner(identity, lease, store, self.replica, self.overlay, self.endpoint, clock, chores)
         self._membership = membership = Membership(self.overlay, self.endpoint, clock, rng, chores)
-        membership.sounding.needs_use = self.reach.alternate_paths.needs_use
+        membership.sounding.needs_use = self.reach.ways.needs_use
         self._detour = membership.detour
         self.discovery = (
             None if lan is None else Discovery(lan, self.endpoint, self.overlay, membership, clock, rng, chores)
@@ -367,7 +367,7 @@ class EntangledNode:
         self._subscriber.forget(contact.node_id)
         self._handover.lost(contact)
         self._membership.lost(contact)
-        self.reach.alternate_paths.lost(contact)
+        self.reach.ways.lost(contact)
 
     def _handle_rejection(self, contact: Contact, code: str) -> None:
         """Count a member that rejects this node as absent."""

@@ -129,7 +129,7 @@ class CommandTests(SynchronousTestCase):
         self.assertEqual((code, json.loads(output)["error"]), (1, "Unavailable"))
         self.assertEqual(self.run_command("dht get a", {"error": "BadRequest", "text": "x"})[0], 2)
         self.assertEqual(self.run_command("dht get a --node b")[0], 2)
-        self.assertIn("there are a", self.said)
+        self.assertIn("run: a", self.said)
         self.assertEqual(self.run_command("tuple get ?number")[0], 2)
         self.assertEqual(self.run_command("dht get a", {"event": []})[0], 1)
 

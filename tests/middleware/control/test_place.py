@@ -30,8 +30,8 @@ class PlaceTests(SynchronousTestCase):
         made("a").touch()
         self.assertEqual(found(None), found("a"))
         made("b").touch()
-        self.assertIn("--node NAME, one of a, b", self.problem(None))
-        self.assertIn("there are a, b", self.problem("c"))
+        self.assertIn("--node NAME: a, b", self.problem(None))
+        self.assertIn("run: a, b", self.problem("c"))
         self.assertEqual(found("b").name, "b.control")
 
     def test_folder_is_the_owners_alone(self) -> None:
