@@ -263,7 +263,7 @@ _BUGS: dict[tuple[str, ...], dict[str, list[tuple[Any, str, Any]]]] = {
         "signature not checked": [(Replica, "is_lawful", lambda self, record, peer: True)],
         "sure before it has caught up": [(Handover, "is_sure", lambda self: True)],
         "a read from the own store counts as sure": [(Reader, "newest", _read_here)],
-        "numbers start again after a restart": [(owner, "BLOCK", -(2**40))],
+        "numbers start again after a restart": [(owner, "SEQUENCE_BLOCK", -(2**40))],
         "the absent are not sought": [(Roster, "absent", lambda self: [])],
         "any answer counts": [(reader, "_votes", _any_answer)],
     },
