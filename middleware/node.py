@@ -272,7 +272,7 @@ class SwarmNode(Service):
         self._on_message = receive
 
     def on_disconnect(self, leave: Callable[[float], None]) -> None:
-        """Call ``leave(seconds)`` when an operator takes this device off the network for that time."""
+        """Call ``leave(seconds)`` when an operator disconnects this device from the network for so many seconds."""
         self._on_disconnect = leave
 
     # -- tasks ------------------------------------------------------------------------------------------------------
@@ -299,7 +299,7 @@ class SwarmNode(Service):
     def group(
         self, task: Task, heard: Heard, ordered: Changed = lambda records: None, panel: Panel | None = None
     ) -> Group:
-        """Take part in a task as one of its participants; bid for it if it has a council.
+        """Take part in a task, and bid for it if it has a council.
 
         In a large team only the reporters (``panel``) of a task with a council write records, except for tasks that
         are divided among devices, which need the records of all participants.

@@ -116,13 +116,13 @@ def charter_of(packed: object) -> Charter | None:
 def is_change_signed(
     member: Contact, task_id: str, configuration: int, ballot: Ballot, members: tuple[Contact, ...], reply: Reply
 ) -> bool:
-    """Return whether ``reply`` has the signature of ``member`` for that change (``sign_change``)."""
+    """Return whether ``reply`` has a valid signature of the change by ``member`` (``sign_change``)."""
     statement = _change_statement(task_id, configuration, ballot, members, reply.token)
     return verified(member.public, statement, reply.proof)
 
 
 def is_end_signed(member: Contact, task_id: str, configuration: int, agent: str, token: int, proof: bytes) -> bool:
-    """Return whether ``proof`` is the signature of ``member`` for that end (``sign_end``)."""
+    """Return whether ``proof`` is a valid signature of the end by ``member`` (``sign_end``)."""
     return verified(member.public, _end_statement(task_id, configuration, agent, token), proof)
 
 

@@ -90,7 +90,7 @@ class Council:
         return Ballot(self._rounds * LIFE + self._life, self.agent)
 
     def leap(self) -> None:
-        """Raise the next ballot above those of other proposers that may be unknown here."""
+        """Raise the next ballot above unknown ballots of other proposers."""
         self._rounds += LEAP
 
     def round(
@@ -104,7 +104,7 @@ class Council:
     ) -> Round:
         """Start a round with all members, or with ``others``; pass its outcome to ``hear``.
 
-        A member whose lease of another agent ends within ``short`` seconds is asked again then.
+        If another agent's lease at a member ends within ``short`` seconds, the round repeats the request then.
         """
         members = others or self.members
         request = (self.task_id, *arguments) if others else (self.task_id, self.configuration, *arguments)

@@ -1,4 +1,4 @@
-"""The lease client of one agent for one task: it claims, renews and releases the lease, or waits for it as a standby.
+"""The lease client of one agent for one task: it claims, renews and releases the lease, or stands by.
 
 A claim has two phases: a majority promises and reports the highest token, then a majority grants.  A renewal needs the
 second phase only.  The deadline counts from the time at which the granted request was *sent*, less a margin for clock
@@ -378,7 +378,7 @@ class Lessee:
         if self.lease is None:
             self._handle(Event.REJECTED, asked)
         else:
-            # A member that has promised a higher ballot needs a new one; there is time for it before the deadline.
+            # A member that has promised a higher ballot needs a new one, and the time until the deadline is enough.
             is_outbid = any(reply.kind is Kind.OUTBID for reply in asked.tally.replies.values())
             self._handle(Event.OUTBID if is_outbid else Event.KEPT)
 

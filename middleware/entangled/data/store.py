@@ -40,7 +40,7 @@ FIXED_BYTES = 17
 """Bytes of a record's sequence (8), ttl (8) and lifetime (1)."""
 
 MAX_SEARCHED = 1000
-"""Tombstones searched for those of one owner, the oldest first."""
+"""Tombstones searched, oldest first, for ones of a given owner."""
 
 Origin = Literal["new", "kept", "replaced"]
 """Origin of a store: newly created, read from its file, or created because the file was corrupt."""

@@ -181,7 +181,7 @@ class Acceptor(Generic[Key]):
     ) -> Reply:
         """Accept ``value`` permanently.
 
-        With ``gives_back`` a holder releases its own lease, with its device at rest; the lease is kept for it so far.
+        With ``gives_back`` a holder whose device is at rest allows the acceptance during its own lease.
         ``token`` is the highest token that the proposer knows.
         """
         register, reply = self._decide(key, _Request(Event.ACCEPT, ballot, now, configuration, token, 0.0, gives_back))

@@ -85,7 +85,7 @@ class Round:
     """Fires ``outcome`` with itself as soon as each of its ``tallies`` is decided.
 
     ``ask`` sends the request to the member of a place.  If another proposer's lease at a member ends within ``short``
-    seconds, it is asked again then, or sooner if that is long.  ``outcome`` also fires, undecided, when all
+    seconds, the request is repeated then, or sooner if that is long.  ``outcome`` also fires, undecided, when all
     members have answered, after ``patience`` seconds, and shortly after a majority has answered.  A silent member is
     asked every ``PAUSE`` seconds until the round is decided, and at least ``TRIES`` times.  With ``single`` it is
     asked once, the transport retransmits, and a failure counts as its answer.

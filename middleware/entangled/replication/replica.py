@@ -139,7 +139,7 @@ class Replica:
         return record.ttl if expiry is None else expiry - self._clock.seconds()
 
     def review(self) -> bool:
-        """Check the records of owners whose authority has changed; return whether there are any such owners.
+        """Check the records of owners with a changed authority; return whether there are any such owners.
 
         Watchers are notified that a record is gone if its owner may no longer write it.  The record is removed if that
         is final; if the reason is the clock or a missing certificate, it is hidden until it is allowed or expires.
@@ -299,7 +299,7 @@ class Replica:
         return [reply.encode() for reply in replies]
 
     def _apply_authority(self, owner: bytes, authority: Authority, before: Authority | None) -> None:
-        """Hide or remove the records that ``owner`` may not write, and show again those that it may."""
+        """Hide or remove the records that ``owner`` may not write, and show the others again."""
         hidden = []
         for record in self._store.owned(owner):
             if not self.may_stay(record.slot):

@@ -49,7 +49,7 @@ class Standing:
         return is_first
 
     def is_enough(self, reached: list[int | None], away: int) -> bool:
-        """Return whether every record held by a majority is held by one of the nodes in ``reached``.
+        """Return whether the nodes in ``reached`` together have every record that a majority has.
 
         ``reached`` lists the sync states of the nodes asked (None: failed); ``away`` more are absent.  A novice has no
         records to give and counts in no majority.  If a synced node answered, only synced nodes count, because an

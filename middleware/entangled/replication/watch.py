@@ -1,8 +1,8 @@
 """The view of one watched key, merged from its replicas.
 
 ``View`` merges the reports of several replicas; it is pure.  A slot is present while any valid report contains it; of
-several records of one slot the one that beats the others wins.  A node's report of its own leased record counts only
-for that node itself, because it would otherwise outlive the node.
+several records of one slot the one that beats the others wins.  Reports about the reporting node's own leased records
+are ignored, except by that node, because they would outlive it.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ class Watch:
             self._changed(list(records))
 
     def forget(self, replica: bytes) -> None:
-        """Discard the report of ``replica`` and ignore its pushes until it is asked again."""
+        """Discard the report of ``replica`` and ignore its pushes until the next request to it."""
         self.asked.discard(replica)
         self.pushed.pop(replica, None)
         self.view.forget(replica)

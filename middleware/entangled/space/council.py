@@ -39,7 +39,7 @@ class Council:
         self._chores = chores
 
     async def claim(self, posted: Sequence[Posted], ballot: Ballot, lease: float) -> list[Outcome]:
-        """Run one round of claims for tuples of one key and council; release those that were not won."""
+        """Run one round of claims for tuples of one key and council; release the others afterwards."""
         outcomes = await self.renew(posted, ballot, lease)
         lost = [p for p, o in zip(posted, outcomes, strict=True) if o.result not in (Result.WON, Result.DECIDED)]
         if lost:

@@ -1,7 +1,7 @@
 """The tuples of one space and arity, kept up to date while calls wait for them.
 
-Pushes of a watch wake the waiting calls.  In addition the node polls the replicas, so that the loss of those that push
-delays a call by less than a second.
+Pushes of a watch wake the waiting calls.  In addition the node polls the replicas, so that the loss of
+the pushing replicas delays a call by less than a second.
 """
 
 from __future__ import annotations
