@@ -198,8 +198,8 @@ class SwarmNode(Service):
         for _ in range(MAX_PLACE_CHECKS):
             await self._chores.sleep(PLACE_CHECK_INTERVAL_S)
             others = await self._find_others()
-            mine = self.presence.device.joined
-            same = [d for d in others if d.joined == mine and d.uuid != self.uuid]
+            own_place = self.presence.device.joined
+            same = [d for d in others if d.joined == own_place and d.uuid != self.uuid]
             ahead = sum(d.uuid < self.uuid for d in same)
             if ahead:
                 self.presence.change(joined=_next_place(others) + ahead - 1)

@@ -104,7 +104,7 @@ def unpacked(fields: object) -> Record | None:
     if not isinstance(fields, list) or len(fields) != 8:
         return None
     key, name, owner, sequence, lifetime, ttl, value, signature = fields
-    lawful = (
+    is_valid = (
         isinstance(key, bytes)
         and len(key) == KEY_BYTES
         and isinstance(name, str)
@@ -120,7 +120,7 @@ def unpacked(fields: object) -> Record | None:
         and isinstance(signature, bytes)
         and len(signature) == 64
     )
-    return Record(key, name, owner, sequence, lifetime, ttl, value, signature) if lawful else None
+    return Record(key, name, owner, sequence, lifetime, ttl, value, signature) if is_valid else None
 
 
 def slot_unpacked(fields: object) -> Slot | None:

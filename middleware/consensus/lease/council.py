@@ -118,10 +118,10 @@ class Council:
 
         if not others:
             self._update_silence()
-        asked = Round([Tally(len(members), kinds)], ask, decode, self._clock, self.ttl / 3, short)
+        round_ = Round([Tally(len(members), kinds)], ask, decode, self._clock, self.ttl / 3, short)
         if not others:
-            self._last_round = asked, members
-        return asked
+            self._last_round = round_, members
+        return round_
 
     def visit(self) -> None:
         """Ping the members, to update ``silent``."""
@@ -198,11 +198,11 @@ class Council:
     def _update_silence(self) -> None:
         """Update the times of silence from the answers to the last round."""
         if self._last_round is not None:
-            asked, members = self._last_round
-            for place in asked.answered:
+            round_, members = self._last_round
+            for place in round_.answered:
                 self._silent_since.pop(members[place].node_id, None)
-            for place in asked.silent:
-                self._silent_since.setdefault(members[place].node_id, asked.began_at)
+            for place in round_.silent:
+                self._silent_since.setdefault(members[place].node_id, round_.began_at)
 
     async def _close(self, token: int) -> None:
         closed_at = 0.0
@@ -255,8 +255,8 @@ class Council:
     async def _change(self, wanted: tuple[Contact, ...], keep: bool) -> None:
         before = self.configuration
         ballot = self.next_ballot()
-        asked = self.round("lease.prepare", ballot.counter, self.ttl, kinds=(Kind.GRANTED, Kind.SEALED))
-        prepared = await asked.outcome
+        round_ = self.round("lease.prepare", ballot.counter, self.ttl, kinds=(Kind.GRANTED, Kind.SEALED))
+        prepared = await round_.outcome
         prepared.close()
         self.hear(prepared)
         if self.configuration != before:

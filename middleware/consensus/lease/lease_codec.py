@@ -80,8 +80,8 @@ def _unpack(noted: bytes) -> tuple[dict[str, Register], bool]:
     if not isinstance(rows, dict):
         return {}, False
     read = {task_id: unpack_row(row) for task_id, row in rows.items()}
-    good = {task_id: each for task_id, each in read.items() if each is not None and isinstance(task_id, str)}
-    return good, len(good) == len(rows)
+    valid = {task_id: each for task_id, each in read.items() if each is not None and isinstance(task_id, str)}
+    return valid, len(valid) == len(rows)
 
 
 def _pack_floor(floor: Floor) -> bytes:

@@ -105,9 +105,9 @@ def _tuple(verb: Callable[[str, str], argparse.ArgumentParser]) -> None:
     read.add_argument("--all", action="store_true", help="print all matching tuples")
 
 
-def request_of(wishes: argparse.Namespace) -> dict[str, Any]:
+def request_of(options: argparse.Namespace) -> dict[str, Any]:
     """Return the request of a command line; raise ``word.BadWord``, also for an unreadable file."""
-    given = {name: value for name, value in vars(wishes).items() if name not in ("verb", "node", "json")}
+    given = {name: value for name, value in vars(options).items() if name not in ("verb", "node", "json")}
     if "node_asked" in given:
         given["node"] = given.pop("node_asked")
     if isinstance(given.get("words"), list):
@@ -117,7 +117,7 @@ def request_of(wishes: argparse.Namespace) -> dict[str, Any]:
             given[name] = [read(each) for each in given[name]]
     if "value" in given:
         given["value"] = _value(given["value"])
-    return {"verb": wishes.verb, "with": {name: value for name, value in given.items() if value is not None}}
+    return {"verb": options.verb, "with": {name: value for name, value in given.items() if value is not None}}
 
 
 def asked(path: Path, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
@@ -152,20 +152,20 @@ def check_peer(connection: socket.socket, path: Path) -> None:
 def main(group: str, words: Sequence[str], out: TextIO | None = None, ask: Ask = asked) -> int:
     """Run one command; return 0, 1 (nothing found, or the node refused), or 2 (wrong command)."""
     out = out or sys.stdout
-    wishes = parser(group).parse_args(words)
+    options = parser(group).parse_args(words)
     try:
-        request = request_of(wishes)
-        path = found(wishes.node)
+        request = request_of(options)
+        path = found(options.node)
         for line in ask(path, request):
             if "error" in line:
-                if wishes.json:
+                if options.json:
                     out.write(word.written(line) + "\n")
                 return _fail(group, line["text"], WRONG if line["error"] == "BadRequest" else FAILED)
             answer = line["answer"] if "answer" in line else line.get("event")
-            out.write("".join(f"{text}\n" for text in _texts(wishes.verb, answer, wishes.json)))
+            out.write("".join(f"{text}\n" for text in _texts(options.verb, answer, options.json)))
             out.flush()
             if "answer" in line:
-                return FAILED if _is_nothing(wishes.verb, answer) else 0
+                return FAILED if _is_nothing(options.verb, answer) else 0
     except KeyboardInterrupt:
         return 0
     except (NoControl, word.BadWord, OSError) as problem:

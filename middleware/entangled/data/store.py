@@ -186,7 +186,7 @@ class Store:
         """Remove records that expired by ``now``; return those removed for room, then the expired, earliest first."""
         self._now = max(self._now, now)
         removed, self._removed_for_room = self._removed_for_room, []
-        gone: list[tuple[float, Slot, Record]] = []
+        expired: list[tuple[float, Slot, Record]] = []
         while self._heap and self._heap[0][0] <= now:
             queued_at, slot = heapq.heappop(self._heap)
             held = self._slots.get(slot)
@@ -195,10 +195,10 @@ class Store:
             if held.expires_at > now:
                 self._queue(held)
             else:
-                gone.append((held.expires_at, slot, self._remove(slot)))
+                expired.append((held.expires_at, slot, self._remove(slot)))
         # The heap yields a record with an extended lease at its old time.
-        gone.sort(key=lambda ended: ended[:2])
-        return removed + [record for _, _, record in gone]
+        expired.sort(key=lambda ended: ended[:2])
+        return removed + [record for _, _, record in expired]
 
     def due(self) -> float:
         """Return the next time at which ``expire`` may remove a record; infinite if the store is empty."""

@@ -53,8 +53,8 @@ class Certificates:
             answer = await self._endpoint.ask(contact, "certificates", owners)
         except EntangledError:
             answer = None
-        shown = answer if isinstance(answer, list) and len(answer) == len(owners) else [None] * len(owners)
-        for owner, certificate in zip(owners, shown, strict=True):
+        certificates = answer if isinstance(answer, list) and len(answer) == len(owners) else [None] * len(owners)
+        for owner, certificate in zip(owners, certificates, strict=True):
             if not (isinstance(certificate, bytes) and certificate and self.door.learn(owner, certificate)):
                 self._unasked.pop(contact.node_id, None)
                 self._unasked[contact.node_id] = self._clock.seconds() + UNASKED_S

@@ -162,13 +162,13 @@ class Handover:
             digests, extra, lives, standing = (
                 answer if isinstance(answer, list) and len(answer) == 4 else ([], 0, [], 0)
             )
-            mine, for_peer = self._overlap.both(contact)
+            own, for_peer = self._overlap.both(contact)
             if not (_is_list_of(digests, bytes) and _is_list_of(lives, int)):
                 raise Refused(f"{contact.address} gives no digests")
             for group, (digest, life) in enumerate(zip(digests, lives, strict=True)):
-                is_longer = life > self._overlap.life(mine[group], bit) + LIFETIME_SUM_SLACK_S
-                if is_longer or digest != digest_of(mine[group]):
-                    await self._compare(contact, group, mine[group])
+                is_longer = life > self._overlap.life(own[group], bit) + LIFETIME_SUM_SLACK_S
+                if is_longer or digest != digest_of(own[group]):
+                    await self._compare(contact, group, own[group])
             if extra:
                 await self._compare(contact, -1, [])
             await self._send_lacking(contact, for_peer)
@@ -178,7 +178,7 @@ class Handover:
         finally:
             self._busy.discard(contact.node_id)
 
-    async def _compare(self, contact: Contact, group: int, mine: list[Record]) -> None:
+    async def _compare(self, contact: Contact, group: int, own: list[Record]) -> None:
         theirs: dict[Slot, Mark] = {}
         after: Slot | None = None
         while True:
@@ -194,7 +194,7 @@ class Handover:
             after = places[-1][0]
         wanted = [slot for slot, mark in theirs.items() if mark > mark_of(self._replica.shown(slot))]
         await self._fetch(contact, wanted)
-        newer = [record for record in mine if mark_of(record) > theirs.get(record.slot, (-1, b""))]
+        newer = [record for record in own if mark_of(record) > theirs.get(record.slot, (-1, b""))]
         await self._send_all(contact, newer)
 
     def _extend_life(self, slot: Slot, mark: Mark, left: float) -> None:

@@ -69,20 +69,22 @@ class Pusher:
         self._watchers[key] = watchers
         return watcher.number
 
-    def push(self, key: bytes, records: Iterable[Record], gone: Iterable[Record]) -> None:
-        """Notify the watchers of ``key`` that this node now holds ``records``, and no longer those in ``gone``."""
+    def push(self, key: bytes, records: Iterable[Record], removed: Iterable[Record]) -> None:
+        """Notify the watchers of ``key`` that this node now holds ``records``, and no longer those in ``removed``."""
         watchers = self._watchers.get(key)
         if not watchers:
             return
         if len(watchers) <= FEW and key not in self._gathered:
-            self._push(key, [record.packed() for record in records], [[record.owner, record.name] for record in gone])
+            self._push(
+                key, [record.packed() for record in records], [[record.owner, record.name] for record in removed]
+            )
             return
         if key not in self._gathered:
             self._chores.later(GATHERED, self._push_gathered, key)
         # Only the last change of each slot is pushed.
         changes = self._gathered.setdefault(key, {})
         changes.update((record.slot, (record, True)) for record in records)
-        changes.update((record.slot, (record, False)) for record in gone)
+        changes.update((record.slot, (record, False)) for record in removed)
 
     def _push_gathered(self, key: bytes) -> None:
         packed: list[object] = []

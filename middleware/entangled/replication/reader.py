@@ -194,10 +194,10 @@ class Reader:
             width -= 1
         waiting = self._overlay.quickest(c for c in targets if c.node_id != own_id)
         done: Deferred[None] = Deferred()
-        under_way = 0
+        pending = 0
 
         def settle() -> None:
-            if not done.called and (is_enough(answers) or not (waiting or under_way)):
+            if not done.called and (is_enough(answers) or not (waiting or pending)):
                 done.callback(None)
 
         def ask_next() -> None:
@@ -210,8 +210,8 @@ class Reader:
             ask_next()
 
         async def ask(contact: Contact) -> None:
-            nonlocal under_way
-            under_way += 1
+            nonlocal pending
+            pending += 1
             in_time = self._chores.later(self._overlay.hedge(), hedge, contact)
             more = 1
             try:
@@ -221,10 +221,10 @@ class Reader:
             except EntangledError:
                 pass
             in_time()
-            under_way -= 1
+            pending -= 1
             settle()
             # A fast read asks one replica first; if that has nothing, a majority, in two or three waves.
-            for _ in range(more if under_way else max(more, 1)):
+            for _ in range(more if pending else max(more, 1)):
                 ask_next()
 
         settle()

@@ -93,8 +93,8 @@ class Replica:
 
     def held(self, key: bytes) -> list[Record]:
         """Return the records held under ``key`` as a replica, tombstones included."""
-        kept = self.keepsakes.under(key)
-        return [r for r in self._store.get(key, tombstones=True) if r.slot not in kept and self.may_stay(r.slot)]
+        copies = self.keepsakes.under(key)
+        return [r for r in self._store.get(key, tombstones=True) if r.slot not in copies and self.may_stay(r.slot)]
 
     def shown(self, slot: Slot) -> Record | None:
         """Return the record held in ``slot`` as a replica, if peers may see it."""
@@ -102,9 +102,9 @@ class Replica:
 
     def team_records(self) -> list[Record]:
         """Return the team records held as a replica that peers may see, tombstones included."""
-        kept = self.keepsakes
+        copies = self.keepsakes
         return [
-            r for r in self._store.records() if r.lifetime == "team" and r.slot not in kept and self.may_stay(r.slot)
+            r for r in self._store.records() if r.lifetime == "team" and r.slot not in copies and self.may_stay(r.slot)
         ]
 
     def holds(self, record: Record) -> bool:

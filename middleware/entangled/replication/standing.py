@@ -58,12 +58,12 @@ class Standing:
         majority.
         """
         missing = reached.count(None) + away
-        heard = reached.count(SURE) or reached.count(ELDER)
+        answered = reached.count(SURE) or reached.count(ELDER)
         if self._has_lost:
-            return missing + 1 < _majority(heard + missing + 1)
+            return missing + 1 < _majority(answered + missing + 1)
         if self._is_elder:
-            return missing < _majority(heard + missing + (0 if SURE in reached else 1))
-        return not missing or (heard > missing and missing < _majority(heard + missing))
+            return missing < _majority(answered + missing + (0 if SURE in reached else 1))
+        return not missing or (answered > missing and missing < _majority(answered + missing))
 
 
 def _majority(members: int) -> int:

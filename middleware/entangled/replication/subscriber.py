@@ -191,12 +191,12 @@ class Subscriber:
             watch.view.replace(contact.node_id, records)
             self._settle(watch)
 
-    def _answer_push(self, peer: Contact, key: bytes, number: int, packed: list[object], gone: list[object]) -> None:
+    def _answer_push(self, peer: Contact, key: bytes, number: int, packed: list[object], removed: list[object]) -> None:
         self._overlay.heard(peer)
         received = [record for record in map(unpacked, packed) if record is not None]
         is_lacking = bool(self._replica.certificates.lacking(peer, (record.owner for record in received)))
         records = [record for record in received if self._reader.is_credible(record, key, peer)]
-        slots = [slot for place in gone if (slot := _slot_of(key, place)) is not None]
+        slots = [slot for place in removed if (slot := _slot_of(key, place)) is not None]
         for watch in [w for w in self._watches if w.key == key and peer.node_id in w.asked]:
             last = watch.pushed.get(peer.node_id, 0)
             watch.pushed[peer.node_id] = max(last, number)

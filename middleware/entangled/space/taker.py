@@ -150,10 +150,10 @@ class Taker:
             agreed = {member.contact.node_id for member in members}
             left, silent = [contact for contact in near if contact.node_id not in agreed], 0
             while left and len(members) < self._size:
-                asked, left = left[: self._size - len(members)], left[self._size - len(members) :]
-                answers = await first(len(asked), [self._enrol(contact) for contact in asked])
+                requested, left = left[: self._size - len(members)], left[self._size - len(members) :]
+                answers = await first(len(requested), [self._enrol(contact) for contact in requested])
                 members += [member for member in answers if member is not None]
-                silent += len(asked) - len(answers)
+                silent += len(requested) - len(answers)
             if members and (len(members) == self._size or not silent):
                 self._members[key] = (self._clock.seconds() + ENROLLED_S, members)
                 return members
@@ -192,7 +192,7 @@ class Taker:
         ready = [p for p in fitting if not is_patient or self._not_before.get(p.place, 0.0) <= now]
         ready.sort(key=lambda p: (self._not_before.get(p.place, 0.0), zlib.crc32(p.place.mark, self._seed), p.place))
         times = [self._not_before[p.place] for p in fitting if p.place in self._not_before]
-        return ready, min((max(0.001, moment - now) for moment in times), default=None)
+        return ready, min((max(0.001, time - now) for time in times), default=None)
 
     def batch(self, posted: Sequence[Posted], most: int) -> list[Posted]:
         """Return the first of ``posted`` and others with the same council, as many as fit into one request."""
