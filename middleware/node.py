@@ -192,8 +192,8 @@ class SwarmNode(Service):
     async def _resolve_place(self) -> None:
         """Resolve equal places of devices that joined at the same time.
 
-        Each device moves behind all devices with its place and a lower uuid, in one step: a crowd is in order after
-        one exchange of presences, not after one per device.
+        Each device moves behind all devices with its place and a lower uuid, in one step, so that many devices are
+        in order after one exchange of presences, not after one per device.
         """
         for _ in range(MAX_PLACE_CHECKS):
             await self._chores.sleep(PLACE_CHECK_INTERVAL_S)

@@ -233,7 +233,7 @@ class Lessee:
     def _handle(self, event: Event, round_: Round | None = None, delay: float = 0.0) -> None:
         """Go to the next state and perform the actions.
 
-        :param asked: the round whose result the event is
+        :param round_: the round whose result the event is
         :param delay: seconds, for an event that sets the timer
         """
         self.state, actions = next_step(self.state, event)
@@ -459,7 +459,7 @@ class Lessee:
     # -- giving back ------------------------------------------------------------------------------------------------
 
     def _lose(self) -> None:
-        """Forget a lease that was not given back, and notify the listener."""
+        """Forget a lease that was not released, and notify the listener."""
         self._held = _Held()
         self._changed()
 

@@ -1,6 +1,6 @@
 """Tables of the SQLite file, checksums of rows, and migration from older schemas.
 
-Each row carries a CRC-32 of its fields: flash errors inside a page do not damage the structure that SQLite checks.
+Each row carries a CRC-32 of its fields, because SQLite's structural checks miss bit errors of the flash inside values.
 """
 
 from __future__ import annotations

@@ -123,7 +123,7 @@ class Log(Generic[Key]):
         self._note(self.codec.bucket_of(key))
 
     def clear(self) -> None:
-        """Remove all registers, when other members no longer rely on this acceptor."""
+        """Remove all registers and the floor, once no proposer relies on this acceptor's votes."""
         self.registers.clear()
         self._buckets.clear()
         self.floor, self.is_whole = Floor(), True

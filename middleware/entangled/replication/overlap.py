@@ -146,7 +146,7 @@ class Overlap:
     # -- inside -----------------------------------------------------------------------------------------------------
 
     def _snapshot(self, peer: Contact) -> list[list[Record]]:
-        """Return ``both`` as sorted lists, the peer's own last; keep them as the snapshot for its further requests."""
+        """Return ``both`` as sorted lists, records for the peer only last; keep them as its snapshot."""
         groups, extra = self.both(peer)
         lists = [sorted(records, key=lambda record: record.slot) for records in (*groups, extra)]
         now = self._clock.seconds()

@@ -183,7 +183,7 @@ class Reader:
     ) -> dict[bytes, Answer]:
         """Collect the answers of ``targets``: ask ``width`` at once, and two more for each that is slow or fails.
 
-        Two, because failures are correlated: with half of the team gone, the next one is as likely to be silent.
+        Two, because failures are correlated: with half of the team gone, every second replica is silent.
         """
         answers: dict[bytes, Answer] = {}
         own_id = self._overlay.own_id

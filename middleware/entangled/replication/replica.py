@@ -201,7 +201,7 @@ class Replica:
         return [page, following, UNSURE if is_aside else self._worth(), near]
 
     def answer_cache(self, peer: Contact, key: bytes, packed: list[object], ttl: float) -> None:
-        """CACHE: cache records found by a lookup, for later lookups on that path (Kademlia, section 2.3)."""
+        """CACHE: keep a copy of records that a lookup found, for later lookups on its path (Kademlia, section 2.3)."""
         records = [record for record in map(unpacked, packed) if record is not None]
         if len(records) < len(packed) or any(record.key != _checked_key(key) for record in records):
             raise Refused("not records of this key")

@@ -82,8 +82,8 @@ class Claim:
     def confirm(self) -> Deferred[Tuple]:
         """Take the tuple permanently; fires when the council has decided.
 
-        Fails with ``ClaimLost`` if the council decided for another claimant, which requires an expired claim.  If the
-        call is cancelled and the council decides for it, the tuple is put back.
+        Fails with ``ClaimLost`` if the council decided for another claimant, which is possible only after the deadline.
+        If the call is cancelled and the council decides for it, the tuple is put back.
         """
         return fail(ClaimLost(OVER)) if self.is_over else self._taker.confirm(self)
 
