@@ -278,10 +278,7 @@ class SwarmNode(Service):
     # -- tasks ------------------------------------------------------------------------------------------------------
 
     async def submit(self, task: Task) -> Task:
-        """Publish ``task`` and pin its council: the nodes closest to its key now (consensus rule 1).
-
-        Raises ``UnknownStrategy`` if its strategy does not exist.
-        """
+        """Publish ``task`` with its council, the nodes closest to its key now (rule 1); raise ``UnknownStrategy``."""
         if not is_deployed(task.strategy):  # only nodes with the deployed module can check it
             place_of(task.strategy)
         task = await self.councils.pinned(task)
@@ -345,10 +342,7 @@ class SwarmNode(Service):
         return await written
 
     def strategy(self, name: str) -> Guard:
-        """Return the strategy ``name`` in its guard, which this node keeps until it stops.
-
-        Raises ``UnknownStrategy``.
-        """
+        """Return the strategy ``name`` in its guard, kept until this node stops; raise ``UnknownStrategy``."""
         return self._strategies.named(name, self.deployed)
 
     def _view(self, strategy: str) -> View:

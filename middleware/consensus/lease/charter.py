@@ -93,19 +93,19 @@ class Charter:
 
 def pin(identity: Identity, task_id: str, members: tuple[Contact, ...]) -> Charter:
     """Return the charter of a new task with the first council ``members``."""
-    return Charter(identity.public, members, identity.sign(_pin_statement(task_id, members)))
+    return Charter(identity.public, members, identity.sign(_pin_bytes(task_id, members)))
 
 
 def sign_change(
     identity: Identity, task_id: str, configuration: int, ballot: Ballot, members: tuple[Contact, ...], token: int
 ) -> bytes:
     """Certify that ``members`` were accepted as the council after ``configuration``, and the highest token granted."""
-    return identity.sign(_change_statement(task_id, configuration, ballot, members, token))
+    return identity.sign(_change_bytes(task_id, configuration, ballot, members, token))
 
 
 def sign_end(identity: Identity, task_id: str, configuration: int, agent: str, token: int) -> bytes:
     """Certify that ``agent`` closed the task under ``token``, which it was granted."""
-    return identity.sign(_end_statement(task_id, configuration, agent, token))
+    return identity.sign(_end_bytes(task_id, configuration, agent, token))
 
 
 def charter_of(packed: object) -> Charter | None:
@@ -117,13 +117,13 @@ def is_change_signed(
     member: Contact, task_id: str, configuration: int, ballot: Ballot, members: tuple[Contact, ...], reply: Reply
 ) -> bool:
     """Return whether ``reply`` has a valid signature of the change by ``member`` (``sign_change``)."""
-    statement = _change_statement(task_id, configuration, ballot, members, reply.token)
+    statement = _change_bytes(task_id, configuration, ballot, members, reply.token)
     return verified(member.public, statement, reply.proof)
 
 
 def is_end_signed(member: Contact, task_id: str, configuration: int, agent: str, token: int, proof: bytes) -> bool:
     """Return whether ``proof`` is a valid signature of the end by ``member`` (``sign_end``)."""
-    return verified(member.public, _end_statement(task_id, configuration, agent, token), proof)
+    return verified(member.public, _end_bytes(task_id, configuration, agent, token), proof)
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,7 @@ class Ending:
     def is_genuine(self, task_id: str, agent: str, token: int) -> bool:
         """Return whether a majority has signed that ``agent`` ended the task under ``token``."""
         members = self.charter.members
-        statement = _end_statement(task_id, self.charter.configuration, agent, token)
+        statement = _end_bytes(task_id, self.charter.configuration, agent, token)
         return self.charter.is_genuine(task_id) and _is_majority(
             members, {place: (statement, signature) for place, signature in self.signatures}
         )
@@ -181,12 +181,12 @@ class Judge:
 @lru_cache(maxsize=64)  # 80 us per signature, and the same charter is read repeatedly
 def _is_genuine(packed: bytes, task_id: str) -> bool:
     charter = _charter_of(packed)
-    if charter is None or not verified(charter.owner, _pin_statement(task_id, charter.first), charter.signature):
+    if charter is None or not verified(charter.owner, _pin_bytes(task_id, charter.first), charter.signature):
         return False
     previous, configuration = charter.first, FIRST
     for members, ballot, votes in charter.links:
         statements = {
-            place: (_change_statement(task_id, configuration, ballot, members, token), signature)
+            place: (_change_bytes(task_id, configuration, ballot, members, token), signature)
             for place, token, signature in votes
         }
         if len(members) < LEAST or not _is_majority(previous, statements):
@@ -238,16 +238,14 @@ def _is_bytes(value: object, size: int) -> bool:
     return isinstance(value, bytes) and len(value) == size
 
 
-def _pin_statement(task_id: str, members: tuple[Contact, ...]) -> bytes:
+def _pin_bytes(task_id: str, members: tuple[Contact, ...]) -> bytes:
     return bytes(msgpack.packb([b"swarm-council-1", task_id, FIRST, pack_members(members)]))
 
 
-def _change_statement(
-    task_id: str, configuration: int, ballot: Ballot, members: tuple[Contact, ...], token: int
-) -> bytes:
+def _change_bytes(task_id: str, configuration: int, ballot: Ballot, members: tuple[Contact, ...], token: int) -> bytes:
     fields = [b"swarm-council-change-1", task_id, configuration, *ballot, pack_members(members), token]
     return bytes(msgpack.packb(fields))
 
 
-def _end_statement(task_id: str, configuration: int, agent: str, token: int) -> bytes:
+def _end_bytes(task_id: str, configuration: int, agent: str, token: int) -> bytes:
     return bytes(msgpack.packb([b"swarm-task-end-1", task_id, configuration, agent, token]))

@@ -58,25 +58,16 @@ def parser(group: str) -> argparse.ArgumentParser:
 def _dht(verb: Callable[[str, str], argparse.ArgumentParser]) -> None:
     get = verb("get", "Print the records under a key.")
     get.add_argument("key")
-    get.add_argument(
-        "--concern", choices=("fast", "majority"), default="majority", help="ask one replica, or a majority"
-    )
+    get.add_argument("--concern", choices=("fast", "majority"), default="majority", help="one replica, or a majority")
     put = verb("put", "Store a value under a key, in this node's own slot.")
     put.add_argument("key")
     put.add_argument("value", help="text, - for standard input, or @FILE")
     put.add_argument("--name", default="", help="name of this node's slot under the key")
     put.add_argument(
-        "--lifetime",
-        choices=("team", "leased"),
-        default="team",
-        help="keep the value when this node leaves, or remove it",
+        "--lifetime", choices=("team", "leased"), default="team", help="keep it when this node leaves, or remove it"
     )
-    put.add_argument(
-        "--concern", choices=("one", "majority", "all"), default="majority", help="replicas that must store it"
-    )
-    put.add_argument(
-        "--expect", type=int, metavar="SEQUENCE", help="store only if the slot has this sequence; 0: empty"
-    )
+    put.add_argument("--concern", choices=("one", "majority", "all"), default="majority", help="required replicas")
+    put.add_argument("--expect", type=int, metavar="SEQUENCE", help="store only if the slot has it; 0: empty slot")
     remove = verb("remove", "Remove this node's value under a key.")
     remove.add_argument("key")
     remove.add_argument("--name", default="")
@@ -132,10 +123,8 @@ def asked(path: Path, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
                 for line in lines:
                     yield json.loads(line)
         except (OSError, ValueError) as error:
-            reason = getattr(error, "strerror", None) or error
-            raise NoControl(
-                f"the node behind {path} does not answer ({reason}); start it, or remove that file"
-            ) from error
+            why = getattr(error, "strerror", None) or error
+            raise NoControl(f"the node behind {path} does not answer ({why}); start it, or remove that file") from error
 
 
 def check_peer(connection: socket.socket, path: Path) -> None:

@@ -49,20 +49,20 @@ class Verbs:
         """Return the verbs of ``node``, with the default tuple space."""
         return cls(node, TupleSpace(node, clock, rng), Keywords(node), clock)
 
-    def run(self, name: object, arguments: object, tell: Tell) -> Deferred[Any]:
+    def run(self, name: object, args: object, tell: Tell) -> Deferred[Any]:
         """Run the verb ``name``; call ``tell`` with events, fire with the answer; can be cancelled.
 
         All errors are failures of the Deferred: ``BadRequest`` for an invalid verb or argument.
         """
-        return maybeDeferred(self._run, name, arguments, tell)
+        return maybeDeferred(self._run, name, args, tell)
 
-    def _run(self, name: object, arguments: object, tell: Tell) -> object:
+    def _run(self, name: object, args: object, tell: Tell) -> object:
         verb = self._verbs().get(name) if isinstance(name, str) else None
         if verb is None:
             raise BadRequest(f"no verb {name!r}; there are {', '.join(sorted(self._verbs()))}")
-        if not isinstance(arguments, dict):
+        if not isinstance(args, dict):
             raise BadRequest("the arguments of a verb must be a JSON object")
-        return verb(Arguments(arguments), tell)
+        return verb(Arguments(args), tell)
 
     def _verbs(self) -> Mapping[str, Callable[[Arguments, Tell], object]]:
         return {
@@ -71,63 +71,59 @@ class Verbs:
             "dht remove": self._dht_remove,
             "dht find": self._dht_find,
             "dht watch": self._dht_watch,
-            "keyword publish": lambda arguments, _: self.keywords.publish(
-                arguments.text("name"), arguments.data("value")
-            ),
-            "keyword remove": lambda arguments, _: self.keywords.remove(arguments.text("name")),
+            "keyword publish": lambda args, _: self.keywords.publish(args.text("name"), args.data("value")),
+            "keyword remove": lambda args, _: self.keywords.remove(args.text("name")),
             "keyword search": self._keyword_search,
             "keyword watch": self._keyword_watch,
-            "tuple put": lambda arguments, _: self.space.put(arguments.fields("fields"), arguments.seconds("ttl")),
+            "tuple put": lambda args, _: self.space.put(args.fields("fields"), args.seconds("ttl")),
             "tuple get": self._tuple_get,
             "tuple read": self._tuple_read,
             "rpc": self._rpc,
-            "health": lambda arguments, _: health(self.node),
-            "links": lambda arguments, _: Deferred.fromCoroutine(links(self.node, self.clock)),
+            "health": lambda args, _: health(self.node),
+            "links": lambda args, _: Deferred.fromCoroutine(links(self.node, self.clock)),
         }
 
     # -- dht --------------------------------------------------------------------------------------------------------
 
-    def _dht_get(self, arguments: Arguments, tell: Tell) -> object:
-        concern = cast(ReadConcern, arguments.choice("concern", "majority", get_args(ReadConcern)))
-        return self.node.get(key_of(arguments.text("key")), concern).addCallback(rows_of)
+    def _dht_get(self, args: Arguments, tell: Tell) -> object:
+        concern = cast(ReadConcern, args.choice("concern", "majority", get_args(ReadConcern)))
+        return self.node.get(key_of(args.text("key")), concern).addCallback(rows_of)
 
-    def _dht_put(self, arguments: Arguments, tell: Tell) -> object:
-        lifetime = cast(Lifetime, arguments.choice("lifetime", "team", get_args(Lifetime)))
-        concern = cast(Concern, arguments.choice("concern", "majority", get_args(Concern)))
-        key, name, value = key_of(arguments.text("key")), arguments.text("name", ""), arguments.data("value")
-        put = self.node.put(key, name, value, lifetime, concern, arguments.whole("expect"))
+    def _dht_put(self, args: Arguments, tell: Tell) -> object:
+        lifetime = cast(Lifetime, args.choice("lifetime", "team", get_args(Lifetime)))
+        concern = cast(Concern, args.choice("concern", "majority", get_args(Concern)))
+        key, name, value = key_of(args.text("key")), args.text("name", ""), args.data("value")
+        put = self.node.put(key, name, value, lifetime, concern, args.whole("expect"))
         return put.addCallback(_stored)
 
-    def _dht_remove(self, arguments: Arguments, tell: Tell) -> object:
-        removed = self.node.remove(key_of(arguments.text("key")), arguments.text("name", ""))
+    def _dht_remove(self, args: Arguments, tell: Tell) -> object:
+        removed = self.node.remove(key_of(args.text("key")), args.text("name", ""))
         return removed.addCallback(_stored)
 
-    def _dht_find(self, arguments: Arguments, tell: Tell) -> object:
-        found = self.node.find_node(key_of(arguments.text("key")))
+    def _dht_find(self, args: Arguments, tell: Tell) -> object:
+        found = self.node.find_node(key_of(args.text("key")))
         return found.addCallback(lambda contacts: [_contact(contact) for contact in contacts])
 
-    def _dht_watch(self, arguments: Arguments, tell: Tell) -> object:
-        return _until_cancelled(self.node.watch(key_of(arguments.text("key")), lambda records: tell(rows_of(records))))
+    def _dht_watch(self, args: Arguments, tell: Tell) -> object:
+        return _until_cancelled(self.node.watch(key_of(args.text("key")), lambda records: tell(rows_of(records))))
 
     # -- keywords and tuples ----------------------------------------------------------------------------------------
 
-    def _keyword_search(self, arguments: Arguments, tell: Tell) -> object:
-        return self.keywords.search(arguments.text("words")).addCallback(_matches)
+    def _keyword_search(self, args: Arguments, tell: Tell) -> object:
+        return self.keywords.search(args.text("words")).addCallback(_matches)
 
-    def _keyword_watch(self, arguments: Arguments, tell: Tell) -> object:
-        return _until_cancelled(
-            self.keywords.watch_keyword(arguments.text("words"), lambda found: tell(_matches(found)))
-        )
+    def _keyword_watch(self, args: Arguments, tell: Tell) -> object:
+        return _until_cancelled(self.keywords.watch_keyword(args.text("words"), lambda found: tell(_matches(found))))
 
-    def _tuple_get(self, arguments: Arguments, tell: Tell) -> object:
-        template, wait = arguments.template("template"), arguments.seconds("wait")
+    def _tuple_get(self, args: Arguments, tell: Tell) -> object:
+        template, wait = args.template("template"), args.seconds("wait")
         found: Deferred[Any] = self.space.get(template, wait) if wait else self.space.get_if_exists(template)
         return found.addCallback(word.plain)
 
-    def _tuple_read(self, arguments: Arguments, tell: Tell) -> object:
-        template, wait = arguments.template("template"), arguments.seconds("wait")
+    def _tuple_read(self, args: Arguments, tell: Tell) -> object:
+        template, wait = args.template("template"), args.seconds("wait")
         found: Deferred[Any]
-        if arguments.flag("all"):
+        if args.flag("all"):
             found = self.space.read_all(template)
         else:
             found = self.space.read(template, wait) if wait else self.space.read_if_exists(template)
@@ -135,19 +131,19 @@ class Verbs:
 
     # -- rpc --------------------------------------------------------------------------------------------------------
 
-    def _rpc(self, arguments: Arguments, tell: Tell) -> object:
+    def _rpc(self, args: Arguments, tell: Tell) -> object:
         return Deferred.fromCoroutine(
             self._ask(
-                arguments.text("node"),
-                arguments.text("method"),
-                arguments.fields("arguments"),
-                arguments.flag("changes"),
+                args.text("node"),
+                args.text("method"),
+                args.fields("arguments"),
+                args.flag("changes"),
             )
         )
 
-    async def _ask(self, target: str, method: str, arguments: Sequence[Any], is_changing: bool) -> object:
+    async def _ask(self, target: str, method: str, args: Sequence[Any], is_changing: bool) -> object:
         contact = await self._contact(target)
-        return word.plain(await self.node.call(contact, method, *arguments, changes=is_changing))
+        return word.plain(await self.node.call(contact, method, *args, changes=is_changing))
 
     async def _contact(self, target: str) -> Contact:
         host, colon, port = target.rpartition(":")

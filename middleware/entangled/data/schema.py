@@ -102,9 +102,7 @@ def checked_version(path: str, connection: sqlite3.Connection) -> int:
             raise BadStore(f"store {path}: belongs to another program; name another file")
         return 0
     if version > SCHEMA_VERSION:
-        raise BadStore(
-            f"store {path}: has schema {version}, newer than {SCHEMA_VERSION}; update this program, or use another file"
-        )
+        raise BadStore(f"store {path}: has the newer schema {version}; update this program, or name another file")
     if (RECORDS if version == SCHEMA_VERSION else RECORDS_1) not in tables:
         raise Rotten(f"it lacks the tables of schema {version}")
     (verdict,) = connection.execute("PRAGMA integrity_check(1)").fetchone()

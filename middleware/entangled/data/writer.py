@@ -53,8 +53,7 @@ class _Owed:
 class Writer:
     """Writes changes to ``connection``, the file ``path``, from ``start`` to ``close``.
 
-    ``deliver`` runs the notification of written changes in the caller's thread; if it is None, ``flush`` and ``close``
-    notify.
+    ``deliver`` notifies of written changes in the caller's thread; if it is None, ``flush`` and ``close`` do.
     """
 
     _log = Logger()

@@ -41,7 +41,7 @@ does not age a record, but may take seconds."""
 LIFETIME_SUM_SLACK_S = 1800
 """Seconds by which the summed lifetimes of a part may differ before its slots are compared."""
 CONTACTS_WAIT_S = 0.1
-NEW_NODE_DELAY_S = 1.0
+NEW_NODE_S = 1.0
 """Seconds that a new node gets to catch up by itself; up to twice as many, by random delay."""
 
 
@@ -106,7 +106,7 @@ class Handover:
         """Reconcile with a new node after a delay, unless it has done so by itself."""
         if self._is_near(contact):
             self._chores.later(
-                NEW_NODE_DELAY_S * (1 + self._rng.random()), self._reconcile_if_new, contact, self._clock.seconds()
+                NEW_NODE_S * (1 + self._rng.random()), self._reconcile_if_new, contact, self._clock.seconds()
             )
 
     def lost(self, contact: Contact) -> None:

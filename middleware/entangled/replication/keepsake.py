@@ -1,7 +1,6 @@
 """Copies of watched records in the node's own store, for readers of the store's file.
 
-A copy is no replica: it is neither served nor pushed to peers, extends no lease, and is removed when the watch no
-longer has its record.
+A copy is no replica: it is neither served nor pushed, extends no lease, and goes when the watch drops its record.
 """
 
 from __future__ import annotations

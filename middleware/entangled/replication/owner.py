@@ -96,7 +96,7 @@ class Owner:
         self._published_at: dict[Slot, float] = {}
         self._leases: dict[Slot, float] = {}
         self._due_at: dict[Slot, float] = {}
-        self._renewal_targets: dict[Slot, list[Contact]] = {}
+        self._holders: dict[Slot, list[Contact]] = {}
         self._period = lease / BEATS_PER_LEASE
         self._transfers: set[bytes] = set()
         self._republishing = False
@@ -275,9 +275,9 @@ class Owner:
 
     def welcome(self, contact: Contact) -> None:
         """Store at a new node the own leased records it should hold; it fetches team records by itself."""
-        lacking = [r for r in self._leased_records() if self._overlay.belongs(r.key, contact)]
+        lacking = [r for r in self._leased() if self._overlay.belongs(r.key, contact)]
         if lacking:
-            self._chores.fork(self._store_pages(contact, lacking))
+            self._chores.fork(self._send(contact, lacking))
 
     def lost_here(self, record: Record) -> bool:
         """Store an own record again that expired here because of a late timer; return whether it is an own one."""
@@ -340,14 +340,7 @@ class Owner:
         return record
 
     def _forget(self, slot: Slot) -> None:
-        for memory in (
-            self._own,
-            self._unsettled,
-            self._published_at,
-            self._leases,
-            self._due_at,
-            self._renewal_targets,
-        ):
+        for memory in (self._own, self._unsettled, self._published_at, self._leases, self._due_at, self._holders):
             memory.pop(slot, None)
 
     def _mark_settled(self, record: Record) -> None:
@@ -359,7 +352,7 @@ class Owner:
         if record.is_tombstone:
             self._forget(record.slot)
 
-    def _leased_records(self) -> list[Record]:
+    def _leased(self) -> list[Record]:
         return [r for r in self._own.values() if r.lifetime == "leased"]
 
     def _lease_of(self, slot: Slot) -> float:
@@ -367,7 +360,7 @@ class Owner:
 
     def _renew_due(self) -> None:
         """Send the renewals that are due, and schedule the next ones by the shortest lease."""
-        leases = [self._lease_of(record.slot) for record in self._leased_records()]
+        leases = [self._lease_of(record.slot) for record in self._leased()]
         self._period = min(leases, default=self._lease) / BEATS_PER_LEASE
         self._cancel_renewal = self._chores.later(self._period, self._renew_due)
         if not self._send_renewals():
@@ -399,30 +392,26 @@ class Owner:
         now = self._clock.seconds()
         due: set[bytes] = set()
         there: dict[bytes, tuple[Contact, list[Record]]] = {}
-        for record in self._leased_records():
+        for record in self._leased():
             slot = record.slot
             if self._due_at.get(slot, now) <= now + EARLY_S:
                 self._due_at[slot] = now + self._lease_of(slot) / BEATS_PER_LEASE
-                self._renewal_targets[slot] = self._overlay.keepers(record.key)
-                due.update(contact.node_id for contact in self._renewal_targets[slot])
-            for contact in self._renewal_targets[slot]:
+                self._holders[slot] = self._overlay.keepers(record.key)
+                due.update(contact.node_id for contact in self._holders[slot])
+            for contact in self._holders[slot]:
                 there.setdefault(contact.node_id, (contact, []))[1].append(record)
         held = self._store.extend(self._identity.public, now + BEATS_PER_LEASE * self._period)
         for contact, records in there.values():
             if contact.node_id in due:
                 lease = min(self._lease_of(record.slot) for record in records)
                 self._endpoint.tell(contact, "alive", lease, digest_of(records))
-        return held > 0 or bool(self._leased_records())
+        return held > 0 or bool(self._leased())
 
     def _answer_missing(self, peer: Contact, marks: list[object]) -> None:
         """MISSING: store at ``peer`` the own leased records that it lacks, and name those it should drop."""
-        there = [
-            r for r in self._leased_records() if any(c.node_id == peer.node_id for c in self._overlay.keepers(r.key))
-        ]
+        there = [r for r in self._leased() if any(c.node_id == peer.node_id for c in self._overlay.keepers(r.key))]
         expected = [digest_of([r]) for r in there]
-        self._chores.fork(
-            self._store_pages(peer, [r for r, mark in zip(there, expected, strict=True) if mark not in marks])
-        )
+        self._chores.fork(self._send(peer, [r for r, mark in zip(there, expected, strict=True) if mark not in marks]))
         unexpected = [mark for mark in marks if mark not in expected]
         if unexpected:
             self._endpoint.tell(peer, "let_go", unexpected)
@@ -443,7 +432,7 @@ class Owner:
         finally:
             self._republishing = False
 
-    async def _store_pages(self, contact: Contact, records: list[Record]) -> None:
+    async def _send(self, contact: Contact, records: list[Record]) -> None:
         """Store own records at ``contact``, page by page, unless such a transfer to it is running."""
         if contact.node_id in self._transfers:
             return

@@ -53,10 +53,7 @@ class Pusher:
         self._chores.every(WATCH_TTL, self._prune)
 
     def watched(self, key: bytes, peer: Contact, ttl: float = WATCH_TTL) -> int:
-        """Add or renew the watcher ``peer`` of ``key``; return the number of the last push to it.
-
-        Raises ``Refused`` if there are too many.
-        """
+        """Add or renew a watcher of ``key``; return the number of the last push to it.  Raises ``Refused``."""
         if not 0.0 < ttl <= MAX_TTL:
             raise Refused(f"a watch lasts at most {MAX_TTL:g} s")
         watchers = self._watchers.get(key, {})
@@ -69,22 +66,20 @@ class Pusher:
         self._watchers[key] = watchers
         return watcher.number
 
-    def push(self, key: bytes, records: Iterable[Record], removed: Iterable[Record]) -> None:
-        """Notify the watchers of ``key`` that this node now holds ``records``, and no longer those in ``removed``."""
+    def push(self, key: bytes, records: Iterable[Record], gone: Iterable[Record]) -> None:
+        """Notify the watchers of ``key`` that this node now holds ``records``, and no longer those in ``gone``."""
         watchers = self._watchers.get(key)
         if not watchers:
             return
         if len(watchers) <= FEW and key not in self._gathered:
-            self._push(
-                key, [record.packed() for record in records], [[record.owner, record.name] for record in removed]
-            )
+            self._push(key, [record.packed() for record in records], [[record.owner, record.name] for record in gone])
             return
         if key not in self._gathered:
             self._chores.later(GATHERED, self._push_gathered, key)
         # Only the last change of each slot is pushed.
         changes = self._gathered.setdefault(key, {})
         changes.update((record.slot, (record, True)) for record in records)
-        changes.update((record.slot, (record, False)) for record in removed)
+        changes.update((record.slot, (record, False)) for record in gone)
 
     def _push_gathered(self, key: bytes) -> None:
         packed: list[object] = []

@@ -117,7 +117,7 @@ class Reader:
             return await self._find_value(key)
         targets = await self._overlay.holders(key)
         voters = self._overlay.voters(key, targets)
-        answers = await self._ask_replicas(key, targets, voters, lambda given: _is_clear(given, voters), width=1)
+        answers = await self._query(key, targets, voters, lambda given: _is_clear(given, voters), width=1)
         for answer in answers.values():
             if _is_something(answer.records):
                 return answer.records
@@ -128,9 +128,7 @@ class Reader:
         targets = await self._overlay.holders(key)
         voters = self._overlay.voters(key, targets)
         needed = voters.majority
-        answers = await self._ask_replicas(
-            key, targets, voters, lambda given: _votes(given, voters) >= needed, width=needed
-        )
+        answers = await self._query(key, targets, voters, lambda given: _votes(given, voters) >= needed, width=needed)
         _check_votes(_votes(answers, voters), voters)
         newest = newest_of(answer.records for answer in answers.values())
         await self._repair(newest, targets, voters, answers)
@@ -173,7 +171,7 @@ class Reader:
             await until(lambda _, holding=holding: voters.count_known(holding) >= voters.majority, lacking)  # type: ignore
             _check_votes(voters.count_known(holding), voters)
 
-    async def _ask_replicas(
+    async def _query(
         self,
         key: bytes,
         targets: list[Contact],

@@ -206,8 +206,7 @@ class Subscriber:
                 for slot in slots:
                     watch.view.remove(peer.node_id, slot)
             self._settle(watch)
-            # The last push may arrive twice.  If the owner's certificate is unknown, ask for the records again, which
-            # requests the certificate.
+            # The last push may arrive twice.  A renewal also requests unknown certificates of owners.
             if is_lacking or number not in (last, last + 1):
                 self._chores.fork(self._renew_at(watch, peer))
 
