@@ -1,4 +1,4 @@
-"""Exceptions of the node outside its peer-to-peer library; the class tells the operator's remedy.
+"""Exceptions of the node outside its peer-to-peer library, each with the remedy for the operator.
 
 ::
 
@@ -42,7 +42,7 @@ class MissingExtra(SwarmError):
         self.extra = extra
 
     def __str__(self) -> str:
-        return f"{self.part} needs more than the bare node; install it by: pip install 'swarm-node[{self.extra}]'"
+        return f"{self.part} needs libraries that are not installed; run: pip install 'swarm-node[{self.extra}]'"
 
 
 class UnknownTask(SwarmError):

@@ -466,7 +466,7 @@ class SwarmNode(Service):
 
     def _answer_disconnect(self, peer: Contact, seconds: float) -> str:
         if not 0 < seconds <= 3600:
-            raise Refused("a device leaves for more than 0 and at most 3600 seconds")
+            raise Refused("a device disconnects for more than 0 and at most 3600 seconds")
         # Leave after the answer was sent.
         self._chores.later(0.05, self._on_disconnect, float(seconds))
         return "leaving"

@@ -280,7 +280,7 @@ class EntangledNode:
         Fails with ``Refused``, an error that the method names, or ``NoAnswer``; cancelling notifies the peer.
         """
         if not self._running:
-            raise NotRunning("start the node first")
+            raise NotRunning("the node is not running; start it first")
         return self.endpoint.ask(contact, name, *arguments, timeout=timeout, changes=changes)
 
     def find_node(self, node_id: bytes) -> Deferred[list[Contact]]:
@@ -349,7 +349,7 @@ class EntangledNode:
         except ValueError:  # a corrupt file may hold anything
             absent_s = 0.0
         if is_long := absent_s > TOLERATED_ABSENCE:
-            self._log.warn("away for {days:.0f} days: what was held is forgotten", days=absent_s / 86400)
+            self._log.warn("away for {days:.0f} days: all records in the store are dropped", days=absent_s / 86400)
             for record in self.store.records():
                 self.store.discard(record.slot)
         return is_long
@@ -407,7 +407,7 @@ class EntangledNode:
 
     def _check(self, key: bytes) -> None:
         if not self._running:
-            raise NotRunning("start the node first")
+            raise NotRunning("the node is not running; start it first")
         if len(key) != KEY_BYTES:
             raise ValueError(f"a key has {KEY_BYTES} bytes, this one {len(key)}")
 

@@ -262,7 +262,7 @@ class Council:
         if self.configuration != before:
             raise Superseded(f"the council is at configuration {self.configuration} already; check it and try again")
         if not prepared.tally.is_won:
-            _raise(prepared, "the council stays as it is")
+            _raise(prepared, "the council is unchanged")
         if prepared.tally.to_complete is not None:
             await self.finish(ballot, prepared, keep)
         else:
@@ -281,7 +281,7 @@ class Council:
         if not accepted.tally.is_won:
             self.hear(accepted)
             self.let_go(ballot, rest=self.ttl)  # a lease of this agent stays valid
-            _raise(accepted, "the council stays as it is")
+            _raise(accepted, "the council is unchanged")
         votes = [
             (place, accepted.tally.replies[place]) for place in sorted(accepted.tally.agreed)[: majority(len(old))]
         ]

@@ -177,7 +177,7 @@ class Arguments:
         """Return one of ``choices``."""
         value = self.text(name, default)
         if value not in choices:
-            raise BadRequest(f"{name}: {value!r} must be one of {', '.join(choices)}")
+            raise BadRequest(f"{name}: must be one of {', '.join(choices)}, is {value!r}")
         return value
 
     def data(self, name: str) -> bytes:

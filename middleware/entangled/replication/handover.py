@@ -164,7 +164,7 @@ class Handover:
             )
             own, for_peer = self._overlap.both(contact)
             if not (_is_list_of(digests, bytes) and _is_list_of(lives, int)):
-                raise Refused(f"{contact.address} gives no digests")
+                raise Refused(f"{contact.address} sends an invalid reply to digests")
             for group, (digest, life) in enumerate(zip(digests, lives, strict=True)):
                 is_longer = life > self._overlap.life(own[group], bit) + LIFETIME_SUM_SLACK_S
                 if is_longer or digest != digest_of(own[group]):
@@ -240,7 +240,7 @@ class Handover:
             places = [[*record.slot, *mark_of(record)] for record in page]
             answer = await self._overlay.ask(contact, "lacking", places)
             if not (isinstance(answer, list) and len(answer) == len(page)):
-                raise Refused(f"{contact.address} does not say what it lacks")
+                raise Refused(f"{contact.address} sends an invalid reply to lacking")
             await self._send_all(contact, [record for record, lacks in zip(page, answer, strict=True) if lacks])
         self._sent_digests[contact.node_id] = digest
 

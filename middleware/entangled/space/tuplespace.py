@@ -264,7 +264,7 @@ class TupleSpace:
                 wait.end()
                 wait.deferred.errback(failure)
             elif failure.check(EntangledError) is None:
-                self._log.failure("in a call that had ended", failure)
+                self._log.failure("a call failed after it had ended", failure)
 
         def expired() -> None:
             if not wait.is_over:
