@@ -1,26 +1,26 @@
-"""Every exception of the node above its peer-to-peer library; the class says what a person can do about it.
+"""Exceptions of the node outside its peer-to-peer library, each with the remedy for the operator.
 
 ::
 
     SwarmError
-      BadSetting         mend the settings file, or the command line
+      BadSetting         correct the settings file or the command line
       MissingExtra       install the named extra
-      UnknownTask        ask for a kind of task, or a behaviour, that exists
-      UnknownStrategy    ask for a consensus strategy that exists
-      UnknownAgent       ask for an agent that exists
-      Undeployable       mend the module, and push it again as a higher version
-      BadFault           ask for a fault that exists, within its bounds
+      UnknownTask        name a kind of task or a behaviour that exists
+      UnknownStrategy    name a consensus strategy that exists
+      UnknownAgent       name an agent that exists
+      Undeployable       correct the module and push it again as a higher version
+      BadFault           name a fault that exists, with values in range
 """
 
 from __future__ import annotations
 
 
 class SwarmError(Exception):
-    """The root of what a node raises of itself; ``str()`` is one line that a person can act upon."""
+    """Base class of the node's exceptions; ``str()`` is one line that says what to do."""
 
 
 class BadSetting(SwarmError):
-    """A setting cannot be used: in which file (or on the command line), which key, what is wrong, and what to do."""
+    """A setting is invalid; ``file`` is empty for the command line."""
 
     def __init__(self, file: str, key: str, problem: str, remedy: str) -> None:
         super().__init__(file, key, problem, remedy)
@@ -34,7 +34,7 @@ class BadSetting(SwarmError):
 
 
 class MissingExtra(SwarmError):
-    """A part of the program was asked for whose libraries are not installed."""
+    """The libraries of an optional part are not installed."""
 
     def __init__(self, part: str, extra: str) -> None:
         super().__init__(part, extra)
@@ -42,7 +42,7 @@ class MissingExtra(SwarmError):
         self.extra = extra
 
     def __str__(self) -> str:
-        return f"{self.part} needs more than the bare node; install it by: pip install 'swarm-node[{self.extra}]'"
+        return f"{self.part} needs libraries that are not installed; run: pip install 'swarm-node[{self.extra}]'"
 
 
 class UnknownTask(SwarmError):
@@ -58,7 +58,7 @@ class UnknownAgent(SwarmError):
 
 
 class Undeployable(SwarmError):
-    """A module that was pushed to the team cannot run: its name, and what is wrong with it."""
+    """A module that an operator pushed to the team cannot run."""
 
     def __init__(self, name: str, problem: str) -> None:
         super().__init__(name, problem)
@@ -70,7 +70,7 @@ class Undeployable(SwarmError):
 
 
 class BadFault(SwarmError):
-    """A fault that cannot be caused: which field of it, what is wrong, and what to do."""
+    """A fault cannot be injected because ``field`` is invalid."""
 
     def __init__(self, field: str, problem: str, remedy: str) -> None:
         super().__init__(field, problem, remedy)

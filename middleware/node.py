@@ -1,7 +1,7 @@
-"""SwarmNode: one Twisted service that wires the rooms of the middleware; it decides nothing itself.
+"""SwarmNode: one Twisted service that connects the packages of the middleware.
 
-What a device can do with its team goes through here: be present, see the devices and tasks, submit and follow a task,
-ask the council for a lease, send a camera's frames, and call a peer by name.
+Its methods serve a device and its agent: announce the presence, list devices and tasks, submit and follow a
+task, request a lease from a task's council, stream camera frames, and call a peer by name.
 """
 
 from __future__ import annotations
@@ -59,23 +59,23 @@ if TYPE_CHECKING:
 
 CAMERA = "camera"
 LEASE_VERBS = ("prepare", "propose", "release", "close", "cancel", "change", "install", "freed")
-LOOK_AGAIN = 0.3
-"""Seconds after which a newcomer looks whether others took the same place in the order of joining."""
-LOOKS = 10
-COUNTING = 2.0
-"""Seconds between two looks at the node's own network figures; in a large team they are told once a minute."""
-REVIEWING = 10.0
-"""Seconds between two looks at the size of the team."""
+PLACE_CHECK_INTERVAL_S = 0.3
+"""Seconds between two checks of a new node whether others took the same place in the order of joining."""
+MAX_PLACE_CHECKS = 10
+FIGURES_INTERVAL_S = 2.0
+"""Seconds between two updates of the node's network figures in its presence; in a large team one minute."""
+REVIEW_INTERVAL_S = 10.0
+"""Seconds between two checks of the size of the team."""
 
 
 class SwarmNode(Service):
     """One node of a team.
 
-    ``team`` is the closed team whose ``door`` the node has, None in an open one; it starts and stops with the node.
-    ``device`` is what the node says of itself; ``wall`` gives seconds of the wall clock, for people only.  ``deployed``
-    is what operators pushed and its owner allowed, ``stop_deployed`` ends its processes; ``halt`` says whether the
-    whole team is to stand.
-    ``later(seconds, call, ...)`` is a timer that ends with the node.
+    ``device`` is the node's own description; ``wall`` returns seconds since the epoch, for display only; ``door`` is
+    the admission check.  ``team`` is the closed team of that check, None in an open team; it starts and stops with the
+    node.  ``deployed`` holds the modules that operators pushed and the device's owner allowed; ``stop_deployed`` ends
+    their processes.  ``halt`` is the stop state of the whole team.  ``later(seconds, call, ...)`` is a timer that ends
+    with the node.
     """
 
     _log = Logger()
@@ -109,19 +109,19 @@ class SwarmNode(Service):
         self.stop_deployed: Callable[[], None] = lambda: None
         self.halt = Halt()
         self.directory = Directory(self.entangled, self._chores)
-        self.presence = Presence(self._named(device), self._announce, self._chores.later)
+        self.presence = Presence(self._with_certified_name(device), self._announce, self._chores.later)
         self.streams = Streams(self.entangled.endpoint, clock)
         self.joined: Deferred[None] = Deferred()
         self._known = list(known_nodes)
-        self._ends: list[Callable[[], None]] = []
+        self._stop_calls: list[Callable[[], None]] = []
         self._network = network
-        self._born_at = clock.seconds()
-        self._counted_at = self._reviewed_at = float("-inf")
+        self._created_at = clock.seconds()
+        self._figures_at = self._reviewed_at = float("-inf")
         self._on_message: Callable[[str], None] = lambda text: None
         self._on_disconnect: Callable[[float], None] = lambda seconds: None
         expose = self.entangled.endpoint.expose
         for verb in LEASE_VERBS:
-            # To repeat what a council member is asked does no harm; nothing need be kept of the first time.
+            # Idempotent: a retransmitted request is executed again, so no reply is cached.
             expose(f"lease.{verb}", partial(self._answer_lease, f"lease.{verb}"), changes=True, idempotent=True)
         expose("bid.offer", self._answer_offer, changes=True, idempotent=True)
         expose("bid.announce", self._answer_announcement, changes=True, idempotent=True)
@@ -132,26 +132,26 @@ class SwarmNode(Service):
     # -- life -------------------------------------------------------------------------------------------------------
 
     def startService(self) -> None:
-        """Open the port, join the network through the known nodes, and appear among the devices."""
+        """Open the port, join the network through the known nodes, and announce this device."""
         super().startService()
         self.entangled.start()
         if self.team is not None:
             self.team.start()
-        Deferred.fromCoroutine(self._join()).addErrback(self._not_joined)
+        Deferred.fromCoroutine(self._join()).addErrback(self._log_join_failure)
 
     def stopService(self) -> None:
-        """Say goodbye and close everything but the store, which belongs to whoever opened it."""
+        """Send goodbye and close everything except the store, which its opener closes."""
         self._leave(self.entangled.stop)
 
     def vanish(self) -> None:
-        """Leave without a word, as when the power fails."""
+        """Stop without sending anything, as after a power failure."""
         self._leave(self.entangled.vanish)
 
     def _leave(self, leave: Callable[[], None]) -> None:
         self._chores.stop()
         self.streams.stop()
-        while self._ends:
-            self._ends.pop()()
+        while self._stop_calls:
+            self._stop_calls.pop()()
         if self.team is not None:
             self.team.stop()
         leave()
@@ -160,109 +160,111 @@ class SwarmNode(Service):
 
     async def _join(self) -> None:
         await self.entangled.join(self._known)
-        others = await self._others()
+        others = await self._find_others()
         depth = await self.directory.arrive()
-        if depth:  # those seen so far stand elsewhere
-            others = await self._others()
-        kept = [d.joined for d in others if d.uuid == self.uuid]
-        self.presence.device = replace(self._addressed(self.presence.device), depth=depth)
-        self.presence.appear(kept[0] if kept else _next_place(others))
+        if depth:  # the devices are in other parts of the directory now
+            others = await self._find_others()
+        previous = [d.joined for d in others if d.uuid == self.uuid]
+        self.presence.device = replace(self._with_address(self.presence.device), depth=depth)
+        self.presence.appear(previous[0] if previous else _next_place(others))
         device = self.presence.device
         self._log.info("{name} joined as number {joined}", name=device.name, joined=device.joined)
-        self._count()
-        self._chores.every(COUNTING, self._count)
+        self._update_figures()
+        self._chores.every(FIGURES_INTERVAL_S, self._update_figures)
         self.joined.callback(None)
-        await self._step_behind()
+        await self._resolve_place()
 
-    def _count(self) -> None:
-        """Say how this node stands in the network (the page's network data), and where in the directory."""
+    def _update_figures(self) -> None:
+        """Update this node's network figures and directory depth in its presence."""
         entangled, now = self.entangled, self.clock.seconds()
-        if now - self._reviewed_at >= REVIEWING:
+        if now - self._reviewed_at >= REVIEW_INTERVAL_S:
             self._reviewed_at = now
-            self.presence.change(depth=self.directory.review(), name=self._named(self.presence.device).name)
-        if self.directory.depth and now - self._counted_at < LONGEST:
+            self.presence.change(
+                depth=self.directory.review(), name=self._with_certified_name(self.presence.device).name
+            )
+        if self.directory.depth and now - self._figures_at < LONGEST:
             return
-        self._counted_at = now
+        self._figures_at = now
         dropped = sum(entangled.endpoint.counters.values())
         contacts, records = len(entangled.overlay.table), len(self.store)
         self.presence.change(network={"contacts": contacts, "records": records, "dropped": dropped})
 
-    async def _step_behind(self) -> None:
-        """Those that join at the same moment take the same place: each steps behind all those whose uuid is lower.
+    async def _resolve_place(self) -> None:
+        """Resolve equal places of devices that joined at the same time.
 
-        All at once, so that a crowd is in order as soon as it has seen itself, and not after as many looks as it has
-        heads, with a record of each for each of them.
+        Each device moves behind all devices with its place and a lower uuid, in one step, so that many devices are
+        in order after one exchange of presences, not after one per device.
         """
-        for _ in range(LOOKS):
-            await self._chores.sleep(LOOK_AGAIN)
-            others = await self._others()
-            mine = self.presence.device.joined
-            same = [d for d in others if d.joined == mine and d.uuid != self.uuid]
+        for _ in range(MAX_PLACE_CHECKS):
+            await self._chores.sleep(PLACE_CHECK_INTERVAL_S)
+            others = await self._find_others()
+            own_place = self.presence.device.joined
+            same = [d for d in others if d.joined == own_place and d.uuid != self.uuid]
             ahead = sum(d.uuid < self.uuid for d in same)
             if ahead:
                 self.presence.change(joined=_next_place(others) + ahead - 1)
             elif not same:
                 return
 
-    async def _others(self) -> list[Device]:
-        """The devices that are here, in a large team those around this one, as soon as anybody can tell."""
+    async def _find_others(self) -> list[Device]:
+        """Return the present devices (in a large team those around this one); retry until the directory answers."""
         while True:
             try:
                 return [device for device, _ in devices_of(await self.directory.around())]
             except NotRunning:
                 raise
             except EntangledError as error:
-                self._log.info("nobody says who is here; asking again: {error}", error=error)
-                await self._chores.sleep(LOOK_AGAIN)
+                self._log.info("the directory does not answer; retrying: {error}", error=error)
+                await self._chores.sleep(PLACE_CHECK_INTERVAL_S)
 
-    def _named(self, device: Device) -> Device:
-        """The device under the name of its certificate, where the team gives certificates."""
+    def _with_certified_name(self, device: Device) -> Device:
+        """Return ``device`` with the name in its certificate, if it has one."""
         return replace(device, name=self._door.authority(self.entangled.identity.public).name or device.name)
 
-    def _addressed(self, device: Device) -> Device:
+    def _with_address(self, device: Device) -> Device:
         return replace(device, uuid=self.uuid, address=str(self._network.address), since=self.wall())
 
-    def _not_joined(self, failure: Any) -> None:
+    def _log_join_failure(self, failure: Any) -> None:
         if failure.check(NotRunning) is None:
-            self._log.failure("while joining", failure)
+            self._log.failure("cannot join", failure)
 
     # -- devices ----------------------------------------------------------------------------------------------------
 
     def watch_devices(self, changed: Changed, keep: bool = False) -> Following:
-        """Follow who is here; ``devices_of`` reads the records, and ``keep`` leaves them in the store as well.
+        """Watch the devices of the team; ``devices_of`` reads the records, ``keep`` also stores them.
 
-        In a large team that is for those who need all of them: it takes a round of reads, and none are kept.
+        In a large team each update takes a round of reads, and ``keep`` has no effect.
         """
         return Following(self.directory, changed, keep)
 
     def list_devices(self) -> Deferred[Listing]:
-        """All devices that are here now; the list knows whether it is complete.  Never fails."""
+        """Fire with all present devices; the list says whether it is complete.  Never fails."""
         return Deferred.fromCoroutine(self.directory.listed())
 
     def some_devices(
         self, count: int, matches: Matches = lambda device: True, after: bytes | None = None
     ) -> Deferred[Page]:
-        """Some of the devices, where a page has no room for all; see ``Directory.some``.  Never fails."""
+        """Fire with at most ``count`` devices; see ``Directory.some``.  Never fails."""
         return Deferred.fromCoroutine(self.directory.some(count, matches, after))
 
     def contact_of(self, record: Record) -> Contact | None:
-        """How to reach the device that wrote ``record``: where it is seen, which may be elsewhere than it says."""
+        """Return the contact of the device that wrote ``record``; the observed address wins over the published one."""
         pair = next(iter(devices_of([record])), None)
         if pair is None:
             return None
         host, _, port = pair[0].address.rpartition(":")
-        said = unpacked([record.owner, host, int(port)]) if port.isascii() and port.isdigit() else None
-        return said and (self.entangled.overlay.known(said.node_id) or said)
+        published = unpacked([record.owner, host, int(port)]) if port.isascii() and port.isdigit() else None
+        return published and (self.entangled.overlay.known(published.node_id) or published)
 
     def team_size(self) -> int:
-        """About how many nodes the team has, this one included."""
+        """Return the estimated number of nodes in the team, this one included."""
         from middleware.consensus.bidding.scale import team_size
 
         overlay = self.entangled.overlay
         return team_size(overlay.own_id, overlay.contacts(), overlay.is_large)
 
     def reached(self, uuids: Sequence[str]) -> list[Contact]:
-        """How to reach those of the devices that this node has met."""
+        """Return the contacts of the given devices that this node knows."""
         return [contact for contact in self.entangled.overlay.contacts() if contact.node_id.hex() in uuids]
 
     def on_message(self, receive: Callable[[str], None]) -> None:
@@ -270,36 +272,34 @@ class SwarmNode(Service):
         self._on_message = receive
 
     def on_disconnect(self, leave: Callable[[float], None]) -> None:
-        """Call ``leave`` with seconds when an operator takes this device off the network for that long."""
+        """Call ``leave(seconds)`` when an operator disconnects this device from the network for so many seconds."""
         self._on_disconnect = leave
 
     # -- tasks ------------------------------------------------------------------------------------------------------
 
     async def submit(self, task: Task) -> Task:
-        """Publish ``task`` with the council pinned: the nodes closest to its key now (consensus rule 1).
-
-        Raises ``UnknownStrategy`` where there is no strategy of the name that it gives.
-        """
-        if not is_deployed(task.strategy):  # those are the business of the nodes that have them
+        """Publish ``task`` with its council, the nodes closest to its key now (rule 1); raise ``UnknownStrategy``."""
+        if not is_deployed(task.strategy):  # only nodes with the deployed module can check it
             place_of(task.strategy)
         task = await self.councils.pinned(task)
         await self.entangled.put(TASKS, task.task_id, task.packed(), "team")
         return task
 
     def watch_tasks(self, changed: Changed, keep: bool = False) -> Watch:
-        """Follow the tasks of the team; ``keep`` leaves them in the store as well."""
+        """Watch the tasks of the team; ``keep`` also stores them."""
         return self.entangled.watch(TASKS, changed, keep)
 
     def watch_group(self, task_id: str, changed: Changed, keep: bool = False) -> Watch:
-        """Follow the reports and the outcome of one task; ``keep`` leaves them in the store as well."""
+        """Watch the reports and the result of one task; ``keep`` also stores them."""
         return self.entangled.watch(group_key(task_id), changed, keep)
 
     def group(
         self, task: Task, heard: Heard, ordered: Changed = lambda records: None, panel: Panel | None = None
     ) -> Group:
-        """Take part in a task: a place among its participants.  Where it has a council, bids go there, too.
+        """Take part in a task, and bid for it if it has a council.
 
-        Then, in a large team, a ``panel`` writes records for all; tasks that are divided together need all of them.
+        In a large team only the reporters (``panel``) of a task with a council write records, except for tasks that
+        are divided among devices, which need the records of all participants.
         """
         from middleware.consensus.bidding.panel import panel_of
 
@@ -307,11 +307,11 @@ class SwarmNode(Service):
         enter = partial(self.bidding, task, task.generation) if task.council else None
         view = self._view(task.strategy) if task.council else None
         devices = self.team_size if task.council and not task.group else lambda: 1
-        told = (heard, self._quietly, ordered, enter, view)
-        return Group(task, self.entangled, *told, panel, devices, self.clock.seconds, self.later)
+        callbacks = (heard, self._log_failures, ordered, enter, view)
+        return Group(task, self.entangled, *callbacks, panel, devices, self.clock.seconds, self.later)
 
     def bidding(self, task: Task, epoch: int, on_summary: OnSummary) -> Bidding:
-        """Bid for ``task`` in ``epoch``: ``on_summary`` is told which bids the task's council announces."""
+        """Bid for ``task`` in ``epoch``; call ``on_summary`` with the bids that the task's council announces."""
         from middleware.consensus.bidding.auction import MAX_WAITING, Auction
 
         waiting = min(float(task.waiting_period), MAX_WAITING)
@@ -319,37 +319,34 @@ class SwarmNode(Service):
         return self.dissemination.enter(auction, on_summary)
 
     def order(self, task_id: str, order: bytes) -> Deferred[Stored]:
-        """Record what an operator wants of a task that is under way (``middleware.tasks.order``, packed)."""
+        """Record an operator's order to a running task (``middleware.tasks.order``, packed)."""
         return self.entangled.put(group_key(task_id), ORDER, order, "team")
 
     def conclude(self, task_id: str, result: Result) -> Deferred[Stored]:
-        """Record how a task ended, as a node that may order tasks."""
+        """Record the result of a task; this node's role must allow orders."""
         return self.entangled.put(group_key(task_id), RESULT, result.packed(), "team")
 
     def justify(self, verdict: Verdict) -> None:
-        """Record why this node's agent decided so; stays when this node goes."""
+        """Publish a decision record of this node's agent; it outlives this node's lease."""
         put = maybeDeferred(self.entangled.put, verdict.key, verdict.slot, verdict.packed(), "team")
-        self._quietly(put)
+        self._log_failures(put)
 
     async def cancel(self, task: Task, result: Result) -> Stored:
-        """Record that ``task`` was cancelled, and have its council grant nothing more; done when nobody can act on it.
+        """Record that ``task`` was cancelled and close its council; return when no agent can act on it.
 
-        Where the council cannot be reached the record alone has to do, and who acts stops when it hears of it.
+        If the council is unreachable only the record is written; the acting agent stops when it receives that.
         """
         written = self.conclude(task.task_id, result)
         with suppress(EntangledError):
-            await self.councils.of(await self._present(task)).close()
+            await self.councils.of(await self._with_present_council(task)).close()
         return await written
 
     def strategy(self, name: str) -> Guard:
-        """The strategy of that name behind its guard, for as long as this node is here.
-
-        Raises ``UnknownStrategy`` where there is none.
-        """
+        """Return the strategy ``name`` in its guard, kept until this node stops; raise ``UnknownStrategy``."""
         return self._strategies.named(name, self.deployed)
 
     def _view(self, strategy: str) -> View:
-        """What the strategy of that name goes by; where there is none, the nearest does."""
+        """Return the report fields that a strategy reads; only the costs if it does not exist."""
         from middleware.consensus.view import View, view_of
 
         try:
@@ -358,62 +355,62 @@ class SwarmNode(Service):
             return View()
 
     def lessee(self, task: Task, changed: Callable[[], None], floor: int) -> Lessee:
-        """The claimant of the right to act on ``task``, in this node's name.
+        """Return this node's proposer for the lease on ``task``; it calls ``changed`` at each change of state.
 
-        ``floor`` is the highest token that the node's own device has obeyed, so that a new token is always higher.
+        ``floor`` is the highest fencing token that the node's device has obeyed; new tokens are higher.
         """
         return self.councils.lessee(task, changed, floor)
 
-    async def _record(self, task: Task) -> None:
-        """Record the present council of ``task``, unless that or a newer one is recorded already."""
+    async def _record_council(self, task: Task) -> None:
+        """Record the present council of ``task``, unless it or a newer one is recorded already."""
         from middleware.consensus.lease.charter import charter_of
 
         charter = charter_of(task.charter)
         if charter is not None:
-            known = await self._present(task.with_council(replace(charter, links=())))
+            known = await self._with_present_council(task.with_council(replace(charter, links=())))
             if known.configuration < task.configuration:
                 await self.entangled.put(group_key(task.task_id), COUNCIL, task.charter, "team")
 
-    async def _present(self, task: Task) -> Task:
-        """``task`` with its present council, as far as it is recorded."""
+    async def _with_present_council(self, task: Task) -> Task:
+        """Return ``task`` with the newest council on record."""
         return council_of(task, await self.entangled.get(group_key(task.task_id)))
 
     @cached_property
     def councils(self) -> Councils:
-        """The councils of the team's tasks: where this node sits in them, and how it asks them."""
-        # Imported by the first who calls it to one: a node that is in none is spared the memory.
+        """The councils of tasks: this node's acceptors, and its proposers."""
+        # Imported on first use: a node without councils saves the memory.
         from middleware.tasks.councils import Councils
 
         def moved(task: Task) -> None:
-            self._quietly(Deferred.fromCoroutine(self._record(task)))
+            self._log_failures(Deferred.fromCoroutine(self._record_council(task)))
 
         def may_sit(public: bytes) -> bool:
             return self._door.may(public, "lease.freed")
 
-        return Councils(self.entangled, self.store, self.clock, self.rng, self._born_at, moved, may_sit)
+        return Councils(self.entangled, self.store, self.clock, self.rng, self._created_at, moved, may_sit)
 
     @cached_property
     def gauge(self) -> Gauge:
-        """How good the ways to this node's peers are."""
-        # Imported by the first who wants to know.
+        """The quality of the paths to this node's peers."""
+        # Imported on first use.
         from middleware.entangled.control.health import Gauge
 
         return Gauge(self.entangled, self.clock, self._chores)
 
     @cached_property
     def _strategies(self) -> Strategies:
-        """What decides on this node who should act."""
-        # Imported by the first who decides, or carries a bid: a node that does neither is spared the memory.
+        """The strategies loaded on this node."""
+        # Imported on first use: a node that neither decides nor carries bids saves the memory.
         from middleware.consensus.selection import Strategies
 
         strategies = Strategies()
-        self._ends.append(strategies.stop)
+        self._stop_calls.append(strategies.stop)
         return strategies
 
     @cached_property
     def dissemination(self) -> Dissemination:
-        """How the bids for tasks travel through this node."""
-        # Imported by the first bid: a node that never carries one is spared the memory.
+        """This node's part in flooding the bids for tasks."""
+        # Imported on first use: a node that carries no bids saves the memory.
         from middleware.consensus.bidding.auctions import Dissemination, Surroundings
 
         entangled = self.entangled
@@ -425,10 +422,10 @@ class SwarmNode(Service):
             lambda: entangled.contact, entangled.overlay.contacts, self.team_size, self.strategy, may_bid
         )
         dissemination = Dissemination(entangled.identity, entangled.endpoint, around, self.clock, self.rng)
-        self._ends.append(dissemination.stop)
+        self._stop_calls.append(dissemination.stop)
         return dissemination
 
-    # -- what peers ask ---------------------------------------------------------------------------------------------
+    # -- requests of peers ---------------------------------------------------------------------------------------------
 
     def _answer_lease(self, method: str, peer: Contact, *arguments: Any) -> object:
         return self.councils.desk.answer(method, peer, arguments)
@@ -437,21 +434,21 @@ class SwarmNode(Service):
         self, peer: Contact, auction: list[object], bids: list[object], age_ms: int, is_shared: bool
     ) -> object:
         offer = partial(self.dissemination.answer_offer, peer, auction, bids, age_ms, is_shared)
-        learnt = self._learn_bidders(peer, bids)
-        return offer() if learnt is None else learnt.addCallback(lambda _: offer())
+        learning = self._learn_bidders(peer, bids)
+        return offer() if learning is None else learning.addCallback(lambda _: offer())
 
     def _answer_announcement(self, peer: Contact, auction: list[object], announcement: list[object]) -> None:
         self.dissemination.answer_announcement(peer, auction, announcement)
 
     def _take_cry(self, peer: Contact, auction: list[object], bids: list[object]) -> None:
-        learnt = self._learn_bidders(peer, bids)
-        if learnt is not None:
-            self._quietly(learnt.addCallback(lambda _: self.dissemination.take_cry(peer, auction, bids)))
+        learning = self._learn_bidders(peer, bids)
+        if learning is not None:
+            self._log_failures(learning.addCallback(lambda _: self.dissemination.take_cry(peer, auction, bids)))
             return
         self.dissemination.take_cry(peer, auction, bids)
 
     def _learn_bidders(self, peer: Contact, bids: list[object]) -> Deferred[None] | None:
-        """Ask ``peer`` for the certificates of those bidders that are unknown here; None where all are known."""
+        """Request missing certificates of bidders from ``peer``; return None if none is missing."""
         from middleware.consensus.bidding.errand import MAX_BIDS
 
         certificates = self.entangled.replica.certificates
@@ -469,8 +466,8 @@ class SwarmNode(Service):
 
     def _answer_disconnect(self, peer: Contact, seconds: float) -> str:
         if not 0 < seconds <= 3600:
-            raise Refused("a device leaves for more than 0 and at most 3600 seconds")
-        # After the answer is out.
+            raise Refused("a device disconnects for more than 0 and at most 3600 seconds")
+        # Leave after the answer was sent.
         self._chores.later(0.05, self._on_disconnect, float(seconds))
         return "leaving"
 
@@ -481,12 +478,12 @@ class SwarmNode(Service):
             device = self.presence.device
             return self.directory.announce(device.name, bounded(value), device.depth)
 
-        self._quietly(maybeDeferred(put))
+        self._log_failures(maybeDeferred(put))
 
-    def _quietly(self, work: Deferred[Any]) -> None:
+    def _log_failures(self, work: Deferred[Any]) -> None:
         def ended(failure: Any) -> None:
             if failure.check(WeatherError, NotRunning, Refused) is None:
-                self._log.failure("while telling the team", failure)
+                self._log.failure("cannot publish to the team", failure)
 
         work.addErrback(ended)
 

@@ -1,7 +1,7 @@
-"""EntangledNode: the verbs of the library, wired over overlay, replica, owner, subscriber and the sealed endpoint.
+"""EntangledNode: the public interface of the peer-to-peer library.
 
-It decides nothing itself: who is known stands in ``overlay`` and ``membership``, what is held for others in ``replica``
-and ``handover``, what is its own in ``owner``, what it reads in ``reader`` and ``subscriber``.
+It connects the parts: ``overlay`` and ``membership`` know the other nodes, ``replica`` and ``handover`` hold records
+for other owners, ``owner`` maintains the node's records, ``reader`` and ``subscriber`` read and watch.
 """
 
 from __future__ import annotations
@@ -42,24 +42,23 @@ if TYPE_CHECKING:
     from middleware.entangled.space.seat import Seat
 
 NOTE = 30.0
-"""Seconds between two notes of the time; whoever comes or goes is noted at once."""
+"""Seconds between two notes of time and contacts; a new or lost contact is noted at once."""
 CONTACTS = "contacts"
 LAST_SEEN = "last seen"
 SEATED = "decree/incarnation"
-"""The note of a node that was in a council in an earlier life, and is asked about it in this one."""
+"""Name of the note of a node that was a member of tuple councils in an earlier run."""
 MAX_NOTED = 64
 
 Answers = TypeVar("Answers", bound=Callable[..., object])
 
 
 class EntangledNode:
-    """One peer; it lives once, from ``start`` to ``stop``.
+    """One node of the network; it runs once, from ``start`` to ``stop``.
 
-    ``lease`` is how long, in seconds, what this node owns on lease outlives its last sign of life; more means fewer
-    false losses, less means quicker notice.  ``rng`` and ``clock`` are the only sources of chance and time; ``wall``
-    gives seconds that go on while the node is off, by which it knows how long it was away (without it, it assumes that
-    it was not for long).  ``door`` says who is let in, and who may do what.  ``lan`` is its place in the group of the
-    LAN, where it finds its team without known nodes.
+    ``lease`` is the time in seconds that leased records outlive the node's last sign of life; more means fewer false
+    failures, less means faster detection.  ``rng`` and ``clock`` are the only sources of randomness and time.  ``wall``
+    returns seconds that continue while the node is off, to measure its absence (None: assume a short one).  ``door`` is
+    the admission check.  ``lan`` is the multicast group in which the node finds its team without known nodes.
     """
 
     _log = Logger()
@@ -102,43 +101,43 @@ class EntangledNode:
             identity.node_id, self.replica, self.overlay, self._reader, self.endpoint, clock, chores
         )
         self.replica.is_sure = self._handover.is_sure
-        self._made_of = (clock, rng)
+        self._acceptor_arguments = (clock, rng)
         self.endpoint.expose("decree.enrol", self._answer_enrol)
-        self.overlay.on_newcomer.add(self._welcome)
-        self.overlay.on_lost.add(self._lost)
-        self.replica.on_record.add(self._held_here)
-        self.replica.on_gone.add(self._gone_here)
+        self.overlay.on_newcomer.add(self._handle_new_contact)
+        self.overlay.on_lost.add(self._handle_lost_contact)
+        self.replica.on_record.add(self._handle_stored_record)
+        self.replica.on_gone.add(self._handle_removed_record)
         if wall is not None:
             self.endpoint.echoer.wall = wall
-        self.endpoint.on_refused.add(self._refused)
-        self.endpoint.on_refusing.add(self._refusing)
+        self.endpoint.on_refused.add(self._handle_rejection)
+        self.endpoint.on_refusing.add(self._handle_rejected_peer)
         self._running = False
 
     @cached_property
     def seat(self) -> Seat:
-        """This node's seat in the councils of tuple spaces."""
-        # Imported by the first who calls it to one: a node that is in none is spared half a MiB.
+        """This node's acceptor for takes in tuple spaces."""
+        # Imported on first use: a node without councils saves half a MiB.
         from middleware.entangled.space.seat import Seat
 
-        seat = Seat(self.endpoint, self.store, *self._made_of)
+        seat = Seat(self.endpoint, self.store, *self._acceptor_arguments)
         seat.written = self.store.written
         return seat
 
-    # -- life -------------------------------------------------------------------------------------------------------
+    # -- lifecycle -----------------------------------------------------------------------------------------------------
 
     @property
     def contact(self) -> Contact:
-        """This node as others know it."""
+        """This node's public key and address."""
         return Contact(self.identity.public, self._network.address)
 
     def start(self) -> None:
-        """Open the port and begin to keep leases, watches and contacts fresh; raises ``PortInUse``."""
+        """Open the port and start to renew leases, watches and contacts; raise ``PortInUse``."""
         self.endpoint.start()
         self._running = True
-        forgot = self._forget_after_long_absence()
+        has_dropped = self._drop_records_after_absence()
         if self.store.noted(SEATED) is not None:
             self.seat.sit()
-        self._handover.start(forgot)
+        self._handover.start(has_dropped)
         for part in (self._membership, self.replica, self._owner, self._subscriber):
             part.start()
         self._chores.every(NOTE, self._note_contacts)
@@ -146,19 +145,19 @@ class EntangledNode:
             self.discovery.start()
 
     def join(self, known: Sequence[Address]) -> Deferred[None]:
-        """Enter the network through ``known`` nodes (thesis, Algorithm 4.1), with back-off until one answers.
+        """Join the network through ``known`` nodes (thesis, Algorithm 4.1), with back-off until one answers.
 
-        The contacts of an earlier life, which the store remembers, are tried beside them, and the detours of the
-        network (tunnels) when nobody has answered for 1.5 s, and whenever all contact is lost.  Fires when one of
-        them has answered, so that keys can be read; where there are none, at once (the first node of a network), or,
-        with a ``lan``, as soon as one of the team answers there or nobody did for a moment.  The node then looks up
-        its own id, meets the others, and takes over what it is to hold.
+        The node also tries the contacts of earlier runs from its store and, after 1.5 s without an answer or on loss of
+        all contacts, the alternate paths of the network (tunnels).  Fires when a node has answered, so that keys can be
+        read.  Without known nodes and contacts it fires at once (the first node of a network) or, with a ``lan``, as
+        soon as a team member answers there or none did for a short time.  The node then looks up its own id, meets the
+        others, and fetches the records it should hold.
         """
         self.reach.acquaintances.bootstraps |= {*known, *detours_of(self._network)}
         return _run(self._join(known))
 
     def stop(self) -> None:
-        """Say goodbye, so that what is leased here leaves at once, and close the port."""
+        """Send goodbye, so that this node's leased records are removed at once, and close the port."""
         if self._running:
             self._note_contacts()
             for contact in self.overlay.contacts():
@@ -166,7 +165,7 @@ class EntangledNode:
         self.vanish()
 
     def vanish(self) -> None:
-        """Leave without a word, as a node does whose power or radio fails."""
+        """Stop without sending anything, as after a failure of power or radio."""
         if self._running:
             self._running = False
             self._subscriber.stop()
@@ -176,24 +175,24 @@ class EntangledNode:
             self.endpoint.stop()
 
     def set_lease(self, lease: float) -> None:
-        """Have what this node owns on lease outlive its last sign of life for so many seconds from now on."""
+        """Set the duration of this node's leases to ``lease`` seconds."""
         self.lease = lease
         self._owner.set_lease(lease)
 
     def evict(self, public: bytes, code: str = REVOKED) -> None:
-        """Part with the node of that key, which the door lets in no more: it is told ``code``, and what it leased goes.
+        """Remove the node with this key, which the admission check rejects: send it ``code``, and drop its leases.
 
-        It is no member any more, and counts in no majority.
+        It is no longer a member, and counts in no majority.
         """
         self.endpoint.evict(public, code)
-        self._parted(public)
+        self._drop_member(public)
 
     def review(self) -> None:
-        """Judge all records that are held, owned or watched anew: what the door knows of their owners has changed."""
+        """Check all held, owned and watched records again, after a change of their owners' authority."""
         for part in (self._owner, self.replica, self._subscriber):
             part.review()
 
-    # -- verbs ------------------------------------------------------------------------------------------------------
+    # -- public ------------------------------------------------------------------------------------------------------
 
     def put(
         self,
@@ -205,66 +204,66 @@ class EntangledNode:
         expect: int | None = None,
         lease: float | None = None,
     ) -> Deferred[Stored]:
-        """Store ``value`` in the slot (key, this node, name); fires with the number of replicas that have it by then.
+        """Store ``value`` in the slot (key, this node, name); fires with the number of replicas that have stored it.
 
-        ``concern`` says how many that are at least: ``one``, a ``majority`` of the k closest members, the absent ones
-        counted in, or ``all`` of these.  Fails with ``NotAcknowledged`` where they cannot be reached; the record may
-        spread all the same.  With ``expect`` it is stored only where the slot's sequence is that (0: it was never
-        filled), and fails with ``Conflict`` else: a compare-and-set.  What it fires with is a number whose ``sequence``
-        says what the slot's is now.  What is leased may have a longer ``lease`` than the node's, in seconds.
+        ``concern`` is the required number of replicas: ``one``, a ``majority`` of the k closest members, absent ones
+        included, or ``all`` of them.  Fails with ``NotAcknowledged`` if too few are reachable; the record may spread
+        nevertheless.  ``expect`` makes it a compare-and-set: it is stored only if the slot has that sequence number
+        (0: never used), and fails with ``Conflict`` otherwise.  The result is an integer with the new number in its
+        attribute ``sequence``.  A leased record may have a longer ``lease`` than the node's, in seconds.
 
-        Fails with ``Refused``, code ``role``, where this node's role, or the owner's as the replicas know it, may not
-        write there.
+        Fails with ``Refused``, code ``role``, if this node's role, as known here or at the replicas, does not allow
+        the record.
 
         Raises ``TooLarge`` at once for a value over ``MAX_VALUE`` or a name over ``MAX_NAME`` bytes, and
-        ``ValueError`` for what is no key.
+        ``ValueError`` for an invalid key.
         """
         if len(value) > MAX_VALUE:
             raise TooLarge(f"value of {len(value)} bytes; a record carries at most {MAX_VALUE}")
         return self._put(key, name, value, lifetime, concern, expect, lease)
 
     def release(self, key: bytes, name: str) -> None:
-        """Look after what this node leased in a slot no more: within its lease it is gone, and leaves no tombstone."""
+        """Stop renewing this node's leased record in a slot: it expires with its lease, without a tombstone."""
         self._owner.release(Slot(key, self.identity.public, name))
 
     def remove(
         self, key: bytes, name: str, concern: Concern = "majority", expect: int | None = None
     ) -> Deferred[Stored]:
-        """Empty a slot of this node: a tombstone takes the place of its record; fails as ``put`` does.
+        """Replace this node's record in a slot by a tombstone; fails as ``put`` does.
 
-        The tombstone stays for ``record.TOMBSTONE_TTL``, longer than any absence that is tolerated.
+        The tombstone stays for ``record.TOMBSTONE_TTL`` seconds, longer than any tolerated absence of a node.
         """
         return self._put(key, name, None, "team", concern, expect)
 
     def get(self, key: bytes, concern: ReadConcern = "majority") -> Deferred[list[Record]]:
-        """What the network holds under ``key``.
+        """Read the records under ``key``.
 
-        A ``majority`` read never shows less than was acknowledged to any writer or shown to any majority read before.
-        A ``fast`` one asks one replica (another one where it is slow): it may be a moment old, and lack a slot that
-        this replica missed.  Where nothing is found, a majority has said so; where too few answer for that, fails with
-        ``Unavailable``.
+        A ``majority`` read returns at least all records acknowledged by a majority write or returned by an earlier
+        majority read.  A ``fast`` read asks one replica, and another if it is slow: the result may be slightly old and
+        lack a slot that this replica missed.  An empty result is confirmed by a majority.  Fails with ``Unavailable``
+        if too few replicas answer.
         """
         self._check(key)
         return _run(self._reader.read(key, concern))
 
     def watch(self, key: bytes, changed: Changed, keep: bool = False) -> Watch:
-        """Call ``changed`` with all records of ``key`` whenever they differ, until ``stop()`` of what is returned.
+        """Call ``changed`` with all records of ``key`` on each change, until ``stop()`` of the returned watch.
 
-        With ``keep`` they are also in the node's own store for as long as they are seen, for whoever reads its file.
+        With ``keep`` the node's own store also has them during the watch, for readers of the store's file.
         """
         self._check(key)
         return self._subscriber.watch(key, changed, keep)
 
     def refresh(self, watch: Watch) -> None:
-        """Ask those that hold a watched key at once whether they hold anything new; else they are asked every 2 s."""
+        """Poll the replicas of a watched key now, instead of at the next interval of 2 s."""
         if self._running:
             self._subscriber.refresh(watch)
 
     def rpc(self, name: str, changes: bool = False) -> Callable[[Answers], Answers]:
-        """Let peers call the decorated function ``answer(peer, *arguments)`` under ``name``.
+        """Make the decorated function ``answer(peer, *arguments)`` callable by peers under ``name``.
 
-        Its plain annotations are checked before it runs; with ``changes`` it runs once for each call, however often the
-        wire repeats it.  What it may return and raise, and ``deadline``, stands at ``Endpoint.expose``.
+        Its annotations of plain types are checked before it runs.  With ``changes`` it runs once per call, even if the
+        request is retransmitted.  ``Endpoint.expose`` describes results, errors and ``deadline``.
         """
 
         def expose(answer: Answers) -> Answers:
@@ -276,21 +275,21 @@ class EntangledNode:
     def call(
         self, contact: Contact, name: str, *arguments: object, timeout: float | None = None, changes: bool = False
     ) -> Deferred[Any]:
-        """Call a peer's method; say ``changes`` where it was exposed so.
+        """Call a method of a peer; set ``changes`` if it was exposed with it.
 
-        Fails with ``Refused`` or a named error of the method's own, or ``NoAnswer``; cancelling it tells the peer.
+        Fails with ``Refused``, an error that the method names, or ``NoAnswer``; cancelling notifies the peer.
         """
         if not self._running:
-            raise NotRunning("start the node first")
+            raise NotRunning("the node is not running; start it first")
         return self.endpoint.ask(contact, name, *arguments, timeout=timeout, changes=changes)
 
     def find_node(self, node_id: bytes) -> Deferred[list[Contact]]:
-        """The k live nodes closest to ``node_id``, by an iterative lookup (Kademlia, section 2.3)."""
+        """Look up the k live nodes closest to ``node_id`` (Kademlia, section 2.3)."""
         self._check(node_id)
         return _run(self.overlay.lookup(node_id))
 
     def newest(self, contact: Contact) -> Contact:
-        """Return the node of ``contact`` with the last address it was heard from."""
+        """Return ``contact`` with the last address it was observed at."""
         return self.overlay.table.get(contact.node_id) or contact
 
     # -- inside -----------------------------------------------------------------------------------------------------
@@ -317,17 +316,17 @@ class EntangledNode:
     async def _compare_and_set(
         self, slot: Slot, value: bytes | None, lifetime: Lifetime, concern: Concern, expect: int
     ) -> Stored:
-        # Nobody but this node writes the slot, but an earlier life of it may have.
+        # Only this node writes the slot, but an earlier run may have done so.
         read = None if self._owner.owns(slot) else (await self._reader.newest(slot.key)).get(slot)
         record = self._owner.next(slot.key, slot.name, value, lifetime, expect, read)
         return await self._owner.put(record, concern)
 
     async def _join(self, known: Sequence[Address]) -> None:
-        ways, noted = detours_of(self._network), self._noted_contacts()
-        self._detour.begin(ways, known)
+        alternate_paths, noted = detours_of(self._network), self._noted_contacts()
+        self._detour.begin(alternate_paths, known)
         if self.discovery is not None and not known:
             await self.discovery.first()
-        if ways and not self._membership.is_entered:
+        if alternate_paths and not self._membership.is_entered:
             await self._detour.beside(self._membership.join(known, noted) if known else None)
         else:
             await self._membership.join(known, noted)
@@ -339,18 +338,18 @@ class EntangledNode:
             self._handover.joined()
             self._note_contacts()
 
-    def _held_here(self, record: Record) -> None:
+    def _handle_stored_record(self, record: Record) -> None:
         self._handover.stored(record)
         self._subscriber.held_here(record)
 
-    def _forget_after_long_absence(self) -> bool:
-        """Re-join empty where this node was away for longer than tombstones are kept; whether it was."""
+    def _drop_records_after_absence(self) -> bool:
+        """Drop all records after an absence longer than tombstones are kept; return whether that was so."""
         try:
-            away = self._wall() - float(self.store.noted(LAST_SEEN) or b"nan") if self._wall else 0.0
-        except ValueError:  # a rotten file may hold anything
-            away = 0.0
-        if is_long := away > TOLERATED_ABSENCE:
-            self._log.warn("away for {days:.0f} days: what was held is forgotten", days=away / 86400)
+            absent_s = self._wall() - float(self.store.noted(LAST_SEEN) or b"nan") if self._wall else 0.0
+        except ValueError:  # a corrupt file may hold anything
+            absent_s = 0.0
+        if is_long := absent_s > TOLERATED_ABSENCE:
+            self._log.warn("away for {days:.0f} days: all records in the store are dropped", days=absent_s / 86400)
             for record in self.store.records():
                 self.store.discard(record.slot)
         return is_long
@@ -358,34 +357,34 @@ class EntangledNode:
     def _answer_enrol(self, peer: Contact) -> bytes:
         return self.seat.answer_enrol(peer)
 
-    def _welcome(self, contact: Contact) -> None:
-        if not self.overlay.is_large:  # where many come, the next note will do
+    def _handle_new_contact(self, contact: Contact) -> None:
+        if not self.overlay.is_large:  # in a large network the periodic note is enough
             self._note_contacts()
         for part in (self._owner, self._handover, self._subscriber):
             part.welcome(contact)
 
-    def _lost(self, contact: Contact) -> None:
+    def _handle_lost_contact(self, contact: Contact) -> None:
         self._subscriber.forget(contact.node_id)
         self._handover.lost(contact)
         self._membership.lost(contact)
         self.reach.ways.lost(contact)
 
-    def _refused(self, contact: Contact, code: str) -> None:
-        """A member does not let this node in: it cannot be reached, and counts as one that is absent."""
+    def _handle_rejection(self, contact: Contact, code: str) -> None:
+        """Count a member that rejects this node as absent."""
         self.overlay.turned_away(contact)
 
-    def _refusing(self, contact: Contact, code: str) -> None:
-        if code not in (DOUBLED, SUPERSEDED):  # else the other one of that identity is a member still
-            self._parted(contact.public)
+    def _handle_rejected_peer(self, contact: Contact, code: str) -> None:
+        if code not in (DOUBLED, SUPERSEDED):  # for these the other node with that identity stays a member
+            self._drop_member(contact.public)
 
-    def _parted(self, public: bytes) -> None:
+    def _drop_member(self, public: bytes) -> None:
         contact = self.overlay.known(node_id(public))
         if contact is not None:
             self.replica.answer_goodbye(contact)
             self._membership.forget(contact)
             self._note_contacts()
 
-    def _gone_here(self, record: Record) -> None:
+    def _handle_removed_record(self, record: Record) -> None:
         if not self._owner.lost_here(record):
             self._subscriber.gone_here(record)
 
@@ -395,20 +394,20 @@ class EntangledNode:
         known = {c.node_id: c for c in [*self.overlay.contacts(), *self.overlay.roster.absent()]}
         contacts = sorted(known.values(), key=lambda c: c.node_id)[:MAX_NOTED]
         if contacts:
-            # One that has lost sight of everybody had better remember whom it knew.
+            # A node without contacts keeps the last note of them.
             self.store.note(CONTACTS, msgpack.packb([c.packed() for c in contacts]))
 
     def _noted_contacts(self) -> list[Contact]:
         try:
             noted = msgpack.unpackb(self.store.noted(CONTACTS) or b"\x90")
-        except Exception:  # a rotten file may hold anything
+        except Exception:  # a corrupt file may hold anything
             return []
         contacts = [unpacked(fields) for fields in noted] if isinstance(noted, list) else []
         return [c for c in contacts if c is not None and c.node_id != self.identity.node_id][:MAX_NOTED]
 
     def _check(self, key: bytes) -> None:
         if not self._running:
-            raise NotRunning("start the node first")
+            raise NotRunning("the node is not running; start it first")
         if len(key) != KEY_BYTES:
             raise ValueError(f"a key has {KEY_BYTES} bytes, this one {len(key)}")
 

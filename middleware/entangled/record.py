@@ -1,8 +1,8 @@
-"""Record: what the network keeps, and which of two records holds.
+"""Records: signed values under a key, and the order between two records of one slot.
 
-A record lives in a slot (key, owner, name).  Many owners may write under one key, each in slots of its own, so a set
-under one key merges without read-modify-write.  In one slot the higher sequence wins; a record without a value is a
-tombstone.  Records are signed by their owner (Ed25519); durations travel, moments do not.
+A record lives in a slot (key, owner, name).  Many owners may write under one key, each in its own slots, so the set of
+records under a key merges without read-modify-write.  Within a slot the higher sequence number wins; a record without
+a value is a tombstone.  The owner signs each record (Ed25519).  Records carry durations, not times of day.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ MAX_VALUE = 2**20
 MAX_NAME = 64
 MAX_SIGNED = 512
 FRAME_BYTES = 160
-"""What a record takes in a message beside its name and value."""
+"""Bytes of a record in a message in addition to its name and value."""
 MAX_TTL = 30 * 86400.0
 TEAM_TTL = 86400.0
-"""How long a team record outlives the last word of its owner."""
+"""Seconds that a team record stays after it was stored or refreshed."""
 TOLERATED_ABSENCE = 6 * 86400.0
-"""A node that was away for longer re-joins empty; a robot in its box over the holidays is a new one.  What it holds
-might have been deleted meanwhile, and who could tell it?"""
+"""Seconds; a node that was away for longer joins with an empty store, because tombstones of records that it still holds
+may have expired meanwhile."""
 TOMBSTONE_TTL = TOLERATED_ABSENCE + 86400.0
-"""A tombstone outlives every absence that is tolerated, by a day for clocks and late deliveries."""
+"""Seconds that a tombstone stays: a day longer than ``TOLERATED_ABSENCE``, for clock errors and late delivery."""
 
 
 class Slot(NamedTuple):
-    """Where a record lives."""
+    """The place of one record."""
 
     key: bytes
     owner: bytes
@@ -43,11 +43,11 @@ class Slot(NamedTuple):
 
 @dataclass(frozen=True)
 class Record:
-    """One signed entry.
+    """One signed value in its slot.
 
-    ``owner`` is the public key (32 bytes); ``ttl`` is in seconds and counts from arrival: a ``leased`` record lives
-    that long after the last sign of its owner, a ``team`` record that long after it was stored.  ``value`` is at most
-    ``MAX_VALUE`` bytes of msgpack, or None for a tombstone.  ``slot`` is where the record lives.
+    ``owner`` is the public key (32 bytes).  ``ttl`` is in seconds and counts from arrival: a ``leased`` record expires
+    that long after the owner's last sign of life, a ``team`` record that long after it was stored.  ``value`` is at
+    most ``MAX_VALUE`` bytes of msgpack, or None for a tombstone.
     """
 
     key: bytes
@@ -65,46 +65,46 @@ class Record:
 
     @property
     def is_tombstone(self) -> bool:
-        """Whether this record says that its slot is empty."""
+        """Whether this record marks its slot as empty."""
         return self.value is None
 
     @property
     def message_bytes(self) -> int:
-        """About how many bytes this record takes in a message; what it takes in a store is ``data.store.weight``."""
+        """The approximate size of this record in a message; ``data.store.weight`` is its size in a store."""
         return len(self.value or b"") + len(self.name.encode()) + FRAME_BYTES
 
     def beats(self, other: Record | None) -> bool:
-        """Whether this record holds against ``other`` of the same slot; a total order, so replicas agree."""
+        """Return whether this record replaces ``other`` in their slot; a total order, so replicas converge."""
         if other is None:
             return True
         return (self.sequence, self.signature) > (other.sequence, other.signature)
 
     def signed(self, identity: Identity) -> Record:
-        """This record with its owner's signature."""
+        """Return a copy of this record signed by its owner's ``identity``."""
         return replace(self, signature=identity.sign(self._signed_bytes()))
 
     def is_genuine(self) -> bool:
-        """Whether the owner signed exactly this."""
+        """Return whether the owner's signature over all fields is valid."""
         return verified(self.owner, self._signed_bytes(), self.signature)
 
     def digest(self) -> bytes:
-        """32 bytes that no other record has, in any part of it."""
+        """Return the 32-byte hash of all fields and the signature."""
         return hashlib.blake2s(self._signed_bytes() + self.signature).digest()
 
     def _signed_bytes(self) -> bytes:
         return bytes(msgpack.packb([b"swarm-record-1", *self.packed()[:-1]]))
 
     def packed(self) -> list[object]:
-        """The record as it stands in a message."""
+        """Return the fields for a message."""
         return [self.key, self.name, self.owner, self.sequence, self.lifetime, self.ttl, self.value, self.signature]
 
 
 def unpacked(fields: object) -> Record | None:
-    """The record that ``packed`` made, or None where the fields cannot be one (wrong type, length or range)."""
+    """Parse the fields of ``Record.packed``; None if a type, length or range is wrong."""
     if not isinstance(fields, list) or len(fields) != 8:
         return None
     key, name, owner, sequence, lifetime, ttl, value, signature = fields
-    lawful = (
+    is_valid = (
         isinstance(key, bytes)
         and len(key) == KEY_BYTES
         and isinstance(name, str)
@@ -120,18 +120,18 @@ def unpacked(fields: object) -> Record | None:
         and isinstance(signature, bytes)
         and len(signature) == 64
     )
-    return Record(key, name, owner, sequence, lifetime, ttl, value, signature) if lawful else None
+    return Record(key, name, owner, sequence, lifetime, ttl, value, signature) if is_valid else None
 
 
 def slot_unpacked(fields: object) -> Slot | None:
-    """The slot that stands in a message as a list of key, owner and name, or None where the fields cannot be one."""
+    """Parse a slot, [key, owner, name]; None if a type is wrong."""
     if not isinstance(fields, list) or [type(part) for part in fields] != [bytes, bytes, str]:
         return None
     return Slot(*fields)
 
 
 class Signed:
-    """Remembers which records had a good signature, the last ``MAX_SIGNED`` of them; to check one takes 80 us."""
+    """A cache of the last ``MAX_SIGNED`` records with a valid signature; verifying one takes 80 us."""
 
     def __init__(self) -> None:
         self._digests: OrderedDict[bytes, None] = OrderedDict()
@@ -140,7 +140,7 @@ class Signed:
         return len(self._digests)
 
     def is_genuine(self, record: Record) -> bool:
-        """Whether the owner signed exactly this, as ``record.is_genuine`` says."""
+        """Return ``record.is_genuine()``, from the cache if possible."""
         digest = record.digest()
         if digest in self._digests:
             self._digests.move_to_end(digest)
@@ -154,5 +154,5 @@ class Signed:
 
 
 def hashed_key(text: str) -> bytes:
-    """The 160-bit key of a text (thesis, Algorithm 4.2)."""
+    """Return the 160-bit key of ``text`` (thesis, Algorithm 4.2)."""
     return hashlib.blake2s(text.encode(), digest_size=KEY_BYTES).digest()

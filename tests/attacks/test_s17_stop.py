@@ -292,7 +292,7 @@ class LossTests(StopCase):
         """Let a replica drop a record, as it does when its time is over."""
         record = house.node.store.slot(slot)
         if record is not None and house.node.store.discard(slot):
-            house.node.replica._gone([record])
+            house.node.replica._notify_gone([record])
 
     def test_a_stop_that_is_not_saved_says_so(self) -> None:
         """A node whose disk takes nothing stands, and does not acknowledge the stop as one that would outlast it."""

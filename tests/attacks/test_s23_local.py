@@ -50,7 +50,7 @@ class ControlSocketTests(SynchronousTestCase):
         self.assertEqual(found("vaio").name, "vaio.control")
         self.be_another()
         for use in (found, made):
-            self.assertIn("not yours alone", str(self.assertRaises(NoControl, use, "vaio")))
+            self.assertIn("accessible to other users", str(self.assertRaises(NoControl, use, "vaio")))
 
     def test_page_of_another(self) -> None:
         """Nobody is led to a page that another user's note names."""
@@ -87,7 +87,7 @@ class ControlSocketTests(SynchronousTestCase):
         for each in (file, link):
             self.assertIn("is no socket", str(self.assertRaises(NoControl, list, asked(each, {}))))
         self.be_another()
-        self.assertIn("not yours alone", str(self.assertRaises(NoControl, list, asked(path, {}))))
+        self.assertIn("accessible to other users", str(self.assertRaises(NoControl, list, asked(path, {}))))
 
     def test_service_of_another_user(self) -> None:
         """Root asks a service of another user if it names the folder, and never in the shared folder."""

@@ -91,7 +91,7 @@ _GENUINE = {
     for place, name in [
         (Greeter, "on_who"),
         (Session, "open"),
-        (Seat, "_claimed"),
+        (Seat, "_prepare"),
         (Seat, "_load"),
         (Log, "keep"),
         (Acceptor, "release"),
@@ -110,7 +110,7 @@ def _won_by_one(tally: Tally) -> Any:
 
 
 def _claimed_for_ever(self: Seat, place: Any, ballot: Any, lease: float, now: float) -> Any:
-    return _GENUINE[Seat, "_claimed"](self, place, ballot, lease + 1e6, now)
+    return _GENUINE[Seat, "_prepare"](self, place, ballot, lease + 1e6, now)
 
 
 def _let_go_as_if_at_rest(self: Lessee, ballot: Any, heirs: Any = ()) -> Any:
@@ -259,18 +259,18 @@ _BUGS: dict[tuple[str, ...], dict[str, list[tuple[Any, str, Any]]]] = {
             (Handover, "is_sure", lambda self: True),
         ],
         "absent members do not count": [(Overlay, "voters", lambda self, key, targets: _voters(targets))],
-        "nothing instead of unavailable": [(Reader, "_nothing", lambda self, answers, voters: [])],
+        "nothing instead of unavailable": [(Reader, "_confirm_empty", lambda self, answers, voters: [])],
         "signature not checked": [(Replica, "is_lawful", lambda self, record, peer: True)],
         "sure before it has caught up": [(Handover, "is_sure", lambda self: True)],
         "a read from the own store counts as sure": [(Reader, "newest", _read_here)],
-        "numbers start again after a restart": [(owner, "BLOCK", -(2**40))],
+        "numbers start again after a restart": [(owner, "SEQUENCE_BLOCK", -(2**40))],
         "the absent are not sought": [(Roster, "absent", lambda self: [])],
         "any answer counts": [(reader, "_votes", _any_answer)],
     },
     ("tuples",): {
         "one promise is a majority": [(takes, "conclude", _won_by_one)],
         "votes forgotten by a restart": [(Seat, "_load", _load_without_votes)],
-        "the lease of the dead never ends": [(Seat, "_claimed", _claimed_for_ever)],
+        "the lease of the dead never ends": [(Seat, "_prepare", _claimed_for_ever)],
         "a take is not noted": [(Keeper, "note", _nothing), (Keeper, "doubt", _idle)],
         "slots are used too early": [(Keeper, "_slot", _only_slot)],
         "who waits is not woken": [(Shelf, "_changed", _told_what_is_known)],
@@ -292,11 +292,11 @@ _BUGS: dict[tuple[str, ...], dict[str, list[tuple[Any, str, Any]]]] = {
         "no clock margin": [(lessee, "CLOCK_MARGIN", 0.0)],
         "a clock that stands still while suspended": [(Machine, "COUNTS_SUSPENSION", False)],
         "the council is whoever is closest now": [(Leases, "council_for", _closest_now)],
-        "a stand-by does not ask": [(Lessee, "_wait", _only_listens)],
-        "minority grants are kept": [(Lessee, "_let_go_of_minority", _idle)],
+        "a stand-by does not ask": [(Lessee, "_schedule_from", _only_listens)],
+        "minority grants are kept": [(Lessee, "_release_minority", _idle)],
         "the token is not stored": [(Log, "keep", _forgets_tokens)],
         "the time to stop is ignored": [(Lessee, "_deadline_of", _deadline_without_the_stop)],
-        "released before it stands still": [(Lessee, "_let_go", _let_go_as_if_at_rest)],
+        "released before it stands still": [(Lessee, "_send_release", _let_go_as_if_at_rest)],
         "granted before it stands still": [(Acceptor, "release", _released_at_rest)],
         "the device takes lower tokens": [(Gate, "admit", _admits_lower_tokens)],
         "a restarted member grants at once": [(Acceptor, "_silence", lambda self, ttl: 0.0)],

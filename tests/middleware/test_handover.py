@@ -92,9 +92,9 @@ class LifeTests(FleetCase):
         handover: Any = fleet.nodes[1]._handover
         [record] = fleet.nodes[1].replica.held(KEY)
         fleet.clock.advance(100.0)
-        handover._stay(record.slot, (record.sequence, b"anothers"), TEAM_TTL)
+        handover._extend_life(record.slot, (record.sequence, b"anothers"), TEAM_TTL)
         self.assertLess(self.left(fleet, 1), TEAM_TTL - 90.0)
-        handover._stay(record.slot, (record.sequence, record.signature[:8]), 9e9)
+        handover._extend_life(record.slot, (record.sequence, record.signature[:8]), 9e9)
         self.assertLess(abs(self.left(fleet, 1) - TEAM_TTL), 1.0)
 
 

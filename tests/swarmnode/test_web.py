@@ -56,6 +56,6 @@ class WebRoleTests(SynchronousTestCase):
         error = self.assertRaises(MissingExtra, web_page, settings, seams, reactor, service.assembly.node)
         self.assertEqual(
             told(error, "x.toml"),
-            "x.toml: [node] roles: the web role needs more than the bare node; "
-            "install it by: pip install 'swarm-node[web]'",
+            "x.toml: [node] roles: the web role needs libraries that are not installed; "
+            "run: pip install 'swarm-node[web]'",
         )

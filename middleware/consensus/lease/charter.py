@@ -1,7 +1,7 @@
-"""Charter: the proof of which nodes are the council of a task; pure.
+"""The certificate of a task's council (charter); pure.
 
-The first council is signed by the member that publishes the task.  Each later one is certified by a majority of the
-council before it: every member that accepts a change signs it.  So no single node can name a council.
+The member that publishes a task signs its first council.  A majority of each council certifies the next one: every
+member that accepts a change signs it.  So no single node can name a council.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ from middleware.entangled.quorum.ballot import FIRST, NONE, ROOM, Ballot, is_num
 from middleware.entangled.quorum.register import Reply
 
 MAX_LINKS = 64
-"""Changes of one task's council; a change of three members takes 350 bytes, one of seven 700."""
+"""Maximum changes of one task's council; a change to three members takes 350 bytes, one to seven 700."""
 LEAST = 3
-"""Members of a council that was changed, at least: of a smaller one a single member would be a majority."""
+"""Minimum members of a new council after a change: a single member of a smaller one would be a majority."""
 MAX_TOKEN = 2 * ROOM
-"""No council begins above it, whatever one member of the council before says."""
+"""Upper bound of the first token of a council, so that one member cannot exhaust the tokens."""
 SIGNATURE_BYTES = 64
 
 Votes = tuple[tuple[int, int, bytes], ...]
-"""Of each member that signed: its place in the council, its highest token, its signature."""
+"""For each member that signed: its place in the council, its highest token, its signature."""
 
 
 class Link(NamedTuple):
-    """One change: the ``members`` of the next council, and who of the one before accepted them under ``ballot``."""
+    """One change: the ``members`` of the next council, and the ``votes`` of the previous one under ``ballot``."""
 
     members: tuple[Contact, ...]
     ballot: Ballot
@@ -42,7 +42,7 @@ class Link(NamedTuple):
 
 @dataclass(frozen=True)
 class Charter:
-    """The first council of a task, signed by ``owner``, and the changes of it, the oldest first."""
+    """The first council of a task, signed by ``owner``, and its changes, the oldest first."""
 
     owner: bytes
     first: tuple[Contact, ...]
@@ -66,90 +66,90 @@ class Charter:
 
     @property
     def token(self) -> int:
-        """The token above which the newest council goes on."""
+        """The token above which the newest council grants leases."""
         return min(MAX_TOKEN, max((token for link in self.links for _, token, _ in link.votes), default=0))
 
     @property
     def pin(self) -> tuple[bytes, bytes]:
-        """What tells the charters of different first councils apart."""
+        """The identity of the first council: its owner and signature."""
         return self.owner, self.signature
 
     def extended(self, members: tuple[Contact, ...], ballot: Ballot, votes: Votes) -> Charter:
-        """This charter with one more council; raises ``Refused`` where it has changed too often."""
+        """Return this charter with one more council; raise ``Refused`` after ``MAX_LINKS`` changes."""
         if len(self.links) >= MAX_LINKS:
-            raise Refused(f"the council has changed {MAX_LINKS} times; have the operator make the task anew")
+            raise Refused(f"the council has changed {MAX_LINKS} times; ask the operator to submit the task again")
         return replace(self, links=(*self.links, Link(members, ballot, votes)))
 
     def is_genuine(self, task_id: str) -> bool:
-        """Whether every signature holds; whether ``owner`` may publish tasks is another question."""
+        """Return whether all signatures are valid; does not check whether ``owner`` may publish tasks."""
         return _is_genuine(self.packed, task_id)
 
     @cached_property
     def packed(self) -> bytes:
-        """The charter as it stands in a message, a record or a note."""
+        """The encoding for messages, records and notes."""
         links = [[pack_members(link.members), *link.ballot, [list(vote) for vote in link.votes]] for link in self.links]
         return bytes(msgpack.packb([self.owner, pack_members(self.first), self.signature, links]))
 
 
 def pin(identity: Identity, task_id: str, members: tuple[Contact, ...]) -> Charter:
-    """The charter of a new task, whose first council is ``members``."""
-    return Charter(identity.public, members, identity.sign(_pinned(task_id, members)))
+    """Return the charter of a new task with the first council ``members``."""
+    return Charter(identity.public, members, identity.sign(_pin_bytes(task_id, members)))
 
 
 def sign_change(
     identity: Identity, task_id: str, configuration: int, ballot: Ballot, members: tuple[Contact, ...], token: int
 ) -> bytes:
     """Certify that ``members`` were accepted as the council after ``configuration``, and the highest token granted."""
-    return identity.sign(_changed(task_id, configuration, ballot, members, token))
+    return identity.sign(_change_bytes(task_id, configuration, ballot, members, token))
 
 
 def sign_end(identity: Identity, task_id: str, configuration: int, agent: str, token: int) -> bytes:
     """Certify that ``agent`` closed the task under ``token``, which it was granted."""
-    return identity.sign(_ended(task_id, configuration, agent, token))
+    return identity.sign(_end_bytes(task_id, configuration, agent, token))
 
 
 def charter_of(packed: object) -> Charter | None:
-    """The charter that ``packed`` is, or None where it cannot be one; its signatures are not checked.  Never raises."""
+    """Decode a charter without a check of its signatures; None if it is invalid; never raises."""
     return _charter_of(packed) if isinstance(packed, bytes) and 0 < len(packed) <= MAX_PROOF_BYTES else None
 
 
 def is_change_signed(
     member: Contact, task_id: str, configuration: int, ballot: Ballot, members: tuple[Contact, ...], reply: Reply
 ) -> bool:
-    """Whether ``reply`` has the signature of ``member`` under that change (``sign_change``)."""
-    statement = _changed(task_id, configuration, ballot, members, reply.token)
+    """Return whether ``reply`` has a valid signature of the change by ``member`` (``sign_change``)."""
+    statement = _change_bytes(task_id, configuration, ballot, members, reply.token)
     return verified(member.public, statement, reply.proof)
 
 
 def is_end_signed(member: Contact, task_id: str, configuration: int, agent: str, token: int, proof: bytes) -> bool:
-    """Whether ``proof`` is the signature of ``member`` under that end (``sign_end``)."""
-    return verified(member.public, _ended(task_id, configuration, agent, token), proof)
+    """Return whether ``proof`` is a valid signature of the end by ``member`` (``sign_end``)."""
+    return verified(member.public, _end_bytes(task_id, configuration, agent, token), proof)
 
 
 @dataclass(frozen=True)
 class Ending:
-    """The proof that a task was ended under a token: a majority of the council of ``charter`` signed it."""
+    """The proof that a task was ended under a token, signed by a majority of the council of ``charter``."""
 
     charter: Charter
     signatures: tuple[tuple[int, bytes], ...]
 
     def is_genuine(self, task_id: str, agent: str, token: int) -> bool:
-        """Whether a majority says that ``agent`` ended the task under ``token``."""
+        """Return whether a majority has signed that ``agent`` ended the task under ``token``."""
         members = self.charter.members
-        statement = _ended(task_id, self.charter.configuration, agent, token)
+        statement = _end_bytes(task_id, self.charter.configuration, agent, token)
         return self.charter.is_genuine(task_id) and _is_majority(
             members, {place: (statement, signature) for place, signature in self.signatures}
         )
 
     @property
     def packed(self) -> bytes:
-        """The proof as it stands in a record; the first council stands in the record of the task already."""
+        """The encoding for a record, without the first council, which the task's record has already."""
         charter = self.charter.packed if self.charter.links else b""
         return bytes(msgpack.packb([charter, [list(each) for each in self.signatures]]))
 
 
 def ending_of(packed: object, pinned: Charter) -> Ending | None:
-    """The proof that ``packed`` is for the task that was published with ``pinned``, or None.  Never raises."""
+    """Decode the proof for the task published with the charter ``pinned``; None if invalid; never raises."""
     fields = unpack_note(packed) if isinstance(packed, bytes) and len(packed) <= 2 * MAX_PROOF_BYTES else None
     if not isinstance(fields, list) or len(fields) != 2 or not isinstance(fields[1], list):
         return None
@@ -162,13 +162,13 @@ def ending_of(packed: object, pinned: Charter) -> Ending | None:
 
 
 class Judge:
-    """Reads charters that others sent; ``may_pin`` says whether the holder of a key may publish that task."""
+    """Checks charters from peers; ``may_pin`` returns whether the owner of a key may publish the task."""
 
     def __init__(self, may_pin: Callable[[bytes, str], bool]) -> None:
         self._may_pin = may_pin
 
     def read(self, task_id: str, packed: object) -> Charter | None:
-        """The charter of ``task_id`` that ``packed`` is, or None where anything in it does not hold."""
+        """Decode and check the charter of ``task_id``; None if anything in it is invalid."""
         charter = charter_of(packed)
         if charter is None or not self._may_pin(charter.owner, task_id) or not charter.is_genuine(task_id):
             return None
@@ -178,25 +178,25 @@ class Judge:
 # -- inside ---------------------------------------------------------------------------------------------------------
 
 
-@lru_cache(maxsize=64)  # each costs 80 us a signature, and the same one is read again and again
+@lru_cache(maxsize=64)  # 80 us per signature, and the same charter is read repeatedly
 def _is_genuine(packed: bytes, task_id: str) -> bool:
     charter = _charter_of(packed)
-    if charter is None or not verified(charter.owner, _pinned(task_id, charter.first), charter.signature):
+    if charter is None or not verified(charter.owner, _pin_bytes(task_id, charter.first), charter.signature):
         return False
-    before, configuration = charter.first, FIRST
+    previous, configuration = charter.first, FIRST
     for members, ballot, votes in charter.links:
         statements = {
-            place: (_changed(task_id, configuration, ballot, members, token), signature)
+            place: (_change_bytes(task_id, configuration, ballot, members, token), signature)
             for place, token, signature in votes
         }
-        if len(members) < LEAST or not _is_majority(before, statements):
+        if len(members) < LEAST or not _is_majority(previous, statements):
             return False
-        before, configuration = members, configuration + 1
+        previous, configuration = members, configuration + 1
     return True
 
 
 def _is_majority(members: tuple[Contact, ...], signed: Mapping[int, tuple[bytes, bytes]]) -> bool:
-    """Whether a majority of ``members`` signed, each the statement at its place."""
+    """Return whether a majority of ``members`` signed, each the statement at its place."""
     if len(signed) < majority(len(members)) or any(place >= len(members) for place in signed):
         return False
     return all(verified(members[place].public, *pair) for place, pair in signed.items())
@@ -214,8 +214,8 @@ def _charter_of(packed: bytes) -> Charter | None:
     if not isinstance(rows, list) or len(rows) > MAX_LINKS:
         return None
     links = [_link_of(row) for row in rows]
-    known = tuple(link for link in links if link is not None)
-    return Charter(owner, members, signature, known) if len(known) == len(links) else None
+    valid = tuple(link for link in links if link is not None)
+    return Charter(owner, members, signature, valid) if len(valid) == len(links) else None
 
 
 def _link_of(row: Any) -> Link | None:
@@ -238,14 +238,14 @@ def _is_bytes(value: object, size: int) -> bool:
     return isinstance(value, bytes) and len(value) == size
 
 
-def _pinned(task_id: str, members: tuple[Contact, ...]) -> bytes:
+def _pin_bytes(task_id: str, members: tuple[Contact, ...]) -> bytes:
     return bytes(msgpack.packb([b"swarm-council-1", task_id, FIRST, pack_members(members)]))
 
 
-def _changed(task_id: str, configuration: int, ballot: Ballot, members: tuple[Contact, ...], token: int) -> bytes:
+def _change_bytes(task_id: str, configuration: int, ballot: Ballot, members: tuple[Contact, ...], token: int) -> bytes:
     fields = [b"swarm-council-change-1", task_id, configuration, *ballot, pack_members(members), token]
     return bytes(msgpack.packb(fields))
 
 
-def _ended(task_id: str, configuration: int, agent: str, token: int) -> bytes:
+def _end_bytes(task_id: str, configuration: int, agent: str, token: int) -> bytes:
     return bytes(msgpack.packb([b"swarm-task-end-1", task_id, configuration, agent, token]))

@@ -1,7 +1,7 @@
 """The states of a lease client, and its transition table.  Pure.
 
 The client (``lessee``) turns calls, timers and the results of rounds into events, looks up the transition, and performs
-its actions.  A claim runs through PREPARING, PROMISED where the previous lease has not ended, and PROPOSING to HOLDING;
+its actions.  A claim runs through PREPARING, PROMISED if the previous lease has not ended, and PROPOSING to HOLDING;
 a standby alternates between WATCHING and LOOKING until the lease is about to end.
 """
 
@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 
 class State(Enum):
-    """The value says what the client does in the state."""
+    """A state of the client; the value describes it."""
 
     IDLE = "does not want the lease"
     WATCHING = "waits, and then asks when the lease ends"
@@ -29,7 +29,7 @@ class State(Enum):
 
 
 class Event(Enum):
-    """The value says what happened."""
+    """An input of the client; the value describes it."""
 
     WANT = "the agent wants the lease"
     STAND_BY = "the agent wants the lease when its holder loses it"
@@ -61,7 +61,7 @@ class Event(Enum):
 
 
 class Action(Enum):
-    """The value says what the client does at the transition."""
+    """An action at a transition; the value describes it."""
 
     CANCEL = "drop the round and the timer"
     LOOK = "ask when the lease ends"
@@ -184,12 +184,12 @@ TABLE: Mapping[State, Mapping[Event, Step]] = {
     },
     S.OVER: {E.RELEASE: Step(S.OVER, (A.CANCEL,))},
 }
-"""The transitions.  A pair that stands neither here nor in ``IMPOSSIBLE`` changes nothing."""
+"""The transitions.  A pair that is neither here nor in ``IMPOSSIBLE`` changes nothing."""
 
 TIMED = (S.WATCHING, S.WAITING, S.PROMISED, S.HOLDING, S.OUTBID)
-"""States in which a timer runs, but for the time between MOVE and MOVED."""
+"""States in which a timer runs, except between MOVE and MOVED."""
 ASKING = (S.LOOKING, S.PREPARING, S.PROPOSING)
-"""States with a round under way."""
+"""States with a running round."""
 ACTIVE = tuple(state for state in State if state not in (S.IDLE, S.OVER))
 """States in which the agent wants the lease."""
 _OF_TIMERS = (E.DUE, E.DUE_FREED, E.EXPIRED)
@@ -209,7 +209,7 @@ IMPOSSIBLE: frozenset[tuple[State, Event]] = frozenset(
         *((state, E.DUE_FREED) for state in (S.HOLDING, S.OUTBID)),
     ]
 )
-"""Pairs that the client never meets: the result of a round in another state, and the like."""
+"""Pairs that cannot occur, such as the result of a round in another state."""
 
 
 def next_step(state: State, event: Event) -> Step:

@@ -1,8 +1,8 @@
-"""Council: the nodes whose majority says who may act on a task, as a claimant knows them; pinned, never "the closest".
+"""The requests of a proposer to the council of a task, the nodes whose majority grants its lease.
 
-Which nodes these are stands in the task's record with a number, its configuration.  A change is decided by a majority
-of the old council and by nobody else, never while a claim is open (consensus rules 1 and 2).  The signatures of that
-majority are kept in the ``charter``; what a single member says of another council is not believed.
+The task's record names the council with a number, its configuration.  Only a majority of the present council can change
+it, and only while no lease is valid (consensus rules 1 and 2).  The ``charter`` has the signatures of that majority; a
+claim of a single member about another council is ignored.
 """
 
 from __future__ import annotations
@@ -24,32 +24,32 @@ from middleware.entangled.quorum.register import Kind, Reply
 from middleware.entangled.quorum.round import PAUSE, Round, Tally
 
 Ask = Callable[[Contact, str, tuple[Any, ...]], Deferred[Any]]
-"""Ask a council member: (member, method, arguments)."""
+"""Calls a method of a council member: (member, method, arguments)."""
 IsGenuine = Callable[[int, Reply], bool]
 Read = Callable[[str, object], Charter | None]
-"""Makes a charter of what a member sent, where it holds: (task id, packed)."""
+"""Decodes and checks a charter: (task id, packed)."""
 LEAP = 16
-"""More ballots than a holder needs until a stand-by looks."""
+"""Counters to skip: more than a holder uses before a standby asks again."""
 
 
 class OpenClaim(Refused):
-    """The council cannot change: an agent holds a lease of it."""
+    """The council cannot change while an agent holds a lease."""
 
 
 class Superseded(Refused):
-    """Another council was chosen than the one that was asked for; the present one is known now."""
+    """Another change of the council was decided; ``Council`` has the present one."""
 
 
 class NoMajority(Refused):
-    """Too few members of the council answered, or another proposer was faster; try again."""
+    """Too few members of the council agreed, or another proposer was faster; try again."""
 
 
 class Council:
-    """The council of one task, in the name of ``agent``.
+    """The council of one task as the proposer ``agent`` knows it.
 
-    ``moved`` is called when it has become another one, so that the task's record can say so.  ``token`` is the highest
-    that was ever seen: whatever is claimed next lies above it.  ``charter`` proves which council it is, ``read`` makes
-    one of what a member sent, and ``ending`` is the proof that the task was closed under a token.
+    ``moved`` is called after a change of the council, to update the task's record.  ``token`` is the highest known
+    token; new claims are above it.  ``charter`` proves the council, ``read`` decodes and checks charters from members,
+    and ``ending`` is the proof that the task was closed under a token.
     """
 
     def __init__(
@@ -81,16 +81,16 @@ class Council:
         self._clock = clock
         self._rounds = 0
         self._life = rng.randrange(LIFE)
-        self._last: tuple[Round, tuple[Contact, ...]] | None = None
+        self._last_round: tuple[Round, tuple[Contact, ...]] | None = None
         self._silent_since: dict[bytes, float] = {}
 
     def next_ballot(self) -> Ballot:
-        """A ballot above all that were seen."""
+        """Return a ballot above all known ones."""
         self._rounds += 1
         return Ballot(self._rounds * LIFE + self._life, self.agent)
 
     def leap(self) -> None:
-        """Have the next ballot be above those of which nobody has told here; there are more than enough."""
+        """Raise the next ballot above unknown ballots of other proposers."""
         self._rounds += LEAP
 
     def round(
@@ -102,88 +102,87 @@ class Council:
         is_genuine: IsGenuine = lambda place, reply: True,
         others: tuple[Contact, ...] = (),
     ) -> Round:
-        """Ask every member, or ``others``; tell ``hear`` what came of it.
+        """Start a round with all members, or with ``others``; pass its outcome to ``hear``.
 
-        ``short`` is the wait for another's lease that is one.
+        If another agent's lease at a member ends within ``short`` seconds, the round repeats the request then.
         """
         members = others or self.members
-        question = (self.task_id, *arguments) if others else (self.task_id, self.configuration, *arguments)
+        request = (self.task_id, *arguments) if others else (self.task_id, self.configuration, *arguments)
 
         def ask(place: int) -> Deferred[Any]:
-            return self._ask(members[place], method, question)
+            return self._ask(members[place], method, request)
 
         def decode(place: int, answer: object) -> list[Reply] | None:
             reply = unpack_reply(answer)
             return None if reply is None or not is_genuine(place, reply) else [reply]
 
         if not others:
-            self._note_silence()
-        asked = Round([Tally(len(members), kinds)], ask, decode, self._clock, self.ttl / 3, short)
+            self._update_silence()
+        round_ = Round([Tally(len(members), kinds)], ask, decode, self._clock, self.ttl / 3, short)
         if not others:
-            self._last = asked, members
-        return asked
+            self._last_round = round_, members
+        return round_
 
     def visit(self) -> None:
-        """Ask the members for nothing but whether they are there; ``silent`` knows it later."""
+        """Ping the members, to update ``silent``."""
         self.round("lease.prepare", 0, self.ttl)
 
     def silent(self, seconds: float) -> tuple[Contact, ...]:
-        """The members that have answered nothing for so long, in spite of questions."""
-        self._note_silence()
+        """Return the members that have not answered any request for ``seconds``."""
+        self._update_silence()
         latest = self._clock.seconds() - seconds
         return tuple(m for m in self.members if self._silent_since.get(m.node_id, math.inf) <= latest)
 
     def learn(self, packed: bytes) -> None:
-        """A record of the task has the charter of a council; what is older, or does not hold, changes nothing."""
+        """Adopt the charter in a record of the task, if it is valid and newer."""
         charter = self._read(self.task_id, packed)
         if charter is not None:
             self._adopt(charter, is_news=False)
 
     def note_token(self, token: int) -> None:
-        """Some node says that ``token`` was granted; it may have invented it."""
+        """Note a token reported by a single node, which may have invented it."""
         self.token = max(self.token, believed([token], len(self.members)))
 
     def hear(self, round_: Round) -> None:
-        """Learn from answers which numbers are taken, and whether the council is another one now."""
+        """Learn used counters and tokens, and changes of the council, from the replies of a round."""
         replies, size = round_.tally.replies.values(), len(self.members)
         self._rounds = max(self._rounds, believed((reply.promised.counter // LIFE for reply in replies), size))
         self.token = max(self.token, believed((reply.token for reply in replies), size))
-        told = [self._read(self.task_id, reply.proof) for reply in replies if reply.kind is Kind.MOVED]
+        charters = [self._read(self.task_id, reply.proof) for reply in replies if reply.kind is Kind.MOVED]
         newest = max(
-            (each for each in told if each is not None), key=lambda charter: charter.configuration, default=None
+            (each for each in charters if each is not None), key=lambda charter: charter.configuration, default=None
         )
         if newest is not None and newest.configuration > self.configuration:
             self._adopt(newest)
             return
-        # Who was away when this council was chosen is told by whoever meets it.
+        # Send the charter to members that missed the choice of this council.
         for place, reply in round_.tally.replies.items():
             if reply.kind is Kind.BEHIND and reply.configuration < self.configuration:
                 self._install(self.members[place])
 
     def let_go(self, ballot: Ballot, heirs: Sequence[Contact] = (), rest: float = 0.0) -> Deferred[Any]:
-        """Give back whatever was promised or granted under ``ballot``, and tell ``heirs``.
+        """Release promises and leases under ``ballot``, and notify the standbys ``heirs``.
 
-        The robot moves for at most ``rest`` seconds from now on.  Fires when every member has been told, or does not
-        answer.
+        The robot may move for up to ``rest`` more seconds.  Fires when every member has answered or failed.
         """
-        told = [self._ask(member, "lease.release", (self.task_id, ballot.counter, rest)) for member in self.members]
-        told += [self._ask(heir, "lease.freed", (self.task_id, self.token, rest)) for heir in heirs]
-        return DeferredList(told, consumeErrors=True)
+        calls = [self._ask(member, "lease.release", (self.task_id, ballot.counter, rest)) for member in self.members]
+        calls += [self._ask(heir, "lease.freed", (self.task_id, self.token, rest)) for heir in heirs]
+        return DeferredList(calls, consumeErrors=True)
 
     def close(self, token: int = 0) -> Deferred[None]:
-        """Have no more leases granted on the task, which has ended; fires when nobody can act on it any more.
+        """Close the task at its council, so that no more leases are granted; fires when no agent can act on it.
 
-        ``token`` is that of the lease under which it was done (the device stands still by now), 0 the word of a node
-        that may order.  Fails with ``NoMajority``, or with ``Superseded`` where a higher token was granted.
+        ``token`` is the token of the agent that finished the task (its device is at rest), or 0 for a node whose role
+        allows orders.  Fails with ``NoMajority``, or with ``Superseded`` if a higher token was granted.
         """
         return Deferred.fromCoroutine(self._close(token))
 
     def change(self, members: Sequence[Contact], keep: bool = False) -> Deferred[None]:
-        """Have ``members`` be the council from now on; fires when a majority of them knows.
+        """Change the council to ``members``; fires when a majority of them has installed it.
 
-        With ``keep`` the own lease is given back with this (``Lessee.move``), and for a ttl granted to nobody else.
-        Fails with ``OpenClaim`` while somebody holds a lease, ``NoMajority`` where the old council cannot decide, and
-        ``Superseded`` where another change was under way, which is then completed instead.
+        With ``keep`` the own lease is released (``Lessee.move``) and reserved for this agent for one ttl.  Fails with
+        ``OpenClaim`` while another agent holds a lease, ``NoMajority`` if the old council cannot decide, and
+        ``Superseded`` if another change was in progress, which is then completed instead.
         """
         wanted = tuple(members)
         if not 0 < len(wanted) <= MAX_COUNCIL:
@@ -191,23 +190,23 @@ class Council:
         return Deferred.fromCoroutine(self._change(wanted, keep))
 
     async def finish(self, ballot: Ballot, prepared: Round, keep: bool = True) -> None:
-        """Complete a change that a member has accepted: it may be decided already, so no other may follow."""
+        """Complete a change that a member has accepted, because it may be decided already."""
         await self._decide(ballot, prepared.tally.to_complete, keep)
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
-    def _note_silence(self) -> None:
-        """Who did not answer the last round, though it was asked often enough; who did is there."""
-        if self._last is not None:
-            asked, members = self._last
-            for place in asked.answered:
+    def _update_silence(self) -> None:
+        """Update the times of silence from the answers to the last round."""
+        if self._last_round is not None:
+            round_, members = self._last_round
+            for place in round_.answered:
                 self._silent_since.pop(members[place].node_id, None)
-            for place in asked.silent:
-                self._silent_since.setdefault(members[place].node_id, asked.began_at)
+            for place in round_.silent:
+                self._silent_since.setdefault(members[place].node_id, round_.began_at)
 
     async def _close(self, token: int) -> None:
-        over_at = 0.0
-        question = ("lease.close", token) if token else ("lease.cancel",)
+        closed_at = 0.0
+        arguments = ("lease.close", token) if token else ("lease.cancel",)
         ended = (Kind.OVER, Kind.SEALED)
         while True:
             configuration, members = self.configuration, self.members
@@ -216,20 +215,20 @@ class Council:
                 signed = self.task_id, configuration, self.agent, token, reply.proof  # noqa: B023
                 return not token or reply.kind not in ended or is_end_signed(members[place], *signed)  # noqa: B023
 
-            done = await self.round(*question, kinds=ended, is_genuine=is_genuine).outcome
+            done = await self.round(*arguments, kinds=ended, is_genuine=is_genuine).outcome
             self.hear(done)
-            over_at = max(over_at, self._over_at(done))
+            closed_at = max(closed_at, self._lease_ends_at(done))
             if self.configuration != configuration:
                 done.close()
-                continue  # there is another council by now
+                continue  # the council has changed meanwhile
             sealed = [reply for reply in done.tally.replies.values() if reply.kind is Kind.SEALED]
             if done.tally.is_won and sealed and len(done.tally.agreed) - len(sealed) < majority(len(self.members)):
-                # A change was accepted by some: it may be decided, so the council to come has to know as well.
+                # Some accepted a change, which may be decided: the next council has to close as well.
                 if token:
                     raise NoMajority("the end of the task is not recorded: its council is changing; try again")
                 others = done.tally.to_complete
                 done = await self.round("lease.cancel", configuration + 1, kinds=ended, others=others).outcome
-                over_at = max(over_at, self._over_at(done))
+                closed_at = max(closed_at, self._lease_ends_at(done))
             if not done.tally.is_won:
                 done.close()
                 if any(reply.kind is Kind.OUTBID for reply in done.tally.replies.values()):
@@ -241,14 +240,14 @@ class Council:
                 (place, reply.proof) for place, reply in sorted(done.tally.replies.items()) if reply.kind is Kind.OVER
             ]
             self.ending = Ending(self.charter, tuple(votes[: majority(len(self.members))])).packed
-        rest = over_at - self._clock.seconds()
+        rest = closed_at - self._clock.seconds()
         if rest > 0.0:
-            waited: Deferred[None] = Deferred()
-            self._clock.callLater(rest, waited.callback, None)
-            await waited
+            pause: Deferred[None] = Deferred()
+            self._clock.callLater(rest, pause.callback, None)
+            await pause
 
-    def _over_at(self, done: Round) -> float:
-        """When a lease ends that may be in force: a member that granted it is among any majority that closed."""
+    def _lease_ends_at(self, done: Round) -> float:
+        """Return the end of a lease that may be valid: any closing majority has a member that granted it."""
         return self._clock.seconds() + max(
             (done.tally.replies[place].remaining for place in done.tally.agreed), default=0.0
         )
@@ -256,64 +255,64 @@ class Council:
     async def _change(self, wanted: tuple[Contact, ...], keep: bool) -> None:
         before = self.configuration
         ballot = self.next_ballot()
-        asked = self.round("lease.prepare", ballot.counter, self.ttl, kinds=(Kind.GRANTED, Kind.SEALED))
-        prepared = await asked.outcome
+        round_ = self.round("lease.prepare", ballot.counter, self.ttl, kinds=(Kind.GRANTED, Kind.SEALED))
+        prepared = await round_.outcome
         prepared.close()
         self.hear(prepared)
         if self.configuration != before:
-            raise Superseded(f"the council is at configuration {self.configuration} already; look at it again")
+            raise Superseded(f"the council is at configuration {self.configuration} already; check it and try again")
         if not prepared.tally.is_won:
-            _raise(prepared, "the council stays as it is")
+            _raise(prepared, "the council is unchanged")
         if prepared.tally.to_complete is not None:
             await self.finish(ballot, prepared, keep)
         else:
             await self._decide(ballot, wanted, keep)
         if self.configuration == before + 1 and set(self.members) != set(wanted):
-            raise Superseded("another change of the council was under way and is complete now; look at it again")
+            raise Superseded("another change of the council was in progress and is complete now; check it")
 
     async def _decide(self, ballot: Ballot, members: tuple[Contact, ...], keep: bool) -> None:
-        """Let a majority of the old council accept ``members``, then tell these; a majority of them must know."""
-        # The council of this object may become another one while answers are awaited; this decision is of this one.
+        """Have a majority of the old council accept ``members``, then a majority of ``members`` install them."""
+        # The council may change during the awaits below; this decision belongs to the present one.
         old, before = self.members, self.charter
         if before is None or before.configuration != self.configuration:
-            raise Refused("the council of this task was not signed when it was published; make the task anew")
+            raise Refused("the council of this task was not signed when it was published; submit the task again")
         accepted = await self._decision(ballot, members, keep)
         accepted.close()
         if not accepted.tally.is_won:
             self.hear(accepted)
-            self.let_go(ballot, rest=self.ttl)  # a lease that this agent holds goes on
-            _raise(accepted, "the council stays as it is")
+            self.let_go(ballot, rest=self.ttl)  # a lease of this agent stays valid
+            _raise(accepted, "the council is unchanged")
         votes = [
             (place, accepted.tally.replies[place]) for place in sorted(accepted.tally.agreed)[: majority(len(old))]
         ]
         charter = before.extended(members, ballot, tuple((place, reply.token, reply.proof) for place, reply in votes))
-        question, kinds = (charter.packed, keep, self.ttl), (Kind.GRANTED, Kind.MOVED)
-        installed = await self.round("lease.install", *question, kinds=kinds, others=members).outcome
+        arguments, kinds = (charter.packed, keep, self.ttl), (Kind.GRANTED, Kind.MOVED)
+        installed = await self.round("lease.install", *arguments, kinds=kinds, others=members).outcome
         if not installed.tally.is_won:
-            raise NoMajority("the new council is chosen, but too few of its members know; ask for the change again")
+            raise NoMajority("the new council is decided, but too few of its members have it; request the change again")
         self._adopt(charter)
         for member in old:
-            # So that who leaves can tell where the council is now.
+            # Former members can then refer proposers to the new council.
             if member not in members:
                 self._install(member, charter)
 
     async def _decision(self, ballot: Ballot, members: tuple[Contact, ...], keep: bool) -> Round:
-        """A majority of the *old* council decides: so no lease of it can be open, nor another change be chosen."""
+        """Run the deciding round: a majority of the *old* council excludes open leases and other changes."""
         old, configuration = self.members, self.configuration
 
         def is_genuine(place: int, reply: Reply) -> bool:
             change = self.task_id, configuration, ballot, members, reply
             return reply.kind is not Kind.GRANTED or is_change_signed(old[place], *change)
 
-        question = ballot.counter, pack_members(members), self.token, keep
-        return await self.round("lease.change", *question, is_genuine=is_genuine).outcome
+        arguments = ballot.counter, pack_members(members), self.token, keep
+        return await self.round("lease.change", *arguments, is_genuine=is_genuine).outcome
 
     def _install(self, member: Contact, charter: Charter | None = None) -> None:
-        """Tell ``member`` of the present council, which was chosen by the one before."""
+        """Send ``member`` the charter of the present council."""
         charter = charter or self.charter
         if charter is not None and charter.links:
-            news = (self.task_id, charter.packed, False, self.ttl)
-            self._ask(member, "lease.install", news).addErrback(lambda _: None)
+            update = (self.task_id, charter.packed, False, self.ttl)
+            self._ask(member, "lease.install", update).addErrback(lambda _: None)
 
     def _adopt(self, charter: Charter, is_news: bool = True) -> None:
         if charter.configuration > self.configuration:
@@ -323,13 +322,13 @@ class Council:
 
 
 def _raise(round_: Round, what: str) -> None:
-    """Say by name why a majority did not agree."""
+    """Raise the exception for a round without a majority."""
     replies: list[Reply] = list(round_.tally.replies.values())
     held = [reply.remaining for reply in replies if reply.kind is Kind.HELD]
     if held:
-        raise OpenClaim(f"{what}: a claim is open and runs out in {max(held):.2f} s unless it is renewed")
+        raise OpenClaim(f"{what}: an agent holds the lease, which expires in {max(held):.2f} s unless renewed")
     if any(reply.kind is Kind.OUTBID for reply in replies):
-        raise NoMajority(f"{what}: another claimant was faster; try again")
+        raise NoMajority(f"{what}: another proposer was faster; try again")
     if any(reply.kind is Kind.OVER for reply in replies) and Kind.OVER not in round_.tally.kinds:
         raise Refused(f"{what}: the task has ended")
-    raise NoMajority(f"{what}: {len(replies)} members answered, too few of them with yes; try again")
+    raise NoMajority(f"{what}: too few of the {len(replies)} members that answered agreed; try again")

@@ -1,4 +1,4 @@
-"""The lease client of one agent for one task: it claims the lease, renews it, gives it back, and stands by for it.
+"""The lease client of one agent for one task: it claims, renews and releases the lease, or stands by.
 
 A claim has two phases: a majority promises and reports the highest token, then a majority grants.  A renewal needs the
 second phase only.  The deadline counts from the time at which the granted request was *sent*, less a margin for clock
@@ -29,32 +29,32 @@ from middleware.entangled.quorum.register import Kind
 from middleware.entangled.quorum.round import PAUSE, Round
 
 CLOCK_MARGIN = 0.02
-"""Share by which the clocks of two correct nodes may drift apart: 2 rho, with rho = 1 %."""
+"""Relative drift between the clocks of two correct nodes: 2 rho, with rho = 1 %."""
 RENEWALS = 3
-"""How often a lease is renewed, and a stand-by asks, in each ttl."""
+"""Number of renewals, or requests of a standby, per ttl."""
 RETRY = 0.1
 JITTER = (0.0, 0.02)
 BACK_OFF = (0.02, 0.08)
-"""Seconds after which a claim is tried again that another one was faster than."""
+"""Seconds (minimum, maximum) before the next attempt when another claim was faster."""
 SOON = 1.5
-"""Periods of asking within which a lease that runs out is claimed rather than looked at once more."""
+"""Poll periods: a lease that ends within them is claimed at its end without another poll."""
 FRESH = 0.3
-"""Seconds for which the news of a release is believed against members that have not heard it."""
+"""Seconds after a notification of release during which members may not know of it yet."""
 EARLY = 0.8
-"""Share of the time before the end of a lease in which its successor may be promised (``AHEAD``), in which it is asked
-for: a guess that is a little late still is in time."""
+"""Share of the promise time before the end of a lease (``AHEAD``) at which the first standby asks for promises, so that
+a slightly late estimate is still in time."""
 LEAD = 0.1
-"""Seconds before a lease ends at which its successor is asked for: time for another try, and what comes too early waits
-at the members (``patience``)."""
+"""Seconds before the end of a lease at which the next grant is requested: time for a retry; members delay the reply to
+an early request."""
 STAGGER = 0.2
-"""Seconds by which each rank of those that stand by waits longer than the one before it."""
+"""Seconds that each rank of standbys waits longer than the rank before it."""
 TICK = 0.05
-"""A timer that fires later than this counts as a possible pause."""
+"""Seconds of delay from which a late timer counts as a possible suspension of the process."""
 
 
 @dataclass(frozen=True)
 class Lease:
-    """The right to act on a task until ``deadline`` (seconds of the lessee's own clock)."""
+    """The right to act on a task until ``deadline`` (seconds of the client's clock)."""
 
     task_id: str
     token: int
@@ -71,10 +71,10 @@ class _Held:
 
 
 @dataclass
-class _Line:
+class _Standby:
     """The client's ``rank`` among the standbys, and its knowledge of the lease of another agent.
 
-    ``freed_at`` is the time at which the robot of an agent that gave the lease back stands still, ``ends_at`` the
+    ``freed_at`` is the time at which the robot of an agent that released the lease is at rest, ``ends_at`` the
     estimated end of the lease, and ``is_outbid`` says whether a higher ballot was promised in the last round.
     """
 
@@ -112,8 +112,8 @@ class Lessee:
         self._stop_time = stop_time
         self._held = _Held()
         self._claimed = NONE
-        self._rests_at = -math.inf
-        self._line = _Line()
+        self._at_rest_at = -math.inf
+        self._standby = _Standby()
         self._round: Round | None = None
         self._timer: IDelayedCall | None = None
         self._due_at = 0.0
@@ -138,74 +138,73 @@ class Lessee:
     # -- calls of the agent -----------------------------------------------------------------------------------------
 
     def want(self) -> None:
-        """Claim the lease and keep it, with further tries until it is granted."""
+        """Claim the lease, retry until it is granted, and renew it."""
         self._set_rank(0)
         self._handle(Event.WANT)
 
     def stand_by(self, rank: int = 1) -> None:
-        """Claim the lease when it was given back or has expired, lower ranks first; until then listen and ask.
+        """Claim the lease when it is released or expires, lower ranks first; until then listen and poll.
 
-        A client that holds the lease or claims it only takes the rank.
+        A client that holds or claims the lease only changes its rank.
         """
         self._set_rank(max(1, rank))
         self._handle(Event.STAND_BY)
 
     def suspect(self) -> None:
-        """Ask now when the lease ends, because the holder may have failed.  It shortens no lease."""
+        """Poll the end of the lease now, because the holder may have failed.  It shortens no lease."""
         if not self._is_freed and self.lease is None:
             self._handle(Event.SUSPECT)
 
     def freed(self, token: int, rest: float = 0.0) -> None:
-        """Learn that the lease with ``token`` was given back, and that its robot moves for ``rest`` more seconds.
+        """Handle a notification that the lease with ``token`` was released; its robot moves for ``rest`` more seconds.
 
-        The first standby asks for promises at once, so that only the grant is left when that robot stands still.
+        The first standby asks for promises at once, so that only the grant is left when that robot is at rest.
         """
         self.council.note_token(token)
         if self.state in ACTIVE and self.lease is None:
             is_new = not self._is_freed
-            self._line.freed_at = self._line.ends_at = self._clock.seconds() + rest
+            self._standby.freed_at = self._standby.ends_at = self._clock.seconds() + rest
             if is_new:
                 self._handle(Event.FREED)
 
     def outrank(self, token: int) -> None:
-        """Learn that a device has obeyed ``token``: claims are higher from now on, and a lower lease is lost."""
+        """Handle a token that a device has obeyed: later claims are above it, and a lower own lease is lost."""
         self.council.token = max(self.council.token, token)
         if 0 < self.token < token:
             self._handle(Event.OUTRANK)
 
     def release(self, heirs: Sequence[Contact] = (), rest: float = 0.0) -> Deferred[object]:
-        """Give the lease back (stop the device first), or stop claiming it; fires when the council knows.
+        """Release the lease (stop the device first), or stop claiming it; fires when the council has been notified.
 
-        The council learns how long the robot needs to stop, and grants nothing before: ``rest`` seconds for a robot
-        that cannot be told, and its own stop time.  The members notify the standbys; ``heirs`` are notified from here,
-        half a round trip earlier.
+        The council grants nothing before the robot is at rest: for ``rest`` seconds if it cannot be stopped, and its
+        stop time.  The members notify the standbys; this client also notifies ``heirs``, half a round trip earlier.
         """
         done: Deferred[object] = succeed(None)
         if self.lease is not None:
-            # With the margin from the beginning: a later release of another claim repeats what is left of it.
-            moves = (rest + self._stop_time) * (1.0 + CLOCK_MARGIN)
-            self._rests_at = min(self._rests_at, self._clock.seconds() + moves)
+            # Includes the margin: a later release of another claim repeats the remaining time.
+            moving_s = (rest + self._stop_time) * (1.0 + CLOCK_MARGIN)
+            self._at_rest_at = min(self._at_rest_at, self._clock.seconds() + moving_s)
         self._handle(Event.RELEASE)
         if self._held.ballot != NONE:
-            done = self._let_go(max(self._held.ballot, self._claimed), heirs)  # which ends the older one, too
+            done = self._send_release(max(self._held.ballot, self._claimed), heirs)  # which releases the older one, too
         else:
-            self._let_go_of_minority()
+            self._release_minority()
         self._held, self._claimed = _Held(), NONE
         return done
 
     def move(self, members: Sequence[Contact]) -> Deferred[None]:
-        """Have ``members`` be the council (stop the device first).
+        """Change the council to ``members`` (stop the device first).
 
-        A lease that is held goes back with it, and is reserved for this client until it has claimed it again there.
-        Fails as ``Council.change`` does; then the lease is claimed again where it was.
+        An own lease is released and reserved for this client, which claims it again at the new council.  Fails as
+        ``Council.change`` does; then the lease is claimed again at the old one.
         """
         return Deferred.fromCoroutine(self._move(members))
 
     def end(self, token: int) -> Deferred[bytes]:
-        """Have the council grant no lease any more (stop the device first): the task was done under ``token``.
+        """Close the task, done under ``token``, so that no more leases are granted (stop the device first).
 
-        If this client holds a later token by now, that one counts.  Fires with the proof, signed by a majority of the
-        council; fails as ``Council.close`` does.
+        A later token of this client takes precedence.  Fires with the proof, signed by a majority of the council; fails
+        as ``Council.close`` does.
         """
         return self.council.close(max(token, self.token)).addCallback(lambda _: self.council.ending)
 
@@ -213,42 +212,42 @@ class Lessee:
         self._handle(Event.MOVE)
         if self.lease is not None:
             self._held.token, self._held.deadline = 0, 0.0
-            moves = self._stop_time * (1.0 + CLOCK_MARGIN)
-            self._rests_at = self._clock.seconds() + moves
-            await deferLater(self._clock, moves)
+            moving_s = self._stop_time * (1.0 + CLOCK_MARGIN)
+            self._at_rest_at = self._clock.seconds() + moving_s
+            await deferLater(self._clock, moving_s)
         try:
             await self.council.change(members, keep=True)
-        except Exception:  # but not when the coroutine of a node that is gone is collected as garbage
+        except Exception:  # not GeneratorExit, when the coroutine is garbage-collected
             self._handle(Event.MOVED)
             raise
         self._handle(Event.MOVED)
 
     def _set_rank(self, rank: int) -> None:
-        """Take a rank among the standbys; a claim that is due becomes due as much sooner or later."""
-        before, self._line.rank = self._stagger(), rank
+        """Set the rank among the standbys, and adjust the time of a scheduled claim."""
+        before, self._standby.rank = self._stagger(), rank
         if self._stagger() != before and self.lease is None and not self._is_freed:
             self._handle(Event.RANK)
 
     # -- transitions ------------------------------------------------------------------------------------------------
 
-    def _handle(self, event: Event, asked: Round | None = None, delay: float = 0.0) -> None:
+    def _handle(self, event: Event, round_: Round | None = None, delay: float = 0.0) -> None:
         """Go to the next state and perform the actions.
 
-        :param asked: the round whose result the event is
+        :param round_: the round whose result the event is
         :param delay: seconds, for an event that sets the timer
         """
         self.state, actions = next_step(self.state, event)
         self._steps = step = self._steps + 1
         for action in actions:
-            if self._steps == step:  # else the listener has called, and its transition has replaced this one
-                self._perform(action, asked, delay)
+            if self._steps == step:  # otherwise a call of the listener has caused another transition
+                self._perform(action, round_, delay)
 
-    def _perform(self, action: Action, asked: Round | None, delay: float) -> None:
+    def _perform(self, action: Action, round_: Round | None, delay: float) -> None:
         match action:
             case Action.CANCEL:
                 self._cancel()
             case Action.LOOK:
-                self._look()
+                self._poll()
             case Action.PREPARE:
                 self._prepare()
             case Action.PROPOSE:
@@ -257,8 +256,8 @@ class Lessee:
                 self._cancel()
                 self._propose(self._held.ballot, self.token)
             case Action.COMPLETE:
-                assert asked is not None
-                completing = Deferred.fromCoroutine(self.council.finish(self._claimed, asked))
+                assert round_ is not None
+                completing = Deferred.fromCoroutine(self.council.finish(self._claimed, round_))
                 completing.addErrback(lambda failure: failure.trap(EntangledError))
                 completing.addBoth(lambda _: self._handle(Event.COMPLETED))
             case Action.LEAP:
@@ -267,70 +266,70 @@ class Lessee:
                 self._lose()
             case Action.DROP:
                 was_held = self.token != 0
-                self._let_go_of_minority()
+                self._release_minority()
                 if was_held:
-                    self._let_go(self._held.ballot)
+                    self._send_release(self._held.ballot)
                     self._lose()
             case Action.NOTIFY:
                 self._changed()
-            case Action.LINE_UP if asked is not None:
-                self._wait(asked)
+            case Action.LINE_UP if round_ is not None:
+                self._schedule_from(round_)
             case Action.LINE_UP:
-                self._line_up(self._rng.uniform(*JITTER))
+                self._schedule_claim(self._rng.uniform(*JITTER))
             case Action.AFTER_RANK:
-                self._again(self._line.rank * self._poll_period)
+                self._set_timer(self._standby.rank * self._poll_period)
             case Action.AFTER_POLL | Action.AFTER_WAIT | Action.AFTER_PREVIOUS:
-                self._again(delay)
+                self._set_timer(delay)
             case Action.AFTER_TURN:
-                self._again(self._turn())
+                self._set_timer(self._turn_delay())
             case Action.AFTER_RENEWAL:
-                self._again(self._poll_period)
+                self._set_timer(self._poll_period)
             case Action.AFTER_RETRY:
-                self._again(min(RETRY, self._held.deadline - self._clock.seconds()))
+                self._set_timer(min(RETRY, self._held.deadline - self._clock.seconds()))
             case Action.AFTER_BACK_OFF:
-                self._again(self._rng.uniform(*BACK_OFF))
+                self._set_timer(self._rng.uniform(*BACK_OFF))
 
     # -- rounds -----------------------------------------------------------------------------------------------------
 
-    def _look(self) -> None:
+    def _poll(self) -> None:
         """Ask whether the lease is free, without a promise."""
         self._cancel()
-        self._round = asked = self.council.round("lease.prepare", 0, self.council.ttl, short=0.0)
-        asked.outcome.addCallback(self._looked, self.council.configuration)
+        self._round = round_ = self.council.round("lease.prepare", 0, self.council.ttl, short=0.0)
+        round_.outcome.addCallback(self._handle_poll, self.council.configuration)
 
-    def _looked(self, asked: Round, configuration: int) -> None:
-        if not self._counts(asked):
+    def _handle_poll(self, round_: Round, configuration: int) -> None:
+        if not self._is_current_round(round_):
             return
-        asked.close()
+        round_.close()
         if self.council.configuration != configuration:
             # Only members of the newest council know the standbys, and notify them of a release.
             self._handle(Event.RECONFIGURED)
         else:
-            is_free = asked.tally.is_won and not self._stagger()
-            self._handle(Event.FREE if is_free else Event.TAKEN, asked)
+            is_free = round_.tally.is_won and not self._stagger()
+            self._handle(Event.FREE if is_free else Event.TAKEN, round_)
 
     def _prepare(self) -> None:
         """Ask for promises; a lease that is held stays valid meanwhile."""
         self._cancel()
         self._claimed = ballot = self.council.next_ballot()
         kinds = (Kind.GRANTED, Kind.SEALED)
-        question = ballot.counter, self.council.ttl
-        self._round = asked = self.council.round("lease.prepare", *question, kinds=kinds, short=self._short)
-        asked.outcome.addCallback(self._promised, self.council.configuration)
+        arguments = ballot.counter, self.council.ttl
+        self._round = round_ = self.council.round("lease.prepare", *arguments, kinds=kinds, short=self._short)
+        round_.outcome.addCallback(self._handle_promises, self.council.configuration)
 
-    def _promised(self, asked: Round, configuration: int) -> None:
-        if not self._counts(asked):
+    def _handle_promises(self, round_: Round, configuration: int) -> None:
+        if not self._is_current_round(round_):
             return
         if self.council.configuration != configuration:
             return self._handle(Event.RECONFIGURED)
-        if not asked.tally.is_won:
-            return self._failed(asked)
-        asked.close()
-        wait = asked.free_in() - LEAD if self.lease is None else 0.0
-        if asked.tally.to_complete is not None:
-            self._handle(Event.UNFINISHED, asked)
+        if not round_.tally.is_won:
+            return self._handle_failure(round_)
+        round_.close()
+        wait = round_.free_in() - LEAD if self.lease is None else 0.0
+        if round_.tally.to_complete is not None:
+            self._handle(Event.UNFINISHED, round_)
         elif wait > 0.0:
-            # The lease is about to expire, or the robot of the agent that gave it back to stop.
+            # The lease is about to expire, or the robot of the agent that released it is about to stop.
             self._handle(Event.EARLY_PROMISES, delay=wait)
         else:
             self._handle(Event.PROMISES)
@@ -343,61 +342,61 @@ class Lessee:
         return self.council.token
 
     def _propose(self, ballot: Ballot, token: int) -> None:
-        question = ballot.counter, token, self.council.ttl
-        self._round = asked = self.council.round("lease.propose", *question, short=self._short)
-        asked.outcome.addCallback(self._granted, ballot, token)
+        arguments = ballot.counter, token, self.council.ttl
+        self._round = round_ = self.council.round("lease.propose", *arguments, short=self._short)
+        round_.outcome.addCallback(self._handle_grants, ballot, token)
 
-    def _granted(self, asked: Round, ballot: Ballot, token: int) -> None:
-        if not self._counts(asked):
+    def _handle_grants(self, round_: Round, ballot: Ballot, token: int) -> None:
+        if not self._is_current_round(round_):
             return
-        deadline = self._deadline_of(asked) if asked.tally.is_won else 0.0
+        deadline = self._deadline_of(round_) if round_.tally.is_won else 0.0
         if deadline <= self._clock.seconds():
-            return self._failed(asked)
+            return self._handle_failure(round_)
         self._held = _Held(token, deadline, ballot)
         # The device counts the deadline on its own clock, which may be slower than the one of this client.
-        self._rests_at = deadline + self._stop_time + self.council.ttl * CLOCK_MARGIN
-        # A member that may not grant anything yet needs no other ballot later.
-        others = [reply for reply in asked.tally.replies.values() if reply.kind not in (Kind.GRANTED, Kind.QUIET)]
+        self._at_rest_at = deadline + self._stop_time + self.council.ttl * CLOCK_MARGIN
+        # A member that may not grant yet needs no new ballot.
+        others = [reply for reply in round_.tally.replies.values() if reply.kind not in (Kind.GRANTED, Kind.QUIET)]
         self._handle(Event.PARTIAL_GRANTS if others else Event.GRANTS)
 
     def _deadline_of(self, won: Round) -> float:
-        """Return the time by which the robot must stand still again, on the own clock."""
+        """Return the time, on this client's clock, by which the robot must be at rest."""
         return won.sent_at + self.council.ttl * (1.0 - CLOCK_MARGIN) - self._stop_time
 
-    def _counts(self, asked: Round) -> bool:
+    def _is_current_round(self, round_: Round) -> bool:
         """Learn from a round; return whether it is the newest one, and the task has not ended."""
-        self.council.hear(asked)
-        if self._round is not asked:
+        self.council.hear(round_)
+        if self._round is not round_:
             return False
-        over = [reply for reply in asked.tally.replies.values() if reply.kind is Kind.OVER]
+        over = [reply for reply in round_.tally.replies.values() if reply.kind is Kind.OVER]
         if len(over) >= majority(len(self.council.members)):
             self._handle(Event.ENDED)
         return not self.is_over
 
-    def _failed(self, asked: Round) -> None:
-        asked.close()
+    def _handle_failure(self, round_: Round) -> None:
+        round_.close()
         if self.lease is None:
-            self._handle(Event.REJECTED, asked)
+            self._handle(Event.REJECTED, round_)
         else:
-            # A member that has promised a higher ballot needs a new one; there is time for it before the deadline.
-            is_outbid = any(reply.kind is Kind.OUTBID for reply in asked.tally.replies.values())
+            # A member that has promised a higher ballot needs a new one, and the time until the deadline is enough.
+            is_outbid = any(reply.kind is Kind.OUTBID for reply in round_.tally.replies.values())
             self._handle(Event.OUTBID if is_outbid else Event.KEPT)
 
     # -- times ------------------------------------------------------------------------------------------------------
 
-    def _wait(self, asked: Round) -> None:
+    def _schedule_from(self, round_: Round) -> None:
         """Estimate the end of the lease from a round that failed, and set the timer."""
-        is_outbid = any(reply.kind is Kind.OUTBID for reply in asked.tally.replies.values())
-        free_in = asked.free_in()
+        is_outbid = any(reply.kind is Kind.OUTBID for reply in round_.tally.replies.values())
+        free_in = round_.free_in()
         if is_outbid and free_in == math.inf:
             free_in = 0.0  # the other members did not answer; under a higher ballot they may
-        self._line.ends_at, self._line.is_outbid = self._clock.seconds() + free_in, is_outbid
-        self._line_up(self._rng.uniform(*(BACK_OFF if is_outbid else JITTER)))
+        self._standby.ends_at, self._standby.is_outbid = self._clock.seconds() + free_in, is_outbid
+        self._schedule_claim(self._rng.uniform(*(BACK_OFF if is_outbid else JITTER)))
 
-    def _line_up(self, pause: float) -> None:
-        """Set the timer for the claim; if that is late or unknown, for a look, because a notification may be lost."""
-        wait = self._turn() if self._is_freed else self._claims_in()
-        # A healthy holder renews well before the end: a lease that expires so soon is claimed without a look.
+    def _schedule_claim(self, pause: float) -> None:
+        """Set the timer for the claim or, if that is late or unknown, for a poll, as a notification may be lost."""
+        wait = self._turn_delay() if self._is_freed else self._claims_in()
+        # A healthy holder renews well before the end: a lease that expires so soon is claimed without a poll.
         is_far = wait > SOON * self._poll_period
         self._handle(Event.FAR if is_far else Event.NEAR, delay=(self._poll_period if is_far else wait) + pause)
 
@@ -406,30 +405,30 @@ class Lessee:
         return self.council.ttl / RENEWALS
 
     def _claims_in(self) -> float:
-        """Return the seconds until the claim of a lease that expires; the first standby gets the promises before."""
-        is_first = not (self._stagger() or self._line.is_outbid)
+        """Return the seconds until the claim of an expiring lease; the first standby gets promises before its end."""
+        is_first = not (self._stagger() or self._standby.is_outbid)
         lead = EARLY * AHEAD * self.council.ttl if is_first else 0.0
-        return max(0.0, self._line.ends_at + self._stagger() - lead - self._clock.seconds())
+        return max(0.0, self._standby.ends_at + self._stagger() - lead - self._clock.seconds())
 
     def _stagger(self) -> float:
-        return STAGGER * max(0, self._line.rank - 1)
+        return STAGGER * max(0, self._standby.rank - 1)
 
-    def _turn(self) -> float:
-        """Return the seconds until the claim of a lease that was given back; the first standby claims at once."""
+    def _turn_delay(self) -> float:
+        """Return the seconds until the claim of a released lease; the first standby claims at once."""
         wait = self._stagger()
-        return wait and max(0.0, self._line.freed_at - self._clock.seconds()) + wait
+        return wait and max(0.0, self._standby.freed_at - self._clock.seconds()) + wait
 
     @property
     def _is_freed(self) -> bool:
-        """Whether the lease was given back a moment ago: some members may not know it yet."""
-        return self._clock.seconds() < self._line.freed_at + FRESH
+        """Whether the lease was released within ``FRESH`` seconds, so that some members may not know it yet."""
+        return self._clock.seconds() < self._standby.freed_at + FRESH
 
     @property
     def _short(self) -> float:
-        """The longest remaining lease in seconds that a round waits for; one that was given back ends soon."""
+        """The longest remaining lease in seconds that a round waits for; unlimited after a release."""
         return math.inf if self._is_freed else PAUSE
 
-    def _due(self) -> None:
+    def _handle_timer(self) -> None:
         """Handle the timer; one that is late may mean that this process or machine was suspended."""
         self._timer = None
         self.pauses += self._clock.seconds() - self._due_at > TICK
@@ -442,14 +441,14 @@ class Lessee:
         else:
             self._handle(Event.DUE)
 
-    def _again(self, delay: float) -> None:
+    def _set_timer(self, delay: float) -> None:
         if self._timer is not None and self._timer.active():
             self._timer.cancel()
         self._due_at = self._clock.seconds() + delay
-        self._timer = self._clock.callLater(delay, self._due)
+        self._timer = self._clock.callLater(delay, self._handle_timer)
 
     def _cancel(self) -> None:
-        """Drop the round under way and the timer."""
+        """Cancel the running round and the timer."""
         if self._round is not None:
             self._round.close()
             self._round = None
@@ -460,16 +459,16 @@ class Lessee:
     # -- giving back ------------------------------------------------------------------------------------------------
 
     def _lose(self) -> None:
-        """Forget a lease that was not given back, and notify the listener."""
+        """Forget a lease that was not released, and notify the listener."""
         self._held = _Held()
         self._changed()
 
-    def _let_go(self, ballot: Ballot, heirs: Sequence[Contact] = ()) -> Deferred[object]:
+    def _send_release(self, ballot: Ballot, heirs: Sequence[Contact] = ()) -> Deferred[object]:
         """Release ``ballot`` at the council, with the time for which the robot may still move."""
-        rest = max(0.0, self._rests_at - self._clock.seconds())
+        rest = max(0.0, self._at_rest_at - self._clock.seconds())
         return self.council.let_go(ballot, heirs, rest * (1.0 + CLOCK_MARGIN))
 
-    def _let_go_of_minority(self) -> None:
+    def _release_minority(self) -> None:
         """Release a claim that only a minority granted, so that it delays no other claimant."""
         if self._claimed not in (self._held.ballot, NONE):
-            self._let_go(self._claimed)
+            self._send_release(self._claimed)

@@ -1,1 +1,1 @@
-"""The control socket: how programs in any language, and people at a shell, speak to the node of their machine."""
+"""The control socket: access to the node of the same machine for programs in any language and for the shell."""

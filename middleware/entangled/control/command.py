@@ -1,6 +1,6 @@
-"""Command: ``swarm dht``, ``swarm tuple``, ``swarm keyword`` and ``swarm rpc``, asked of the node of this machine.
+"""The commands ``swarm dht``, ``swarm tuple``, ``swarm keyword`` and ``swarm rpc``.
 
-It needs nothing but the standard library, so that help and answers come at once.
+They talk to the node of this machine, and import only the standard library to start fast.
 """
 
 from __future__ import annotations
@@ -18,87 +18,87 @@ from middleware.entangled.control import word
 from middleware.entangled.control.place import NoControl, check_socket, found, owner_of
 
 FAILED, WRONG = 1, 2
-FORMS = """fields:     7  1.5  true  null  "7"  words       JSON where it is JSON, else text
-templates:  _  any;  ?int ?float ?str ?bytes ?bool  a kind;  >5  <=5  !=red  in:a,b  prefix:job-  a predicate"""
-KEYS = "A key is any text, or id: and its 40 hexadecimal digits."
+FORMS = """fields:     7  1.5  true  null  "7"  words       valid JSON, otherwise text
+templates:  _  any;  ?int ?float ?str ?bytes ?bool  a type;  >5  <=5  !=red  in:a,b  prefix:job-  a predicate"""
+KEYS = "A key is any text, or id: followed by 40 hexadecimal digits."
 
 Ask = Callable[[Path, dict[str, Any]], Iterator[dict[str, Any]]]
 
 
 def parser(group: str) -> argparse.ArgumentParser:
-    """The command line of one group of verbs."""
+    """Return the argument parser of one group of verbs."""
     common = argparse.ArgumentParser(add_help=False)
-    common.add_argument("--node", metavar="NAME", help="which node of this machine, where several run")
-    common.add_argument("--json", action="store_true", help="answer in JSON, one line each")
+    common.add_argument("--node", metavar="NAME", help="name of the node, if several run on this machine")
+    common.add_argument("--json", action="store_true", help="print JSON, one line per answer")
     if group == "rpc":
         rpc = argparse.ArgumentParser(prog="swarm rpc", parents=[common], description="Call a method of a node.")
-        rpc.add_argument("node_asked", metavar="NODE", help="HOST:PORT, or the beginning of a known node's id")
-        rpc.add_argument("method", help="for instance ping")
-        rpc.add_argument("arguments", nargs="*", default=[], help="JSON where it is JSON, else text")
-        rpc.add_argument("--changes", action="store_true", help="the method changes something: it is to run once")
+        rpc.add_argument("node_asked", metavar="NODE", help="HOST:PORT, or the first digits of a known node's id")
+        rpc.add_argument("method", help="name of the method, such as ping")
+        rpc.add_argument("arguments", nargs="*", default=[], help="valid JSON, otherwise text")
+        rpc.add_argument("--changes", action="store_true", help="the method changes state and must run only once")
         rpc.set_defaults(verb="rpc")
         return rpc
     build = {"dht": _dht, "tuple": _tuple, "keyword": _keyword}[group]
-    whole = argparse.ArgumentParser(
+    top = argparse.ArgumentParser(
         prog=f"swarm {group}",
         epilog=FORMS if group == "tuple" else KEYS if group == "dht" else None,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    verbs = whole.add_subparsers(dest="verb", required=True, metavar="VERB")
+    verbs = top.add_subparsers(dest="verb", required=True, metavar="VERB")
 
     def verb(name: str, purpose: str) -> argparse.ArgumentParser:
-        added = verbs.add_parser(name, help=purpose, description=purpose, parents=[common])
-        added.set_defaults(verb=f"{group} {name}")
-        return added
+        subparser = verbs.add_parser(name, help=purpose, description=purpose, parents=[common])
+        subparser.set_defaults(verb=f"{group} {name}")
+        return subparser
 
     build(verb)
-    return whole
+    return top
 
 
 def _dht(verb: Callable[[str, str], argparse.ArgumentParser]) -> None:
-    get = verb("get", "Print what the network holds under a key.")
+    get = verb("get", "Print the records under a key.")
     get.add_argument("key")
-    get.add_argument("--concern", choices=("fast", "majority"), default="majority", help="one answer, or a sure one")
+    get.add_argument("--concern", choices=("fast", "majority"), default="majority", help="one replica, or a majority")
     put = verb("put", "Store a value under a key, in this node's own slot.")
     put.add_argument("key")
-    put.add_argument("value", help="text; - reads standard input, @FILE a file")
-    put.add_argument("--name", default="", help="which of this node's slots under the key")
+    put.add_argument("value", help="text, - for standard input, or @FILE")
+    put.add_argument("--name", default="", help="name of this node's slot under the key")
     put.add_argument(
-        "--lifetime", choices=("team", "leased"), default="team", help="outlive this node, or leave with it"
+        "--lifetime", choices=("team", "leased"), default="team", help="keep it when this node leaves, or remove it"
     )
-    put.add_argument("--concern", choices=("one", "majority", "all"), default="majority", help="who must have it")
-    put.add_argument("--expect", type=int, metavar="SEQUENCE", help="only where the slot is at this sequence; 0: empty")
+    put.add_argument("--concern", choices=("one", "majority", "all"), default="majority", help="required replicas")
+    put.add_argument("--expect", type=int, metavar="SEQUENCE", help="store only if the slot has it; 0: empty slot")
     remove = verb("remove", "Remove this node's value under a key.")
     remove.add_argument("key")
     remove.add_argument("--name", default="")
-    verb("find", "Print the nodes that are closest to a key.").add_argument("key")
-    verb("watch", "Print what a key holds whenever it changes, until Ctrl-C.").add_argument("key")
+    verb("find", "Print the nodes closest to a key.").add_argument("key")
+    verb("watch", "Print the records under a key on each change, until Ctrl-C.").add_argument("key")
 
 
 def _keyword(verb: Callable[[str, str], argparse.ArgumentParser]) -> None:
     publish = verb("publish", "Publish data under every word of a name.")
     publish.add_argument("name")
-    publish.add_argument("value", help="text; - reads standard input, @FILE a file")
-    verb("search", "Print what was published under all of the words.").add_argument("words", nargs="+")
-    verb("watch", "Print what was published under a word whenever it changes, until Ctrl-C.").add_argument("words")
-    verb("remove", "Take back what this node published under a name.").add_argument("name")
+    publish.add_argument("value", help="text, - for standard input, or @FILE")
+    verb("search", "Print the publications with all of the words.").add_argument("words", nargs="+")
+    verb("watch", "Print the publications with a word on each change, until Ctrl-C.").add_argument("words")
+    verb("remove", "Remove this node's publication under a name.").add_argument("name")
 
 
 def _tuple(verb: Callable[[str, str], argparse.ArgumentParser]) -> None:
     put = verb("put", "Put a tuple into the space.")
     put.add_argument("fields", nargs="+", metavar="FIELD")
-    put.add_argument("--ttl", type=float, metavar="SECONDS", help="take it out after that time")
-    get = verb("get", "Take a tuple that matches out of the space; nobody else gets it.")
-    read = verb("read", "Print a tuple that matches, and leave it.")
+    put.add_argument("--ttl", type=float, metavar="SECONDS", help="remove it after that time")
+    get = verb("get", "Take a matching tuple out of the space.")
+    read = verb("read", "Print a matching tuple without taking it.")
     for each in (get, read):
         each.add_argument("template", nargs="+", metavar="FIELD")
-        each.add_argument("--wait", type=float, metavar="SECONDS", help="for one to come")
-    read.add_argument("--all", action="store_true", help="print all that match")
+        each.add_argument("--wait", type=float, metavar="SECONDS", help="wait for a matching tuple for that time")
+    read.add_argument("--all", action="store_true", help="print all matching tuples")
 
 
-def request_of(wishes: argparse.Namespace) -> dict[str, Any]:
-    """The request that a command line means; raises ``word.BadWord``, also for a file that cannot be read."""
-    given = {name: value for name, value in vars(wishes).items() if name not in ("verb", "node", "json")}
+def request_of(options: argparse.Namespace) -> dict[str, Any]:
+    """Return the request of a command line; raise ``word.BadWord``, also for an unreadable file."""
+    given = {name: value for name, value in vars(options).items() if name not in ("verb", "node", "json")}
     if "node_asked" in given:
         given["node"] = given.pop("node_asked")
     if isinstance(given.get("words"), list):
@@ -108,11 +108,11 @@ def request_of(wishes: argparse.Namespace) -> dict[str, Any]:
             given[name] = [read(each) for each in given[name]]
     if "value" in given:
         given["value"] = _value(given["value"])
-    return {"verb": wishes.verb, "with": {name: value for name, value in given.items() if value is not None}}
+    return {"verb": options.verb, "with": {name: value for name, value in given.items() if value is not None}}
 
 
 def asked(path: Path, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    """The lines that the node behind the socket at ``path`` answers; raises ``NoControl`` where it does not."""
+    """Send ``request`` to the socket at ``path`` and yield the answer's lines; raise ``NoControl`` on failure."""
     check_socket(path)
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
         try:
@@ -128,38 +128,38 @@ def asked(path: Path, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
 
 
 def check_peer(connection: socket.socket, path: Path) -> None:
-    """Raise ``NoControl`` where another user's process is at the other end, if the system tells."""
+    """Raise ``NoControl`` if a process of another user listens; no check without ``SO_PEERCRED``."""
     option = getattr(socket, "SO_PEERCRED", None)
     if option is None:
         return
     credentials = struct.Struct("3i")
     _, user, _ = credentials.unpack(connection.getsockopt(socket.SOL_SOCKET, option, credentials.size))
     if user not in (owner_of(path.parent), 0):
-        raise NoControl(f"another user's process listens at {path}; remove it, and start the node anew")
+        raise NoControl(f"another user's process listens at {path}; remove it and restart the node")
 
 
 def main(group: str, words: Sequence[str], out: TextIO | None = None, ask: Ask = asked) -> int:
-    """Run one command; returns 0, 1 where nothing was found or the node refused, 2 where the command is wrong."""
+    """Run one command; return 0, 1 (nothing found, or the node refused), or 2 (wrong command)."""
     out = out or sys.stdout
-    wishes = parser(group).parse_args(words)
+    options = parser(group).parse_args(words)
     try:
-        request = request_of(wishes)
-        path = found(wishes.node)
+        request = request_of(options)
+        path = found(options.node)
         for line in ask(path, request):
             if "error" in line:
-                if wishes.json:
+                if options.json:
                     out.write(word.written(line) + "\n")
-                return _complain(group, line["text"], WRONG if line["error"] == "BadRequest" else FAILED)
+                return _fail(group, line["text"], WRONG if line["error"] == "BadRequest" else FAILED)
             answer = line["answer"] if "answer" in line else line.get("event")
-            out.write("".join(f"{text}\n" for text in _texts(wishes.verb, answer, wishes.json)))
+            out.write("".join(f"{text}\n" for text in _texts(options.verb, answer, options.json)))
             out.flush()
             if "answer" in line:
-                return FAILED if _is_nothing(wishes.verb, answer) else 0
+                return FAILED if _is_nothing(options.verb, answer) else 0
     except KeyboardInterrupt:
         return 0
     except (NoControl, word.BadWord, OSError) as problem:
-        return _complain(group, problem, WRONG)
-    return _complain(group, "the node closed the connection without an answer", FAILED)
+        return _fail(group, problem, WRONG)
+    return _fail(group, "the node closed the connection without an answer", FAILED)
 
 
 def _texts(verb: str, answer: Any, is_json: bool) -> list[str]:
@@ -178,7 +178,7 @@ def _texts(verb: str, answer: Any, is_json: bool) -> list[str]:
     if verb in ("tuple get", "tuple read"):
         return [word.shown(answer)]
     if isinstance(answer, dict) and "replicas" in answer:
-        return [f"{answer['replicas']} replicas have it"]
+        return [f"stored at {answer['replicas']} replicas"]
     return [word.written(answer)]
 
 
@@ -208,6 +208,6 @@ def _value(text: str) -> Any:
     return text
 
 
-def _complain(group: str, problem: object, code: int) -> int:
+def _fail(group: str, problem: object, code: int) -> int:
     sys.stderr.write(word.printable(f"swarm {group}: {problem}") + "\n")
     return code

@@ -1,4 +1,4 @@
-"""Health: what a running node says of itself and of the ways to its peers, for whoever looks what is wrong."""
+"""State of a running node and quality of the paths to its peers, for diagnostics."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from middleware.entangled.network.network import is_relayed
 from middleware.entangled.node import EntangledNode
 
 ASKED = 10
-"""Questions to each peer."""
-APART = 0.1
-LIMIT = 1.5
+"""Pings to each peer."""
+PING_INTERVAL_S = 0.1
+PING_TIMEOUT_S = 1.5
 MAX_LINKS = 32
-"""Peers whose ways are measured: 32 x 10 questions in a second are 50 kB each way."""
-PACE = 1.0
-"""Seconds between two questions to a peer, after the first ``ASKED`` ones."""
+"""Peers that are measured: 32 x 10 pings in a second are 50 kB in each direction."""
+SLOW_INTERVAL_S = 1.0
+"""Seconds between two pings to a peer, after the first ``ASKED`` ones."""
 FEW = 10
-"""Peers up to which that holds; with more of them it goes slower, so that a node asks 10 questions a second at most,
-and 100 at the beginning: 1 and 10 kB each way."""
+"""Peers up to which that holds.  With more peers the interval grows, so that a node sends at most 10 pings per second,
+and 100 at first: 1 and 10 kB in each direction."""
 IDLE = 12.0
-"""Seconds since the last who wanted to know after which it ends."""
+"""Seconds after the last call of ``Gauge.links`` until the measurement stops."""
 
 
 def health(node: EntangledNode) -> Mapping[str, Any]:
-    """The node's contacts, what its store holds and may hold, and who does not let it in, and why."""
+    """Return the number of contacts, the store's usage and limits, and the nodes that reject this one."""
     usage = node.store.usage
     return {
         "id": node.identity.node_id.hex(),
@@ -49,13 +49,13 @@ def health(node: EntangledNode) -> Mapping[str, Any]:
 
 
 async def links(node: EntangledNode, clock: IReactorTime) -> list[Mapping[str, Any]]:
-    """The way to each peer, and how long it took for each of ``ASKED`` small questions, None where it did not answer.
+    """Return the path to each peer with the durations of ``ASKED`` pings, None for a lost one.
 
-    All times are seconds; ``for`` says how long the peer is reached that way, None where it is not.
+    All times are seconds; ``for`` is the time since the path came into use, None if the peer is unreachable.
     """
     contacts = sorted(node.overlay.contacts(), key=lambda contact: contact.node_id)[:MAX_LINKS]
-    asked = [Deferred.fromCoroutine(_times(node, clock, contact)) for contact in contacts]
-    answers = await DeferredList(asked, consumeErrors=True)
+    pings = [Deferred.fromCoroutine(_times(node, clock, contact)) for contact in contacts]
+    answers = await DeferredList(pings, consumeErrors=True)
     return [
         {**way(node, clock, contact), "times": times}
         for contact, (ok, times) in zip(contacts, answers, strict=True)
@@ -64,7 +64,7 @@ async def links(node: EntangledNode, clock: IReactorTime) -> list[Mapping[str, A
 
 
 def way(node: EntangledNode, clock: IReactorTime, contact: Contact) -> dict[str, Any]:
-    """How a peer is reached: ``way`` is a ``passage.Kind``, ``by`` the id of who carries, or empty."""
+    """Return the path to a peer: ``way`` is a ``passage.Kind``, ``by`` the id of the relay, or empty."""
     passage = node.reach.ways.passage(contact)
     return {
         "id": contact.node_id.hex(),
@@ -77,29 +77,29 @@ def way(node: EntangledNode, clock: IReactorTime, contact: Contact) -> dict[str,
 
 
 async def timed(node: EntangledNode, clock: IReactorTime, contact: Contact) -> float | None:
-    """How long a peer takes for one small question, in seconds; None where it does not answer."""
-    begun = clock.seconds()
+    """Ping a peer; return the round-trip time in seconds, None if it does not answer."""
+    started_at = clock.seconds()
     try:
-        await node.call(contact, "ping", b"", timeout=LIMIT, changes=True)
+        await node.call(contact, "ping", b"", timeout=PING_TIMEOUT_S, changes=True)
     except EntangledError:
         return None
-    return clock.seconds() - begun
+    return clock.seconds() - started_at
 
 
 async def _times(node: EntangledNode, clock: IReactorTime, contact: Contact) -> list[float | None]:
-    await timed(node, clock, contact)  # opens the session, where there is none
-    asked = []
+    await timed(node, clock, contact)  # opens a session if there is none
+    pings = []
     for _ in range(ASKED):
-        asked.append(Deferred.fromCoroutine(timed(node, clock, contact)))
-        await deferLater(clock, APART)
-    return [seconds for _, seconds in await DeferredList(asked, consumeErrors=True)]
+        pings.append(Deferred.fromCoroutine(timed(node, clock, contact)))
+        await deferLater(clock, PING_INTERVAL_S)
+    return [seconds for _, seconds in await DeferredList(pings, consumeErrors=True)]
 
 
 class Gauge:
-    """Measures the ways from ``node`` to its peers, only while somebody wants to know.
+    """Measures the paths from ``node`` to its peers, only while ``links`` is called.
 
-    The first caller is answered at once, and gets more with each second.  Each peer is asked small questions: some in
-    quick succession, then one a second, until nobody has asked for a while.
+    The first call returns at once, without figures; later calls have more.  Each peer gets several pings in quick
+    succession, then one per second, until ``links`` has not been called for ``IDLE`` seconds.
     """
 
     def __init__(self, node: EntangledNode, clock: IReactorTime, chores: Background) -> None:
@@ -107,21 +107,21 @@ class Gauge:
         self._clock = clock
         self._chores = chores
         self._times: dict[bytes, deque[float | None]] = {}
-        self._turns = 0
-        self._wanted_at = float("-inf")
+        self._ping_rounds = 0
+        self._called_at = float("-inf")
         self._is_running = False
 
     def links(self) -> list[dict[str, Any]]:
-        """The way to each peer and how good it is, as far as it is known by now; this also keeps it measuring.
+        """Return the path to each peer with the figures measured so far, and keep measuring.
 
-        Each is what ``way`` says, and ``loss``, ``round_trip`` and ``jitter`` (None: not known).
+        Each entry has the fields of ``way``, ``loss``, ``round_trip`` and ``jitter`` (None: unknown).
         """
-        self._wanted_at = self._clock.seconds()
+        self._called_at = self._clock.seconds()
         if not self._is_running:
             self._is_running = True
-            self._turns = 0
+            self._ping_rounds = 0
             self._times.clear()
-            self._turn()
+            self._ping_peers()
         return [{**way(self._node, self._clock, each), **self._figures(each)} for each in self._peers()]
 
     def _figures(self, contact: Contact) -> dict[str, float | None]:
@@ -134,23 +134,23 @@ class Gauge:
     def _peers(self) -> list[Contact]:
         return sorted(self._node.overlay.contacts(), key=lambda contact: contact.node_id)[:MAX_LINKS]
 
-    def _turn(self) -> None:
-        if self._clock.seconds() - self._wanted_at > IDLE:
+    def _ping_peers(self) -> None:
+        if self._clock.seconds() - self._called_at > IDLE:
             self._is_running = False
             self._times.clear()
             return
-        self._turns += 1
+        self._ping_rounds += 1
         peers = self._peers()
-        here = {contact.public for contact in peers}
-        self._times = {public: times for public, times in self._times.items() if public in here}
+        present = {contact.public for contact in peers}
+        self._times = {public: times for public, times in self._times.items() if public in present}
         for contact in peers:
-            # The first question to a peer opens the session, and takes longer.
+            # The first ping opens the session and takes longer, so it is not counted.
             is_met = self._node.endpoint.is_met(contact)
-            self._chores.fork(self._time(contact) if is_met else timed(self._node, self._clock, contact))
-        pause = APART if self._turns < ASKED else PACE
-        self._chores.later(pause * max(1.0, len(peers) / FEW), self._turn)
+            self._chores.fork(self._record_ping(contact) if is_met else timed(self._node, self._clock, contact))
+        pause = PING_INTERVAL_S if self._ping_rounds < ASKED else SLOW_INTERVAL_S
+        self._chores.later(pause * max(1.0, len(peers) / FEW), self._ping_peers)
 
-    async def _time(self, contact: Contact) -> None:
+    async def _record_ping(self, contact: Contact) -> None:
         seconds = await timed(self._node, self._clock, contact)
         if self._is_running:
             self._times.setdefault(contact.public, deque(maxlen=ASKED)).append(seconds)

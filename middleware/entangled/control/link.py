@@ -1,7 +1,7 @@
-"""Link: how good the way to one peer is, from the times that it took to answer; pure.
+"""Quality of the path to one peer, computed from round-trip times; pure.
 
-Several small questions are asked one after the other.  One whose first datagram, or its answer, was lost is asked again
-after a while, so that it takes much longer than the others: so losses are seen also where they are mended.
+Several pings are sent one after the other.  If the first datagram of a ping or of its answer is lost, it is
+retransmitted and takes much longer than the others, so losses show even though retransmission repairs them.
 """
 
 from __future__ import annotations
@@ -10,12 +10,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 RETRY = 0.045
-"""Seconds that an answer to a second try comes later at least: the wire waits 50 ms for the first."""
+"""Minimum extra seconds of a retransmitted ping: the wire waits 50 ms before it retransmits."""
 
 
 @dataclass(frozen=True)
 class Link:
-    """The way to one peer: the share of questions that were lost at the first try, and seconds."""
+    """The quality of a path: share of pings lost at the first attempt; round trip and jitter in seconds."""
 
     loss: float
     round_trip: float | None
@@ -24,9 +24,9 @@ class Link:
 
     @property
     def score(self) -> int:
-        """0 (nothing comes back) to 100 (near, steady, direct).
+        """A score from 0 (no answers) to 100 (near, steady, direct).
 
-        A tenth lost costs 30 points, 100 ms of round trip 10 (at most 25), 20 ms of jitter 8 (at most 15), a relay 15.
+        10 % loss costs 30 points, 100 ms of round trip 10 (at most 25), 20 ms of jitter 8 (at most 15), a relay 15.
         """
         if self.round_trip is None or self.jitter is None:
             return 0
@@ -36,7 +36,7 @@ class Link:
 
 
 def link(times: Sequence[float | None], is_relayed: bool) -> Link:
-    """The link whose questions took so many seconds, None for one that nobody answered."""
+    """Return the link with these round-trip times in seconds, None for a ping without an answer."""
     answered = sorted(seconds for seconds in times if seconds is not None)
     if not answered:
         return Link(1.0, None, None, is_relayed)
@@ -48,6 +48,6 @@ def link(times: Sequence[float | None], is_relayed: bool) -> Link:
 
 
 def median(times: Sequence[float]) -> float:
-    """The middle one of some times, which stand in order."""
+    """Return the median of sorted times."""
     half = len(times) // 2
     return times[half] if len(times) % 2 else (times[half - 1] + times[half]) / 2

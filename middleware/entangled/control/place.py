@@ -1,6 +1,6 @@
-"""Place: where the control sockets of this machine's nodes lie, one file a node, for its owner's eyes only.
+"""Location of the control sockets of this machine's nodes: one file per node, accessible to its user only.
 
-In ``/tmp`` any user may make a folder, a link or a socket first.  So node and client check the owner of each.
+Any user may create a folder, a link or a socket in ``/tmp``, so node and client check the owner of each.
 """
 
 from __future__ import annotations
@@ -14,43 +14,43 @@ from middleware.entangled.errors import LocalError
 FOLDER = "swarm-node"
 ENDING = ".control"
 MAX_PATH = 107
-"""Bytes of the path of a UNIX socket (``sockaddr_un``, Linux)."""
+"""Maximum bytes of the path of a UNIX socket (``sockaddr_un``, Linux)."""
 
 
 class NoControl(LocalError):
-    """There is no such control socket, or none can be made."""
+    """The control socket does not exist or cannot be created."""
 
 
 def folder() -> Path:
-    """The folder of the sockets: in ``XDG_RUNTIME_DIR``, else in ``/tmp`` under the user's number."""
+    """Return the folder of the sockets: in ``XDG_RUNTIME_DIR``, otherwise in ``/tmp`` with the user's id."""
     runtime = os.environ.get("XDG_RUNTIME_DIR")
     return Path(runtime) / FOLDER if runtime else Path(f"/tmp/{FOLDER}-{os.getuid()}")
 
 
 def made(name: str) -> Path:
-    """The path for the socket of node ``name``, its folder made; raises ``NoControl`` where that is not safe."""
-    where = folder()
+    """Create the folder and return the path for the socket of node ``name``; raise ``NoControl`` if unsafe."""
+    directory = folder()
     try:
-        where.mkdir(mode=0o700, parents=True, exist_ok=True)
+        directory.mkdir(mode=0o700, parents=True, exist_ok=True)
     except OSError as error:
-        raise NoControl(f"cannot make {where} for the control socket: {error.strerror}") from error
-    if owner_of(where) != os.getuid():
-        raise _foreign(where)
-    path = where / f"{name}{ENDING}"
+        raise NoControl(f"cannot create {directory} for the control socket: {error.strerror}") from error
+    if owner_of(directory) != os.getuid():
+        raise _unsafe_path(directory)
+    path = directory / f"{name}{ENDING}"
     if len(os.fsencode(path)) > MAX_PATH:
-        raise NoControl(f"{path} is longer than the {MAX_PATH} bytes of a socket's path; set a shorter XDG_RUNTIME_DIR")
+        raise NoControl(f"{path} exceeds the {MAX_PATH} bytes of a socket's path; set a shorter XDG_RUNTIME_DIR")
     return path
 
 
 def files(ending: str) -> list[Path]:
-    """The files of the nodes of this machine with that ending, by name; raises ``NoControl`` for a foreign folder."""
+    """Return the files with that ending in the folder, sorted; raise ``NoControl`` if the folder is unsafe."""
     if os.path.lexists(folder()):
         owner_of(folder())
     return sorted(folder().glob(f"*{ending}"))
 
 
 def found(name: str | None) -> Path:
-    """The socket of node ``name``, or of the only node here; raises ``NoControl``, which names those there are."""
+    """Return the socket of node ``name``, or of the only node; raise ``NoControl`` with the existing names."""
     names = [path.name.removesuffix(ENDING) for path in files(ENDING)]
     if name is None and len(names) == 1:
         name = names[0]
@@ -58,41 +58,41 @@ def found(name: str | None) -> Path:
         return folder() / f"{name}{ENDING}"
     if not names:
         raise NoControl("no node runs on this machine; start one: twistd -n swarm-node --name NAME")
-    there = ", ".join(names)
+    existing = ", ".join(names)
     if name is None:
-        raise NoControl(f"several nodes have run on this machine; say which: --node NAME, one of {there}")
-    raise NoControl(f"no node {name!r} runs on this machine; there are {there}")
+        raise NoControl(f"several nodes have run on this machine; choose one with --node NAME: {existing}")
+    raise NoControl(f"no node {name!r} runs on this machine; these have run: {existing}")
 
 
 def check_socket(path: Path) -> None:
-    """Raise ``NoControl`` where ``path`` is no socket, or one of another user than its folder's."""
+    """Raise ``NoControl`` if ``path`` is no socket, or its owner is not the owner of its folder."""
     owner = owner_of(path.parent)
     try:
         state = path.lstat()
     except OSError as error:
-        why = error.strerror
-        raise NoControl(f"the node behind {path} does not answer ({why}); start it, or remove that file") from error
+        reason = error.strerror
+        raise NoControl(f"the node behind {path} does not answer ({reason}); start it, or remove that file") from error
     if not stat.S_ISSOCK(state.st_mode):
-        raise NoControl(f"{path} is no socket; remove it, and start the node anew")
+        raise NoControl(f"{path} is no socket; remove it and restart the node")
     if state.st_uid != owner:
-        raise _foreign(path)
+        raise _unsafe_path(path)
 
 
-def owner_of(where: Path) -> int:
-    """The user of the folder ``where``, in which no other user can make anything; raises ``NoControl``.
+def owner_of(path: Path) -> int:
+    """Return the user id of the folder ``path``; raise ``NoControl`` if other users have access.
 
-    That is this user, or for root the user of a service, where ``XDG_RUNTIME_DIR`` names its folder.
+    The owner must be this user, or for root the user of a service whose folder ``XDG_RUNTIME_DIR`` names.
     """
     try:
-        state = where.lstat()
+        state = path.lstat()
     except OSError as error:
-        raise NoControl(f"cannot use {where} for the control socket: {error.strerror}") from error
+        raise NoControl(f"cannot use {path} for the control socket: {error.strerror}") from error
     is_served = os.getuid() == 0 and bool(os.environ.get("XDG_RUNTIME_DIR"))
     is_trusted = state.st_uid == os.getuid() or is_served
     if not stat.S_ISDIR(state.st_mode) or state.st_mode & 0o077 or not is_trusted:
-        raise _foreign(where)
+        raise _unsafe_path(path)
     return state.st_uid
 
 
-def _foreign(path: Path) -> NoControl:
-    return NoControl(f"{path} is not yours alone; remove it, or set XDG_RUNTIME_DIR to a folder of your own")
+def _unsafe_path(path: Path) -> NoControl:
+    return NoControl(f"{path} is accessible to other users; remove it, or set XDG_RUNTIME_DIR to a private folder")

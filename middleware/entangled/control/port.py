@@ -1,8 +1,8 @@
-"""Port: the control socket of one node; a connection carries one request and its answers, each a line of JSON.
+"""The control socket of one node; each connection carries one request and its answers as lines of JSON.
 
-A request is ``{"verb": "dht get", "with": {"key": "a"}}``.  Lines come back: any number of ``{"event": ...}``, then one
-of ``{"answer": ...}`` or ``{"error": "Unavailable", "text": "..."}``, and the connection closes.  Who closes it earlier
-cancels what was asked for.
+A request is ``{"verb": "dht get", "with": {"key": "a"}}``.  The reply is any number of lines ``{"event": ...}``, then
+one line ``{"answer": ...}`` or ``{"error": "Unavailable", "text": "..."}``, after which the node closes the connection.
+A client that closes it earlier cancels the request.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from twisted.python.failure import Failure
 from middleware.entangled.errors import EntangledError
 
 MAX_REQUEST = 2_000_000
-"""Bytes of a request: a value of 1 MiB in base64, and room for the rest."""
+"""Maximum bytes of a request: a value of 1 MiB in base64, and the other fields."""
 MAX_CONNECTIONS = 64
 
 
@@ -35,26 +35,26 @@ class ControlProtocol(Protocol):
 
     def __init__(self, port: ControlPort) -> None:
         self._port = port
-        self._heard = bytearray()
+        self._received = bytearray()
         self._work: Deferred[Any] | None = None
-        self._is_asked = False
+        self._has_request = False
 
     def connectionMade(self) -> None:  # noqa: D102 (Twisted's)
         self._port.open.add(self)
         if len(self._port.open) > MAX_CONNECTIONS:
-            self._end({"error": "Busy", "text": f"more than {MAX_CONNECTIONS} connections; close some"})
+            self._end({"error": "Busy", "text": f"more than {MAX_CONNECTIONS} connections; close some of them"})
 
     def dataReceived(self, data: bytes) -> None:  # noqa: D102 (Twisted's)
-        if self._is_asked:
+        if self._has_request:
             return
-        self._heard += data
-        line, newline, _ = self._heard.partition(b"\n")
+        self._received += data
+        line, newline, _ = self._received.partition(b"\n")
         if len(line) > MAX_REQUEST:
-            self._is_asked = True
+            self._has_request = True
             self._end({"error": "BadRequest", "text": f"a request has at most {MAX_REQUEST} bytes"})
         elif newline:
-            self._is_asked = True
-            self._heard.clear()
+            self._has_request = True
+            self._received.clear()
             self._ask(bytes(line))
 
     def connectionLost(self, reason: Failure = connectionDone) -> None:  # noqa: D102 (Twisted's)
@@ -71,14 +71,14 @@ class ControlProtocol(Protocol):
         if not isinstance(request, dict):
             self._end({"error": "BadRequest", "text": "a request is one line with a JSON object"})
             return
-        work = self._port.verbs.run(request.get("verb"), request.get("with", {}), self._tell)
+        work = self._port.verbs.run(request.get("verb"), request.get("with", {}), self._send_event)
         self._work = work
-        work.addCallbacks(lambda answer: {"answer": answer}, self._trouble).addCallback(self._end)
+        work.addCallbacks(lambda answer: {"answer": answer}, self._error_line).addCallback(self._end)
 
-    def _tell(self, event: Any) -> None:
+    def _send_event(self, event: Any) -> None:
         self._write({"event": event})
 
-    def _trouble(self, failure: Failure) -> dict[str, Any]:
+    def _error_line(self, failure: Failure) -> dict[str, Any]:
         if failure.check(CancelledError) is not None:
             return {"error": "Cancelled", "text": "cancelled"}
         if failure.check(EntangledError, ValueError) is None:
@@ -97,16 +97,16 @@ class ControlProtocol(Protocol):
 
 
 class Runs(Shape):
-    """What does the verbs; ``control.verb.Verbs`` does."""
+    """Runs verbs; ``control.verb.Verbs`` implements it."""
 
     def run(self, name: object, arguments: object, tell: Callable[[Any], None]) -> Deferred[Any]:
-        """Do what ``name`` says, as ``Verbs.run`` does."""
+        """Run the verb ``name``; see ``Verbs.run``."""
 
 
 class ControlPort(Service):
     """The control socket of one node, open while the service runs.
 
-    ``verbs`` is called when first somebody asks: a node that nobody speaks to need not load them.
+    ``verbs`` is called at the first request, so that a node without requests does not load them.
     """
 
     _log = Logger()
@@ -121,23 +121,23 @@ class ControlPort(Service):
 
     @property
     def verbs(self) -> Runs:
-        """The verbs, made at the first use."""
+        """The verbs, created on first use."""
         if self._verbs is None:
             self._verbs = self._make_verbs()
         return self._verbs
 
     def startService(self) -> None:
-        """Listen; where that cannot be, the log says why, and the node lives without."""
+        """Listen; on failure log the reason and run without the socket."""
         super().startService()
         factory = _Connections(self)
         try:
-            # With a lock file: what a killed node left behind is removed, what a living one holds is not.
+            # The lock file lets Twisted remove the socket of a killed node, but not of a running one.
             self._port = self._reactor.listenUNIX(str(self._path), factory, mode=0o600, wantPID=True)
         except (CannotListenError, OSError) as error:
-            self._log.warn("no control socket at {path}: {error}", path=self._path, error=error)
+            self._log.warn("cannot listen at the control socket {path}: {error}", path=self._path, error=error)
 
     def stopService(self) -> Deferred[object]:
-        """Close, and cancel what is still asked for."""
+        """Close the socket and cancel running requests."""
         super().stopService()
         for connection in list(self.open):
             if connection.transport is not None:

@@ -1,4 +1,4 @@
-"""Verb: what the control socket can ask of a node; each takes plain JSON and answers in plain JSON."""
+"""The verbs of the control socket, with JSON arguments and answers."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ Tell = Callable[[Any], None]
 
 
 class BadRequest(LocalError):
-    """A verb or an argument that nothing can be done with."""
+    """The verb or an argument is invalid."""
 
 
 @dataclass(frozen=True)
 class Verbs:
-    """The verbs of one node; ``run`` is all that a socket needs."""
+    """The verbs of one node; the socket calls ``run``."""
 
     node: EntangledNode
     space: TupleSpace
@@ -46,23 +46,23 @@ class Verbs:
 
     @classmethod
     def of(cls, node: EntangledNode, clock: IReactorTime, rng: random.Random) -> Verbs:
-        """The verbs of ``node``, over the tuple space that has no other name."""
+        """Return the verbs of ``node``, with the default tuple space."""
         return cls(node, TupleSpace(node, clock, rng), Keywords(node), clock)
 
-    def run(self, name: object, arguments: object, tell: Tell) -> Deferred[Any]:
-        """Do what ``name`` says; events go to ``tell``, the Deferred fires with the answer and may be cancelled.
+    def run(self, name: object, args: object, tell: Tell) -> Deferred[Any]:
+        """Run the verb ``name``; call ``tell`` with events, fire with the answer; can be cancelled.
 
-        Every trouble is a failure of the Deferred: ``BadRequest`` for what the caller got wrong.
+        All errors are failures of the Deferred: ``BadRequest`` for an invalid verb or argument.
         """
-        return maybeDeferred(self._run, name, arguments, tell)
+        return maybeDeferred(self._run, name, args, tell)
 
-    def _run(self, name: object, arguments: object, tell: Tell) -> object:
+    def _run(self, name: object, args: object, tell: Tell) -> object:
         verb = self._verbs().get(name) if isinstance(name, str) else None
         if verb is None:
             raise BadRequest(f"no verb {name!r}; there are {', '.join(sorted(self._verbs()))}")
-        if not isinstance(arguments, dict):
-            raise BadRequest("the arguments of a verb are an object with names")
-        return verb(Arguments(arguments), tell)
+        if not isinstance(args, dict):
+            raise BadRequest("the arguments of a verb must be a JSON object")
+        return verb(Arguments(args), tell)
 
     def _verbs(self) -> Mapping[str, Callable[[Arguments, Tell], object]]:
         return {
@@ -71,59 +71,59 @@ class Verbs:
             "dht remove": self._dht_remove,
             "dht find": self._dht_find,
             "dht watch": self._dht_watch,
-            "keyword publish": lambda a, _: self.keywords.publish(a.text("name"), a.data("value")),
-            "keyword remove": lambda a, _: self.keywords.remove(a.text("name")),
+            "keyword publish": lambda args, _: self.keywords.publish(args.text("name"), args.data("value")),
+            "keyword remove": lambda args, _: self.keywords.remove(args.text("name")),
             "keyword search": self._keyword_search,
             "keyword watch": self._keyword_watch,
-            "tuple put": lambda a, _: self.space.put(a.fields("fields"), a.seconds("ttl")),
+            "tuple put": lambda args, _: self.space.put(args.fields("fields"), args.seconds("ttl")),
             "tuple get": self._tuple_get,
             "tuple read": self._tuple_read,
             "rpc": self._rpc,
-            "health": lambda a, _: health(self.node),
-            "links": lambda a, _: Deferred.fromCoroutine(links(self.node, self.clock)),
+            "health": lambda args, _: health(self.node),
+            "links": lambda args, _: Deferred.fromCoroutine(links(self.node, self.clock)),
         }
 
     # -- dht --------------------------------------------------------------------------------------------------------
 
-    def _dht_get(self, a: Arguments, tell: Tell) -> object:
-        concern = cast(ReadConcern, a.choice("concern", "majority", get_args(ReadConcern)))
-        return self.node.get(key_of(a.text("key")), concern).addCallback(rows_of)
+    def _dht_get(self, args: Arguments, tell: Tell) -> object:
+        concern = cast(ReadConcern, args.choice("concern", "majority", get_args(ReadConcern)))
+        return self.node.get(key_of(args.text("key")), concern).addCallback(rows_of)
 
-    def _dht_put(self, a: Arguments, tell: Tell) -> object:
-        lifetime = cast(Lifetime, a.choice("lifetime", "team", get_args(Lifetime)))
-        concern = cast(Concern, a.choice("concern", "majority", get_args(Concern)))
-        key, name, value = key_of(a.text("key")), a.text("name", ""), a.data("value")
-        put = self.node.put(key, name, value, lifetime, concern, a.whole("expect"))
+    def _dht_put(self, args: Arguments, tell: Tell) -> object:
+        lifetime = cast(Lifetime, args.choice("lifetime", "team", get_args(Lifetime)))
+        concern = cast(Concern, args.choice("concern", "majority", get_args(Concern)))
+        key, name, value = key_of(args.text("key")), args.text("name", ""), args.data("value")
+        put = self.node.put(key, name, value, lifetime, concern, args.whole("expect"))
         return put.addCallback(_stored)
 
-    def _dht_remove(self, a: Arguments, tell: Tell) -> object:
-        removed = self.node.remove(key_of(a.text("key")), a.text("name", ""))
+    def _dht_remove(self, args: Arguments, tell: Tell) -> object:
+        removed = self.node.remove(key_of(args.text("key")), args.text("name", ""))
         return removed.addCallback(_stored)
 
-    def _dht_find(self, a: Arguments, tell: Tell) -> object:
-        found = self.node.find_node(key_of(a.text("key")))
+    def _dht_find(self, args: Arguments, tell: Tell) -> object:
+        found = self.node.find_node(key_of(args.text("key")))
         return found.addCallback(lambda contacts: [_contact(contact) for contact in contacts])
 
-    def _dht_watch(self, a: Arguments, tell: Tell) -> object:
-        return _until_cancelled(self.node.watch(key_of(a.text("key")), lambda records: tell(rows_of(records))))
+    def _dht_watch(self, args: Arguments, tell: Tell) -> object:
+        return _until_cancelled(self.node.watch(key_of(args.text("key")), lambda records: tell(rows_of(records))))
 
     # -- keywords and tuples ----------------------------------------------------------------------------------------
 
-    def _keyword_search(self, a: Arguments, tell: Tell) -> object:
-        return self.keywords.search(a.text("words")).addCallback(_matches)
+    def _keyword_search(self, args: Arguments, tell: Tell) -> object:
+        return self.keywords.search(args.text("words")).addCallback(_matches)
 
-    def _keyword_watch(self, a: Arguments, tell: Tell) -> object:
-        return _until_cancelled(self.keywords.watch_keyword(a.text("words"), lambda found: tell(_matches(found))))
+    def _keyword_watch(self, args: Arguments, tell: Tell) -> object:
+        return _until_cancelled(self.keywords.watch_keyword(args.text("words"), lambda found: tell(_matches(found))))
 
-    def _tuple_get(self, a: Arguments, tell: Tell) -> object:
-        template, wait = a.template("template"), a.seconds("wait")
+    def _tuple_get(self, args: Arguments, tell: Tell) -> object:
+        template, wait = args.template("template"), args.seconds("wait")
         found: Deferred[Any] = self.space.get(template, wait) if wait else self.space.get_if_exists(template)
         return found.addCallback(word.plain)
 
-    def _tuple_read(self, a: Arguments, tell: Tell) -> object:
-        template, wait = a.template("template"), a.seconds("wait")
+    def _tuple_read(self, args: Arguments, tell: Tell) -> object:
+        template, wait = args.template("template"), args.seconds("wait")
         found: Deferred[Any]
-        if a.flag("all"):
+        if args.flag("all"):
             found = self.space.read_all(template)
         else:
             found = self.space.read(template, wait) if wait else self.space.read_if_exists(template)
@@ -131,52 +131,57 @@ class Verbs:
 
     # -- rpc --------------------------------------------------------------------------------------------------------
 
-    def _rpc(self, a: Arguments, tell: Tell) -> object:
+    def _rpc(self, args: Arguments, tell: Tell) -> object:
         return Deferred.fromCoroutine(
-            self._ask(a.text("node"), a.text("method"), a.fields("arguments"), a.flag("changes"))
+            self._ask(
+                args.text("node"),
+                args.text("method"),
+                args.fields("arguments"),
+                args.flag("changes"),
+            )
         )
 
-    async def _ask(self, whom: str, method: str, arguments: Sequence[Any], is_changing: bool) -> object:
-        contact = await self._contact(whom)
-        return word.plain(await self.node.call(contact, method, *arguments, changes=is_changing))
+    async def _ask(self, target: str, method: str, args: Sequence[Any], is_changing: bool) -> object:
+        contact = await self._contact(target)
+        return word.plain(await self.node.call(contact, method, *args, changes=is_changing))
 
-    async def _contact(self, whom: str) -> Contact:
-        host, colon, port = whom.rpartition(":")
+    async def _contact(self, target: str) -> Contact:
+        host, colon, port = target.rpartition(":")
         if colon and port.isdecimal():
             number = int(port) if len(port) <= 5 else 0
             if not 0 < number < 65536:
-                raise BadRequest(f"{whom!r:.80}: a port is 1 to 65535")
+                raise BadRequest(f"{target!r:.80}: the port must be 1 to 65535")
             return await self.node.endpoint.greet(Address(host.strip("[]"), number))
         known = self.node.overlay.table.contacts()
-        meant = [contact for contact in known if contact.node_id.hex().startswith(whom.lower())] if whom else []
-        if len(meant) == 1:
-            return meant[0]
-        problem = f"{len(meant)} known nodes begin with" if meant else "no known node begins with"
-        raise BadRequest(f"{problem} {whom!r}; say HOST:PORT, or more of the node's id (swarm dht find)")
+        matching = [contact for contact in known if contact.node_id.hex().startswith(target.lower())] if target else []
+        if len(matching) == 1:
+            return matching[0]
+        problem = f"{len(matching)} known nodes begin with" if matching else "no known node begins with"
+        raise BadRequest(f"{problem} {target!r}; give HOST:PORT, or more digits of the node's id (swarm dht find)")
 
 
 class Arguments:
-    """The named arguments of one request, each checked when it is asked for; raises ``BadRequest``."""
+    """The named arguments of one request; each method checks one argument and raises ``BadRequest``."""
 
     def __init__(self, given: Mapping[str, Any]) -> None:
         self._given = given
 
-    def text(self, name: str, otherwise: str | None = None) -> str:
-        """A text."""
-        value = self._given.get(name, otherwise)
+    def text(self, name: str, default: str | None = None) -> str:
+        """Return a text."""
+        value = self._given.get(name, default)
         if not isinstance(value, str):
             raise BadRequest(f"{name}: must be a text" if name in self._given else f"{name}: is missing")
         return value
 
-    def choice(self, name: str, otherwise: str, choices: Sequence[str]) -> str:
-        """One of ``choices``."""
-        value = self.text(name, otherwise)
+    def choice(self, name: str, default: str, choices: Sequence[str]) -> str:
+        """Return one of ``choices``."""
+        value = self.text(name, default)
         if value not in choices:
-            raise BadRequest(f"{name}: {value!r} is none of {', '.join(choices)}")
+            raise BadRequest(f"{name}: must be one of {', '.join(choices)}, is {value!r}")
         return value
 
     def data(self, name: str) -> bytes:
-        """Bytes, given as text or as ``{"base64": ...}``."""
+        """Return bytes, given as text or as ``{"base64": ...}``."""
         value = self._value(name)
         if isinstance(value, str):
             return value.encode()
@@ -185,14 +190,14 @@ class Arguments:
         return value
 
     def whole(self, name: str) -> int | None:
-        """A whole number that is not negative, or None where it is not given."""
+        """Return a non-negative integer, or None if absent."""
         value = self._given.get(name)
         if value is not None and (type(value) is not int or value < 0):
-            raise BadRequest(f"{name}: must be a whole number that is not negative")
+            raise BadRequest(f"{name}: must be a non-negative integer")
         return value
 
     def seconds(self, name: str) -> float | None:
-        """Seconds above 0, at most a day; None where they are not given, or 0."""
+        """Return seconds, at most a day; None if absent or 0."""
         value = self._given.get(name)
         if value is None or value == 0:
             return None
@@ -201,18 +206,18 @@ class Arguments:
         return float(value)
 
     def flag(self, name: str) -> bool:
-        """Whether it is set."""
+        """Return whether it is true."""
         return self._given.get(name) is True
 
     def fields(self, name: str) -> list[Any]:
-        """The fields of a tuple, or the arguments of a method."""
+        """Return the fields of a tuple, or the arguments of a method."""
         value = self._value(name)
         if not isinstance(value, list):
             raise BadRequest(f"{name}: must be a list")
         return value
 
     def template(self, name: str) -> list[Field]:
-        """The fields of a template: a value, ``{"any": true}``, ``{"kind": "int"}`` or an operator with its operand."""
+        """Return template fields: a value, ``{"any": true}``, ``{"kind": "int"}`` or an operator with its operand."""
         given = self._given.get(name)
         if not isinstance(given, list):
             raise BadRequest(f"{name}: must be a list")
@@ -226,7 +231,7 @@ class Arguments:
 
 
 def key_of(text: str) -> bytes:
-    """The key that ``text`` means: the hash of it, or after ``id:`` the 40 hexadecimal digits of the key itself."""
+    """Return the hash of ``text``, or the key itself if ``text`` is ``id:`` and 40 hexadecimal digits."""
     if not text.startswith(RAW):
         return hashed_key(text)
     try:
@@ -234,7 +239,7 @@ def key_of(text: str) -> bytes:
     except ValueError:
         key = b""
     if len(key) != KEY_BYTES:
-        raise BadRequest(f"key: after {RAW} come {2 * KEY_BYTES} hexadecimal digits")
+        raise BadRequest(f"key: {RAW} must be followed by {2 * KEY_BYTES} hexadecimal digits")
     return key
 
 
@@ -247,7 +252,7 @@ def _field(given: Any) -> Field:
                 return KINDS[given["kind"]]
             if "operator" in given:
                 return where(given["operator"], word.value(given.get("operand")))
-            raise BadRequest(f"template: no field can be read from {given!r:.80}")
+            raise BadRequest(f"template: {given!r:.80} is no field")
         return word.value(given)  # type: ignore[no-any-return]
     except (word.BadWord, TypeError) as error:
         raise BadRequest(f"template: {error}") from error
@@ -258,7 +263,7 @@ def _stored(stored: Stored) -> dict[str, int]:
 
 
 def rows_of(records: Sequence[Record]) -> list[dict[str, Any]]:
-    """Records as the socket tells them; tombstones are left out."""
+    """Return records in the form of the socket's answers, without tombstones."""
     return [
         {
             "owner": record.owner.hex(),

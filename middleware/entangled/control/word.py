@@ -1,10 +1,10 @@
-"""Word: values as words of a shell and as JSON; the same for every verb, in both directions.
+"""Conversion of values between shell words, JSON and tuples, for all verbs.
 
-JSON has no bytes: bytes that are UTF-8 text are shown as that text, others as ``{"base64": "..."}``, which is also read
-back.  A tuple's text stays text, its bytes are always ``{"base64": ...}``, since there the two differ.
+JSON has no bytes: bytes that are valid UTF-8 become text, others ``{"base64": "..."}``, which is also accepted as
+input.  In a tuple, where text and bytes differ, bytes always become ``{"base64": ...}``.
 
-Any member of the team chooses its own words, and records keep them as they are.  What would move a terminal's cursor
-is taken out where they are shown, and nowhere else: a node that refused them would see another team than the others.
+Members of the team choose their texts freely, and records keep them unchanged.  Control characters are removed only
+when a text is printed, because a node that rejected such records would differ from the others.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ ANY = "_"
 
 
 class BadWord(ValueError):
-    """A word that no value can be read from."""
+    """A word that is no valid value."""
 
 
 def text_or_base64(data: bytes) -> Any:
-    """Bytes for JSON: text where they are text."""
+    """Convert bytes to JSON: text if they are valid UTF-8, otherwise base64."""
     try:
         return data.decode()
     except UnicodeDecodeError:
@@ -35,7 +35,7 @@ def text_or_base64(data: bytes) -> Any:
 
 
 def plain(value: Any) -> Any:
-    """A tuple's field, or a method's answer, for JSON."""
+    """Convert a tuple's field or a method's answer to JSON."""
     if isinstance(value, bytes):
         return {"base64": base64.b64encode(value).decode()}
     if isinstance(value, list | tuple):
@@ -48,7 +48,7 @@ def plain(value: Any) -> Any:
 
 
 def value(field: Any) -> Any:
-    """What ``plain`` made of a value, as that value; raises ``BadWord``."""
+    """Convert the result of ``plain`` back to the value; raise ``BadWord``."""
     if isinstance(field, dict) and set(field) == {"base64"}:
         try:
             return base64.b64decode(field["base64"], validate=True)
@@ -60,7 +60,7 @@ def value(field: Any) -> Any:
 
 
 def scalar(word: str) -> Any:
-    """A field out of a word: JSON where it is JSON (``7``, ``true``, ``null``, ``"7"``), else the text itself."""
+    """Parse a word as a field: valid JSON (``7``, ``true``, ``null``, ``"7"``), otherwise the text itself."""
     try:
         read = json.loads(word, parse_constant=_refused)
     except (ValueError, RecursionError):
@@ -71,12 +71,12 @@ def scalar(word: str) -> Any:
 
 
 def pattern(word: str) -> Any:
-    """A template's field out of a word: ``_`` any, ``?int`` a kind, ``>5`` ``!=red`` a predicate, else a value."""
+    """Parse a template field: ``_`` any, ``?int`` a type, ``>5`` ``!=red`` a predicate, otherwise a value."""
     if word == ANY:
         return {"any": True}
     if word.startswith("?"):
         if word[1:] not in KINDS:
-            raise BadWord(f"{word!r}: a kind is one of ?{', ?'.join(KINDS)}")
+            raise BadWord(f"{word!r}: the type must be one of ?{', ?'.join(KINDS)}")
         return {"kind": word[1:]}
     for operator in OPERATORS:
         if word.startswith(operator):
@@ -89,17 +89,17 @@ def pattern(word: str) -> Any:
 
 
 def shown(fields: Sequence[Any]) -> str:
-    """A tuple for a person: its fields as JSON, side by side."""
+    """Format a tuple for printing: its fields as JSON, separated by spaces."""
     return " ".join(written(plain(field)) for field in fields)
 
 
 def printable(text: str) -> str:
-    """Somebody's words as a terminal may be shown them, on one line: each control character is a space."""
+    """Replace control characters by spaces, for printing a text of a peer on one line of a terminal."""
     return "".join(c if c.isprintable() else " " for c in text)
 
 
 def written(value: Any) -> str:
-    """Plain JSON on one line that a terminal may be shown; read back it is the same value."""
+    """Format JSON on one line with control characters escaped, safe for a terminal."""
     text = json.dumps(value, ensure_ascii=False)
     return "".join(c if c.isprintable() else json.dumps(c)[1:-1] for c in text)
 

@@ -1,1 +1,1 @@
-"""The data store: what a node holds, in memory or in a SQLite file."""
+"""The data store of a node, in memory or in a SQLite file."""

@@ -1,4 +1,4 @@
-"""MemoryStore: the data store that lives as long as the program."""
+"""A data store in memory."""
 
 from __future__ import annotations
 
@@ -6,4 +6,4 @@ from middleware.entangled.data.store import Store
 
 
 class MemoryStore(Store):
-    """A store without a file: what it holds is gone with the process."""
+    """A store without a file; its contents end with the process."""

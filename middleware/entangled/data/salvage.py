@@ -1,7 +1,7 @@
-"""Salvage: what is done with a store's file that has rotted.
+"""Recovery from a corrupt store file.
 
-It is set aside by name and never removed, and the notes in it that are still whole are brought over: with them the node
-keeps its identity.
+The file is renamed and never removed.  Notes in it with a valid checksum are copied to the new store; the node's
+identity is one of them.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ CHUNK = 2**20
 
 
 def is_ours(path: str) -> bool:
-    """Whether a file that SQLite cannot read was a store: by its header, by what else of us is in it, or all zeros."""
+    """Return whether an unreadable file was a store: by its header, its tables, or because it is all zeros."""
     return _has_our_header(path) or _is_blank(path) or any(_has_trace(path + part) for part in PARTS[:2])
 
 
 def set_aside(path: str) -> str:
-    """Rename the file ``path`` with its log to the first free name, ``PATH.rotten-1`` and so on; returns that."""
+    """Rename the file and its write-ahead log to the first free name, ``PATH.rotten-1`` and so on; return that."""
     number = 1
     while os.path.lexists(f"{path}.rotten-{number}"):
         number += 1
@@ -36,7 +36,7 @@ def set_aside(path: str) -> str:
 
 
 def saved_notes(path: str) -> dict[str, bytes]:
-    """The notes of the rotten file ``path`` that are whole by their checksum; none where it cannot be read."""
+    """Return the notes with a valid checksum in a corrupt file; empty if SQLite cannot read it."""
     try:
         with closing(sqlite3.connect(f"file:{quote(path)}?mode=ro", uri=True, timeout=1.0)) as connection:
             open_rows(connection)
@@ -51,7 +51,7 @@ def _has_our_header(path: str) -> bool:
 
 
 def _is_blank(path: str) -> bool:
-    """Whether there is nothing but zeros in the file, as a card leaves it that lost its pages."""
+    """Return whether all bytes are zero, as after lost pages of a flash card."""
     with open(path, "rb") as file:
         return not any(chunk.strip(b"\0") for chunk in iter(lambda: file.read(CHUNK), b""))
 

@@ -1,6 +1,6 @@
-"""Schema: how records and notes stand in a SQLite file, how they are checked, and how older files become new ones.
+"""Tables of the SQLite file, checksums of rows, and migration from older schemas.
 
-Each row carries a CRC-32 of what it says, for flash that rots inside a page leaves SQLite's own structure whole.
+Each row carries a CRC-32 of its fields, because SQLite's structural checks miss bit errors of the flash inside values.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from middleware.entangled.errors import BadStore
 from middleware.entangled.record import Record, unpacked
 
 APPLICATION_ID = 0x53574E31
-"""Says in the file's header that the file is ours ("SWN1")."""
+"""Identifies the file in its header as a store ("SWN1")."""
 SCHEMA_VERSION = 2
 MARK = bytes.fromhex("a9531c4e5fd0428fb1e7706d2c8834f6")
-"""Stands among the notes, so that a file whose header is gone is still known as ours."""
+"""Value of a note that identifies a store file with a damaged header."""
 RECORDS_1 = (
     "CREATE TABLE records(key BLOB, owner BLOB, name TEXT, sequence INTEGER, lifetime TEXT, ttl REAL, value BLOB,"
     " signature BLOB, PRIMARY KEY(key, owner, name)) WITHOUT ROWID"
 )
-"""Until version 1; large values make such a table slow, for they lie in the tree by which it is searched."""
+"""Schema 1; large values slow it down, because they are stored in the tree that SQLite searches."""
 RECORDS = (
     "CREATE TABLE records(id INTEGER PRIMARY KEY, key BLOB, owner BLOB, name TEXT, sequence INTEGER, lifetime TEXT,"
     " ttl REAL, signature BLOB, crc INTEGER, value BLOB, UNIQUE(key, owner, name))"
@@ -36,7 +36,7 @@ ROTTEN = (
     " ttl REAL, signature BLOB, crc INTEGER, value BLOB)"
 )
 MAX_ROTTEN = 16
-"""Rotten rows that are kept to be looked at; more helps whoever wonders about a card, less spares it."""
+"""Number of corrupt rows kept for diagnosis; more of them cost space on the card."""
 
 FIELDS = "key, owner, name, sequence, lifetime, ttl, signature, crc, value"
 SELECT = f"SELECT {FIELDS} FROM records"
@@ -52,12 +52,12 @@ Statement = tuple[str, Sequence[Any]]
 
 
 class Rotten(Exception):
-    """The file is ours and damaged; ``str()`` says how that showed."""
+    """The file is a damaged store; ``str()`` is the symptom."""
 
 
 @dataclass
 class Contents:
-    """What a file holds; ``repairs`` are the statements that set aside what is rotten or belongs to an earlier life."""
+    """The contents of a file; ``repairs`` are the statements that set aside corrupt rows and remove leased records."""
 
     records: list[Record] = field(default_factory=list)
     notes: dict[str, bytes] = field(default_factory=dict)
@@ -66,53 +66,53 @@ class Contents:
 
 
 def row_of(record: Record) -> tuple[object, ...]:
-    """``record`` in the order of ``FIELDS``."""
+    """Return the row of ``record`` in the order of ``FIELDS``."""
     crc = _crc(record.packed())
     return *record.slot, record.sequence, record.lifetime, record.ttl, record.signature, crc, record.value
 
 
 def record_of(row: Sequence[Any]) -> Record | None:
-    """The record in a row of ``FIELDS`` whose texts are bytes; None if the row is rotten."""
+    """Return the record in a row of ``FIELDS`` with texts as bytes; None if the row is corrupt."""
     record = _unchecked(row)
     return record if record is not None and _crc(record.packed()) == row[7] else None
 
 
 def note_of(name: str, value: bytes) -> tuple[str, bytes, int]:
-    """A row of ``notes``."""
+    """Return a row of ``notes``."""
     return name, value, _crc([name, value])
 
 
 def open_rows(connection: sqlite3.Connection) -> None:
-    """Let ``connection`` answer texts as bytes: those of a rotten row may be no texts."""
+    """Make ``connection`` return texts as bytes, because a corrupt text may not be UTF-8."""
     connection.text_factory = bytes
 
 
 def checked_version(path: str, connection: sqlite3.Connection) -> int:
-    """The schema version of the file, 0 where it is empty.
+    """Return the schema version of the file, 0 if it is empty.
 
-    Raises ``BadStore`` where it is not ours or newer than we are, ``Rotten`` where it is not whole.
+    Raises ``BadStore`` if it is no store or has a newer schema, ``Rotten`` if it is a damaged store.
     """
     (application,) = connection.execute("PRAGMA application_id").fetchone()
     (version,) = connection.execute("PRAGMA user_version").fetchone()
-    tables = [_text(sql) for (sql,) in connection.execute("SELECT sql FROM sqlite_schema WHERE type = 'table'")]
+    tables = [_decode_text(sql) for (sql,) in connection.execute("SELECT sql FROM sqlite_schema WHERE type = 'table'")]
     if application != APPLICATION_ID:
         if RECORDS in tables or RECORDS_1 in tables:
-            raise Rotten("its header is not ours")
+            raise Rotten("its header has another application id")
         if application or version or tables:
-            raise BadStore(f"store {path}: is the database of another program; name another file")
+            raise BadStore(f"store {path}: belongs to another program; name another file")
         return 0
     if version > SCHEMA_VERSION:
-        raise BadStore(f"store {path}: has schema {version}, we know {SCHEMA_VERSION}; update us, or name another file")
+        raise BadStore(f"store {path}: has the newer schema {version}; update this program, or name another file")
     if (RECORDS if version == SCHEMA_VERSION else RECORDS_1) not in tables:
-        raise Rotten(f"it has not the tables of schema {version}")
+        raise Rotten(f"it lacks the tables of schema {version}")
     (verdict,) = connection.execute("PRAGMA integrity_check(1)").fetchone()
-    if _text(verdict) != "ok":
-        raise Rotten(str(_text(verdict)))
+    if _decode_text(verdict) != "ok":
+        raise Rotten(str(_decode_text(verdict)))
     return int(version)
 
 
 def make(connection: sqlite3.Connection, version: int) -> None:
-    """Bring the file from ``version`` (0: empty) to ours, in one transaction: all of it, or nothing."""
+    """Create or migrate the tables from ``version`` (0: empty) to ``SCHEMA_VERSION`` in one transaction."""
     if version == SCHEMA_VERSION:
         return
     connection.execute("BEGIN IMMEDIATE")
@@ -134,9 +134,9 @@ def make(connection: sqlite3.Connection, version: int) -> None:
 
 
 def contents(connection: sqlite3.Connection) -> Contents:
-    """What the file holds, in the order in which it came."""
+    """Read the whole file, records in order of insertion."""
     found = Contents()
-    # Owners and keys stand in many rows; one copy of each is enough.
+    # Many rows share an owner or a key; share their bytes objects.
     known: dict[bytes, bytes] = {}
     for row_id, key, owner, *rest in connection.execute(f"SELECT id, {FIELDS} FROM records ORDER BY id"):
         record = record_of([known.setdefault(key, key), known.setdefault(owner, owner), *rest])
@@ -145,7 +145,7 @@ def contents(connection: sqlite3.Connection) -> Contents:
             found.repairs += _set_aside(row_id)
         elif record.lifetime == "team":
             found.records.append(record)
-    # Leases ended with the node that watched them.
+    # Leases end with the process that received the owners' signs of life.
     found.repairs.append(("DELETE FROM records WHERE lifetime = 'leased'", ()))
     found.notes, bad = notes_in(connection)
     found.rotten += bad
@@ -153,11 +153,11 @@ def contents(connection: sqlite3.Connection) -> Contents:
 
 
 def notes_in(connection: sqlite3.Connection) -> tuple[dict[str, bytes], int]:
-    """The notes of the file that are whole, and how many are not."""
+    """Return the notes with a valid checksum, and the number of corrupt ones."""
     notes: dict[str, bytes] = {}
     rotten = 0
     for raw, value, crc in connection.execute("SELECT name, value, crc FROM notes ORDER BY name"):
-        name = _text(raw)
+        name = _decode_text(raw)
         if isinstance(name, str) and isinstance(value, bytes) and _crc([name, value]) == crc:
             notes[name] = value
         else:
@@ -166,7 +166,7 @@ def notes_in(connection: sqlite3.Connection) -> tuple[dict[str, bytes], int]:
 
 
 def _migrate_from_1(connection: sqlite3.Connection) -> None:
-    """Give every row of schema 1 its checksum."""
+    """Copy the rows of schema 1 and compute their checksums."""
     fields = "key, owner, name, sequence, lifetime, ttl, signature, NULL, value"
     for row in connection.execute(f"SELECT {fields} FROM old_records ORDER BY key, owner, name"):
         record = _unchecked(row)
@@ -182,7 +182,7 @@ def _migrate_from_1(connection: sqlite3.Connection) -> None:
 
 def _unchecked(row: Sequence[Any]) -> Record | None:
     key, owner, name, sequence, lifetime, ttl, signature, _, value = row
-    return unpacked([key, _text(name), owner, sequence, _text(lifetime), ttl, value, signature])
+    return unpacked([key, _decode_text(name), owner, sequence, _decode_text(lifetime), ttl, value, signature])
 
 
 def _set_aside(row_id: int) -> list[Statement]:
@@ -193,7 +193,7 @@ def _set_aside(row_id: int) -> list[Statement]:
     ]
 
 
-def _text(raw: object) -> object:
+def _decode_text(raw: object) -> object:
     if not isinstance(raw, bytes):
         return raw
     try:

@@ -1,7 +1,7 @@
-"""SQLite store: what a node holds, in a file that outlives it.
+"""A data store in a SQLite file.
 
-Reads are answered from memory; changes go to the file through one ``writer``.  ``read_records`` reads the file for the
-pages, from any thread.
+Reads are served from memory; one ``writer`` writes changes to the file.  ``read_records`` reads the file from any
+thread, for the pages.
 """
 
 from __future__ import annotations
@@ -33,21 +33,21 @@ from middleware.entangled.record import Record, Slot
 
 SYNCHRONOUS: dict[Durable, str] = {"power": "FULL", "crash": "NORMAL"}
 EPOCH = "epoch"
-"""The note that holds the store's epoch; it never goes from one file to the next."""
+"""The note that holds the store's epoch; it is not copied from a corrupt file to the new one."""
 MAX_LOG = 4 * 2**20
-"""Bytes to which the write-ahead log is cut after a flood of writes."""
+"""Bytes to which the write-ahead log is truncated after a burst of writes."""
 
 
 class SqliteStore(Store):
-    """A ``Store`` with the file ``path`` behind it; ``open`` makes one.
+    """A ``Store`` backed by the file ``path``; use ``open`` to create one.
 
-    While the file cannot be written (a full disk, say) reads go on, ``put`` raises ``Unwritable`` with the reason, and
-    what is owed to the file is tried again until it succeeds.
+    While the file is not writable (a full disk, say), reads continue, ``put`` raises ``Unwritable`` with the reason,
+    and the writer retries pending changes until it succeeds.
     """
 
     _log = Logger()
     make_writer: Callable[[str, sqlite3.Connection, Deliver | None], Writer] = Writer
-    """What writes the file; simulations put in one that has no thread."""
+    """Factory of the writer; simulations replace it by one without a thread."""
 
     def __init__(
         self,
@@ -78,36 +78,35 @@ class SqliteStore(Store):
         fresh_epoch: bytes | None = None,
         durable: Durable = "power",
     ) -> SqliteStore:
-        """The store in the file ``path``, made if there is none; raises ``BadStore`` with the reason and a remedy.
+        """Open the store in the file ``path``, or create it; raise ``BadStore`` with the reason and a remedy.
 
-        Team records are back, to expire a whole ttl from ``now`` (the file cannot know how long it lay); leased ones
-        are gone, for their owners' leases ended with the node that watched them.  A rotten file is set aside and the
-        store starts empty, with those notes that could be saved.  ``deliver`` is ``reactor.callFromThread``, or None
-        where nobody awaits ``written``; ``fresh_epoch`` is the epoch if the store is made now (None: drawn).
-        ``durable`` is what ``written`` stands for: that it outlives a loss of ``power``, or only the ``crash`` of this
-        process, which spares a wait for the disk at each commit; with the power the last commits may then go, but
-        nothing else.
+        Team records expire a whole ttl after ``now``, because the time since it was closed is unknown; leased
+        records are removed.  A corrupt file is renamed, and the store starts empty except for the notes that could be
+        read.  ``deliver`` is ``reactor.callFromThread``, or None if the caller never waits for ``written``.
+        ``fresh_epoch`` is the epoch of a new store, random if None.  With ``durable`` set to ``power``, written data
+        survives a power failure.  With ``crash`` it survives a crash of the process: commits do not wait for the disk,
+        and a power failure may lose the last of them, without other damage.
         """
         path = os.fspath(path)
         fresh_epoch = os.urandom(8) if fresh_epoch is None else fresh_epoch
         notes: dict[str, bytes] = {}
         origin: Origin = "kept"
         try:
-            connection, lock, version, found = _opened(path, durable)
+            connection, lock, version, found = _open_file(path, durable)
         except Rotten as error:
             aside = set_aside(path)
             notes = saved_notes(aside)
             notes.pop(EPOCH, None)
             saved = f"its notes were saved ({', '.join(notes)})" if notes else "nothing in it could be saved"
             cls._log.error(
-                "store {path} was rotten ({why}); it is set aside as {aside}, and the node starts with an empty one; "
+                "store {path} is corrupt ({why}); it is renamed to {aside}, and the node starts with an empty store; "
                 "{saved}",
                 path=path,
                 why=error,
                 aside=aside,
                 saved=saved,
             )
-            connection, lock, version, found = _opened(path, durable)
+            connection, lock, version, found = _open_file(path, durable)
             origin = "replaced"
         if not version and origin == "kept":
             origin = "new"
@@ -115,60 +114,60 @@ class SqliteStore(Store):
         writer = cls.make_writer(path, connection, deliver)
         store = cls(path, connection, lock, writer, max_rows, max_bytes, hold, epoch)
         store.origin = origin
-        store._take_in(found, now)
+        store._load(found, now)
         writer.start(found.repairs)
         for name, value in {**notes, EPOCH: epoch}.items():
             store.note(name, value)
         return store
 
     def put(self, record: Record, expires_at: float) -> bool:
-        """Hold ``record`` if it beats what its slot holds; see ``Store.put``."""
+        """Store ``record`` if it beats the record in its slot; see ``Store.put``."""
         self._check_open()
         if self._writer.trouble and record.beats(self.slot(record.slot)):
             raise self._writer.refusal(self._writer.trouble)
         return super().put(record, expires_at)
 
     def written(self) -> Deferred[None]:
-        """Fire when all that was put until now is in the file; fail with ``Unwritable`` if it cannot be written."""
+        """Fire when all changes made so far are in the file; fail with ``Unwritable`` if it is not writable."""
         return self._writer.written()
 
     @property
     def trouble(self) -> str:
-        """Why the file cannot be written at present; empty if it can."""
+        """The reason why the file is not writable at present; empty if it is."""
         return self._writer.trouble
 
     def note(self, name: str, value: bytes) -> None:
-        """Keep a small fact of the node's own under ``name``; it is in the file once ``written`` fires."""
+        """Store a small value for the node's own use under ``name``; it is durable once ``written`` fires."""
         self._check_open()
         if self.noted(name) != value:
             super().note(name, value)
             self._writer.owe_note(name, value)
 
     def flush(self, timeout: float = 5.0) -> None:
-        """Wait until all that was put is in the file; raises ``BadStore`` where that takes over ``timeout`` seconds."""
+        """Block until all changes are in the file; raise ``BadStore`` after ``timeout`` seconds."""
         self._writer.flush(timeout)
 
     def close(self) -> None:
-        """Write what is to be written and let go of the file; may be called twice.
+        """Write pending changes and close the file; may be called twice.
 
-        Where it cannot be written the reason is logged: what was owed to the file is lost with this node.
+        If the file is not writable the pending changes are lost and the reason is logged.
         """
         if self._writer.close():
             self._connection.close()
-            # After the connection, for closing any descriptor of the file ends SQLite's own locks on it.
+            # Closed last, because closing any descriptor of the file releases SQLite's locks on it.
             os.close(self._lock)
 
     # -- inside ------------------------------------------------------------------------------------------------------
 
-    def _take_in(self, found: Contents, now: float) -> None:
-        """Take in what an earlier life left; only before the writer runs."""
+    def _load(self, found: Contents, now: float) -> None:
+        """Load the contents of the file; only before the writer runs."""
         for record in found.records:
             self._insert(record, now + record.ttl)
         self._notes.update(found.notes)
         self.rotten = found.rotten
         if found.rotten:
             self._log.warn(
-                "store {path}: {count} rotten rows are set aside; they are absent until their replicas repair them",
+                "store {path}: {count} corrupt rows are set aside; their records are missing until replicas send them",
                 path=self._path,
                 count=found.rotten,
             )
@@ -182,9 +181,9 @@ class SqliteStore(Store):
 
 
 def read_records(path: str | os.PathLike[str], key: bytes) -> list[Record]:
-    """The records under ``key`` in the file ``path``, in the order of (owner, name); for any thread or process.
+    """Return the records under ``key`` in the file ``path``, in the order of (owner, name); from any thread or process.
 
-    Never blocks the writer; sees what was committed, up to ``writer.COMMIT_AFTER`` late.  Raises ``BadStore``.
+    Never blocks the writer; sees committed changes, up to ``writer.COMMIT_AFTER`` late.  Raises ``BadStore``.
     """
     path = os.fspath(path)
     connection = None
@@ -194,30 +193,29 @@ def read_records(path: str | os.PathLike[str], key: bytes) -> list[Record]:
         rows = connection.execute(SELECT + " WHERE key = ? AND value IS NOT NULL ORDER BY owner, name", (key,))
         return [record for record in map(record_of, rows) if record is not None]
     except sqlite3.Error as error:
-        raise _bad(path, str(error), "is it the store of a running node?") from error
+        raise _bad_store(path, str(error), "is it the store of a running node?") from error
     finally:
         if connection is not None:
             connection.close()
 
 
-def _opened(path: str, durable: Durable) -> tuple[sqlite3.Connection, int, int, Contents]:
-    """The file, locked and made ready to be written, the version that it had, and what it holds.
+def _open_file(path: str, durable: Durable) -> tuple[sqlite3.Connection, int, int, Contents]:
+    """Lock and open the file; return the connection, the lock, the version that it had, and its contents.
 
-    Raises ``BadStore`` where it cannot be used, ``Rotten`` where it is ours and damaged.
+    Raises ``BadStore`` if it is not usable, ``Rotten`` if it is a damaged store.
     """
-    lock = _locked(path)
+    lock = _lock_file(path)
     connection = None
     try:
-        # Autocommit: transactions are begun by hand.  One thread at a time uses the connection, this one until the
-        # writer starts.
+        # Autocommit: the code begins transactions explicitly.  One thread at a time uses the connection, this one until
+        # the writer starts.
         connection = sqlite3.connect(path, isolation_level=None, check_same_thread=False, timeout=5.0)
         open_rows(connection)
         version = checked_version(path, connection)
-        # Only now, for the file of another program is left as it was.
+        # Only now, to leave another program's file unchanged.
         os.fchmod(lock, 0o600)
         connection.execute("PRAGMA journal_mode = WAL")
-        # Robots lose power at any moment; with less than FULL the last commits would be gone.  Less than NORMAL could
-        # damage the file.
+        # Robots lose power at any time; less than FULL loses the last commits, less than NORMAL may damage the file.
         connection.execute(f"PRAGMA synchronous = {SYNCHRONOUS[durable]}")
         connection.execute("PRAGMA cache_size = -512")
         connection.execute(f"PRAGMA journal_size_limit = {MAX_LOG}")
@@ -234,46 +232,46 @@ def _opened(path: str, durable: Durable) -> tuple[sqlite3.Connection, int, int, 
             os.close(lock)
             if ours:
                 raise Rotten(_line(error)) from error
-            raise _bad(path, str(error), "name another file") from error
+            raise _bad_store(path, str(error), "name another file") from error
         os.close(lock)
         if isinstance(error, sqlite3.Error | OSError):
-            raise _bad(path, str(error), "make room, or name another file") from error
+            raise _bad_store(path, str(error), "make room, or name another file") from error
         raise
 
 
 def _line(problem: object) -> str:
-    # SQLite may find several lines for what is wrong; people get one.
+    # SQLite's messages may have several lines.
     return " ".join(str(problem).split())
 
 
-def _bad(path: str, problem: str, remedy: str) -> BadStore:
+def _bad_store(path: str, problem: str, remedy: str) -> BadStore:
     return BadStore(f"store {path}: {_line(problem)}; {remedy}")
 
 
-def _locked(path: str) -> int:
-    """A descriptor of the file that keeps other nodes off it; the file is made if there is none."""
+def _lock_file(path: str) -> int:
+    """Create or open the file and lock it against other nodes; return the descriptor."""
     if os.path.isdir(path):
-        raise _bad(path, "is a directory", "name a file in it")
+        raise _bad_store(path, "is a directory", "name a file in it")
     try:
-        # Only its owner may read it: the seed of the node's identity lies in it.
+        # Readable by its owner only: it holds the seed of the node's identity.
         lock = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
     except OSError as error:
-        raise _bad(path, error.strerror or str(error), "name a file that can be written") from error
+        raise _bad_store(path, error.strerror or str(error), "name a file that can be written") from error
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
         holder = _holder(lock)
         os.close(lock)
-        who = "another node uses it" + (f" (process {holder})" if holder else "")
-        raise _bad(path, who, "stop that one, or give each node a store of its own: its identity lies there") from error
+        problem = "another node uses it" + (f" (process {holder})" if holder else "")
+        raise _bad_store(path, problem, "stop it, or give each node its own store, which holds its identity") from error
     except OSError as error:
         os.close(lock)
-        raise _bad(path, error.strerror or str(error), "name a file of your own on a local disk") from error
+        raise _bad_store(path, error.strerror or str(error), "name a file on a local disk that is yours") from error
     return lock
 
 
 def _holder(lock: int) -> int:
-    """The process that has locked the file; 0 where the system does not tell."""
+    """Return the id of the process that holds the lock, 0 if unknown."""
     inode = os.fstat(lock).st_ino
     try:
         with open("/proc/locks", encoding="ascii") as lines:

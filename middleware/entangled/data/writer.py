@@ -1,8 +1,8 @@
-"""Writer: the one thread that writes a SQLite file, many changes to a commit.
+"""The thread that writes a SQLite file, with many changes to a commit.
 
-A single commit can stall for a quarter of a second on a busy card, so nobody waits for it: changes are owed to the
-file, and who needs to know that they are safe is told when they are.  A change that somebody waits for is committed at
-once, with all that came while the commit before it ran; one that nobody waits for shares a later commit.
+A single commit can stall for a quarter of a second on a busy flash card, so callers do not block on it: changes are
+queued, and ``written`` fires when they are durable.  A change that a caller waits for is committed at once, together
+with all changes queued during the commit before; other changes share a later commit.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from middleware.entangled.errors import BadStore, NotRunning, Unwritable
 from middleware.entangled.record import Record, Slot
 
 COMMIT_AFTER = 0.02
-"""Seconds that a change for which nobody waits may wait for others.  More spares the card; less loses less with the
-power."""
+"""Seconds that a change may wait for others if no caller waits for it.  More means fewer writes to the card; less means
+fewer changes lost in a power failure."""
 COMMIT_FULL = 200
-"""Changes that are committed without waiting."""
+"""Pending changes that are committed without waiting."""
 TRY_AGAIN = 0.5
-"""Seconds between two tries to write what could not be written, as on a full disk."""
+"""Seconds between two attempts after a failed commit, as on a full disk."""
 
 Deliver = Callable[[Callable[[], None]], object]
-"""Runs a function soon in the thread of the store's caller: ``reactor.callFromThread``."""
+"""Calls a function in the thread of the store's user: ``reactor.callFromThread``."""
 
 
 @dataclass
 class _Owed:
-    """What the file lacks: the last word on each slot and note is enough, so it never outgrows what is held."""
+    """Pending changes: only the last one of each slot and note, so they never exceed the store's size."""
 
     statements: list[Statement] = field(default_factory=list)
     changes: dict[Slot, Record | None] = field(default_factory=dict)
@@ -44,16 +44,16 @@ class _Owed:
         return len(self.statements) + len(self.changes) + len(self.notes)
 
     def before(self, later: _Owed) -> _Owed:
-        """This and then ``later``."""
+        """Return the changes of this batch followed by ``later``."""
         return _Owed(
             self.statements + later.statements, {**self.changes, **later.changes}, {**self.notes, **later.notes}
         )
 
 
 class Writer:
-    """Writes to ``connection``, the file ``path``, from ``start`` to ``close``.
+    """Writes changes to ``connection``, the file ``path``, from ``start`` to ``close``.
 
-    ``deliver`` brings the news that something is safe to the caller's thread; without it, ``flush`` and ``close`` do.
+    ``deliver`` notifies of written changes in the caller's thread; if it is None, ``flush`` and ``close`` do.
     """
 
     _log = Logger()
@@ -63,48 +63,48 @@ class Writer:
         self._connection = connection
         self._deliver = deliver
         self._turn = threading.Condition()
-        # All of these belong to whoever holds the turn.
+        # Access to these needs the lock of ``_turn``.
         self._owed = _Owed()
         self._waiting: list[Deferred[None]] = []
         self._writing = False
         self._hurry = False
         self._closing = False
         self._trouble = ""
-        # Appended to by the writer, emptied by the caller.
+        # The writer appends, the caller's thread pops.
         self._news: deque[tuple[Deferred[None], str]] = deque()
         self._thread = threading.Thread(target=self._write_on, name=f"writer of {path}", daemon=True)
 
     @property
     def trouble(self) -> str:
-        """Why the last commit failed; empty if it did not."""
+        """The reason why the last commit failed; empty if it succeeded."""
         return self._trouble
 
     @property
     def is_closed(self) -> bool:
-        """Whether ``close`` was called."""
+        """Whether ``close`` has been called."""
         return self._closing
 
-    # -- the caller's side -------------------------------------------------------------------------------------------
+    # -- the caller's thread -------------------------------------------------------------------------------------------
 
     def start(self, statements: list[Statement]) -> None:
-        """Begin to write, ``statements`` first."""
+        """Start the thread, which executes ``statements`` first."""
         self._owed.statements += statements
         self._thread.start()
 
     def owe(self, slot: Slot, record: Record | None) -> None:
-        """Have ``record`` written as what ``slot`` holds, or nothing."""
+        """Queue the change of ``slot`` to ``record``, or to empty."""
         with self._turn:
             self._owed.changes[slot] = record
             self._turn.notify_all()
 
     def owe_note(self, name: str, value: bytes) -> None:
-        """Have a note written."""
+        """Queue the change of a note."""
         with self._turn:
             self._owed.notes[name] = value
             self._turn.notify_all()
 
     def written(self) -> Deferred[None]:
-        """Fire once all that is owed now is in the file; fail with ``Unwritable`` as soon as a commit fails."""
+        """Fire once all changes queued so far are in the file; fail with ``Unwritable`` as soon as a commit fails."""
         with self._turn:
             if self._closing:
                 return fail(NotRunning(f"store {self._path} is closed"))
@@ -119,7 +119,7 @@ class Writer:
             return waiting
 
     def flush(self, timeout: float) -> None:
-        """Wait until all that is owed is in the file; raises ``BadStore`` where that takes over ``timeout`` seconds."""
+        """Block until all queued changes are in the file; raise ``BadStore`` after ``timeout`` seconds."""
         with self._turn:
             self._hurry = True
             self._turn.notify_all()
@@ -127,12 +127,12 @@ class Writer:
         self._tell()
         if not done:
             why = self._trouble or "slow"
-            raise BadStore(f"store {self._path}: not written within {timeout} s: {why}; make room for it")
+            raise BadStore(f"store {self._path}: not written within {timeout} s: {why}; free disk space and retry")
 
     def close(self) -> bool:
-        """Write what is owed and end; False if that was done before.
+        """Write queued changes and end the thread; return False if that was done before.
 
-        Where it cannot be written the reason is logged: what was owed to the file is lost with this node.
+        If the file is not writable the queued changes are lost and the reason is logged.
         """
         with self._turn:
             if self._closing:
@@ -144,25 +144,25 @@ class Writer:
         return True
 
     def refusal(self, why: str) -> Unwritable:
-        """What is said to whoever wants something written while that cannot be."""
-        # Peers read this as well, and where a file lies is not their business; the log names it.
+        """Return the error for callers while the file is not writable."""
+        # Sent to peers as well: without the path, which is in the log.
         return Unwritable(f"the data store cannot be written: {why}")
 
     def _tell(self) -> None:
-        """Pass the news on, in the caller's thread."""
+        """Notify waiting callers; runs in the caller's thread."""
         while self._news:
             waiting, trouble = self._news.popleft()
             if waiting.called:
-                continue  # it was cancelled
+                continue  # cancelled by its caller
             if trouble:
                 waiting.errback(self.refusal(trouble))
             else:
                 waiting.callback(None)
 
-    # -- the writer's side -------------------------------------------------------------------------------------------
+    # -- the writer's thread -------------------------------------------------------------------------------------------
 
     def _write_on(self) -> None:
-        """Write until the store is closed, and then until nothing is owed or nothing can be written."""
+        """Write until the store is closed, and then until no changes are left or a commit fails."""
         ended = False
         while not ended:
             batch, waiting = self._take()
@@ -172,7 +172,7 @@ class Writer:
                 self._deliver(self._tell)
 
     def _take(self) -> tuple[_Owed, list[Deferred[None]]]:
-        """Wait until it is worth committing, and take what is owed and who waits for it."""
+        """Wait until a commit is due; return the pending changes and the Deferreds that wait for them."""
         with self._turn:
             if self._trouble:
                 self._turn.wait_for(lambda: self._closing, TRY_AGAIN)
@@ -185,7 +185,7 @@ class Writer:
             return batch, waiting
 
     def _settle(self, batch: _Owed, waiting: list[Deferred[None]], trouble: str) -> bool:
-        """Take back what could not be written, tell whoever waits, and say whether it is time to end."""
+        """Requeue the changes of a failed commit, schedule notifications, and return whether to end the thread."""
         with self._turn:
             if trouble:
                 self._owed = batch.before(self._owed)
@@ -194,7 +194,7 @@ class Writer:
                 self._waiting = []
             self._news.extend((each, trouble) for each in waiting)
             if trouble != self._trouble:
-                self._log.warn("store {path}: {what}", path=self._path, what=trouble or "can be written again")
+                self._log.warn("store {path}: {what}", path=self._path, what=trouble or "writable again")
             self._trouble = trouble
             self._writing = False
             self._turn.notify_all()
@@ -204,7 +204,7 @@ class Writer:
             return self._closing and (bool(trouble) or not left)
 
     def _commit(self, batch: _Owed) -> str:
-        """Write all of it in one transaction; returns what went wrong."""
+        """Write the batch in one transaction; return the error, empty if none."""
         connection = self._connection
         try:
             connection.execute("BEGIN IMMEDIATE")
@@ -214,7 +214,7 @@ class Writer:
             connection.executemany(PUT, (row_of(r) for r in batch.changes.values() if r is not None))
             connection.executemany(NOTE, (note_of(*note) for note in batch.notes.items()))
             connection.execute("COMMIT")
-        except Exception as error:  # whatever it is, those who wait must be told
+        except Exception as error:  # whatever the error, the waiting callers must be notified
             return f"{' '.join(str(error).split()) or type(error).__name__}{self._rolled_back()}"
         return ""
 

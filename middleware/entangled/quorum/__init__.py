@@ -1,1 +1,1 @@
-"""Quorum: Paxos with leases, the one implementation; ``docs/explanation/quorum.md`` is its specification."""
+"""Paxos with leases; ``docs/explanation/quorum.md`` is its specification."""

@@ -1,8 +1,8 @@
-"""The acceptor: it promises, leases and accepts; every vote follows from ``TABLE``.
+"""The acceptor: promises ballots, grants leases and accepts values; ``TABLE`` determines each vote.
 
-A decision is Lamport's single-decree Paxos: prepare, then accept for ever.  A lease is PaxosLease: prepare, then
-lease for ``ttl`` seconds, extended by leasing again under the same ballot.  A change of the configuration is a
-decision that ends all leases (Vertical Paxos).  ``docs/explanation/quorum.md`` has the invariants that are named here.
+A decision is Lamport's single-decree Paxos: prepare, then accept permanently.  A lease is PaxosLease: prepare, then
+lease for ``ttl`` seconds, and renew by leasing again under the same ballot.  A change of the configuration is a
+decision that ends all leases (Vertical Paxos).  ``docs/explanation/quorum.md`` lists the invariants named here.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from middleware.entangled.quorum.log import Key, Log
 from middleware.entangled.quorum.register import Kind, Register, Reply
 
 NO_ROOM = Reply(Kind.QUIET, remaining=1.0)
-"""The answer where there is no room for a register: ask again in a second."""
+"""The reply if there is no room for a register: ask again in a second."""
 
 
 class State(Enum):
-    """What an acceptor knows of a register."""
+    """The state of a register at an acceptor."""
 
     UNKNOWN = "unknown"
     OPEN = "open"
@@ -31,7 +31,7 @@ class State(Enum):
 
 
 class Event(Enum):
-    """What a proposer asks."""
+    """The request of a proposer."""
 
     PREPARE = "prepare"
     LEASE = "lease"
@@ -40,30 +40,30 @@ class Event(Enum):
 
 
 class Stand(Enum):
-    """How a ballot stands to a register at one moment."""
+    """The relation of a ballot to a register at one time."""
 
     BEHIND = "behind"
-    """Its configuration is newer than the one that is known here."""
+    """Its configuration is newer than the acceptor's."""
     MOVED = "moved"
-    """Its configuration is over."""
+    """Its configuration has been replaced."""
     HELD = "held"
-    """The lease of another runs."""
+    """Another proposer's lease is valid."""
     LOWER = "lower"
-    """It was outbid or given back, or its numbers are not believed."""
+    """A higher ballot or token exists, it was released, or its numbers are implausibly high."""
     OVERTAKEN = "overtaken"
-    """It is the holder's; what follows its lease is promised to another."""
+    """It is the holder's, but the time after the lease is promised to another proposer."""
     OWN = "own"
-    """It is the holder's, and the lease runs."""
+    """It is the holder's, and the lease is valid."""
     ENDING = "ending"
-    """The lease of another is about to end, or was given back by a holder whose device still moves."""
+    """Another proposer's lease is about to expire, or was released while its device still moves."""
     RESERVED = "reserved"
-    """The leased promise of another runs."""
+    """Another proposer's reservation is valid."""
     FOREIGN = "foreign"
-    """It has nothing to give back here."""
+    """It has no promise or lease to release here."""
     FREE = "free"
 
 
-class _Question(NamedTuple):
+class _Request(NamedTuple):
     event: Event
     ballot: Ballot
     now: float
@@ -76,13 +76,13 @@ class _Question(NamedTuple):
 _COLUMNS = (Stand.HELD, Stand.LOWER, Stand.OVERTAKEN, Stand.OWN, Stand.ENDING, Stand.RESERVED, Stand.FREE)
 _G, _H, _O = Kind.GRANTED, Kind.HELD, Kind.OUTBID
 _VOTES = {
-    # L3: to prepare while a lease runs changes nothing.
+    # L3: a prepare during a lease changes nothing.
     Event.PREPARE: (_H, _O, _O, _G, _G, _H, _G),
-    # L1: nothing is leased before the lease of another has ended and its device rests.
+    # L1: no lease is granted before the lease of another has ended and its device is at rest.
     # L4: a promise for the time after a lease does not end it.
-    # A majority elsewhere has promised a ballot that comes under a reservation: the reservation has lost.
+    # A ballot that a majority promised may arrive during another's reservation: then the reservation has lost.
     Event.LEASE: (_H, _O, _G, _G, _H, _G, _G),
-    # C2: no value is accepted while a lease runs.
+    # C2: no value is accepted during a lease.
     Event.ACCEPT: (_H, _O, _O, _H, _H, _G, _G),
 }
 _RELEASES = {Stand.FOREIGN: Kind.UNPREPARED, Stand.LOWER: _O, Stand.HELD: _G, Stand.FREE: _G}
@@ -98,13 +98,13 @@ def _rows() -> Iterator[tuple[tuple[State, Event, Stand], tuple[Kind, State]]]:
             for stand, kind in stands.items():
                 answer, after = kind, state
                 if is_unknown and event is not Event.PREPARE:
-                    answer = Kind.UNPREPARED  # R4: what was promised here may be forgotten
+                    answer = Kind.UNPREPARED  # R4: the acceptor may have forgotten a promise
                 elif state is State.OVER and stand is not Stand.BEHIND:
                     answer = Kind.OVER  # C4: after the end nothing is granted
                 elif is_sealed and event is Event.LEASE and kind not in (Kind.BEHIND, Kind.MOVED):
                     answer = Kind.SEALED  # C1: a sealed configuration leases nothing
                 elif is_sealed and event is Event.PREPARE and kind is Kind.GRANTED:
-                    answer = Kind.SEALED  # A2: a promise tells what was accepted
+                    answer = Kind.SEALED  # A2: a promise reports the accepted value
                 elif kind is Kind.GRANTED and (is_unknown or event is Event.ACCEPT):
                     after = State.OPEN if is_unknown else State.SEALED
                 yield (state, event, stand), (answer, after)
@@ -116,10 +116,10 @@ TABLE = dict(_rows())
 
 @dataclass(frozen=True)
 class Terms:
-    """How one use of registers differs from another.
+    """Parameters of one use of registers.
 
-    In the last ``ahead`` share of a lease what follows it is promised.  An accepted value is left to its proposer for
-    ``finish`` seconds before another may complete it.  With ``must_prepare`` an unknown register has to be prepared.
+    During the last ``ahead`` share of a lease the time after it may be promised.  Only its proposer may complete an
+    accepted value within ``finish`` seconds.  With ``must_prepare`` an unknown register has to be prepared first.
     """
 
     ahead: float = 0.0
@@ -128,36 +128,36 @@ class Terms:
 
 
 class Acceptor(Generic[Key]):
-    """A member since ``born_at``; about what its log may have forgotten it keeps silent for the longest ttl."""
+    """An acceptor started at ``born_at``; if its log is incomplete it grants nothing for the longest ttl."""
 
     def __init__(self, log: Log[Key], terms: Terms, born_at: float = -math.inf) -> None:
         self.log = log
         self._terms = terms
-        self._born_at = born_at
+        self._started_at = born_at
 
     def prepare(
         self, key: Key, configuration: int, ballot: Ballot, ttl: float, now: float, reserve: float = 0.0
     ) -> Reply:
-        """Promise to accept nothing under a lower ballot, and lease the promise for ``reserve`` seconds.
+        """Promise to accept nothing under a lower ballot, and reserve the promise for ``reserve`` seconds.
 
-        ``ttl`` is that of the lease which is to follow.  A ballot of counter 0 only looks and is promised nothing: an
-        acceptor whose lease has run out, because it missed an extension, is not to be lost to the healthy holder.
+        ``ttl`` is the duration of the lease to follow.  A ballot with counter 0 is a read without a promise: an
+        acceptor whose lease expired because it missed a renewal must not be lost to the healthy holder.
         """
-        register, reply = self._judge(key, _Question(Event.PREPARE, ballot, now, configuration, ttl=ttl))
+        register, reply = self._decide(key, _Request(Event.PREPARE, ballot, now, configuration, ttl=ttl))
         if reply.kind in (Kind.GRANTED, Kind.SEALED):
             register.touched_at = now
             if ballot.counter > 0:
                 is_new = ballot > register.promised or reserve != register.reserve
                 register.promised = ballot  # P1
                 register.reserve, register.reserved_until = reserve, now + reserve
-                if is_new:  # D1: what is answered is noted before
+                if is_new:  # D1: durable before the reply
                     self.log.keep(key)
             reply = self._reply(reply.kind, register, now)
         return reply._replace(remaining=0.0) if ballot.is_kin(register.holder, self.log.codec.lives) else reply
 
     def lease(self, key: Key, configuration: int, ballot: Ballot, token: int, ttl: float, now: float) -> Reply:
-        """Grant the lease for ``ttl`` seconds from now, or extend it."""
-        register, reply = self._judge(key, _Question(Event.LEASE, ballot, now, configuration, token, ttl))
+        """Grant or renew the lease for ``ttl`` seconds from now."""
+        register, reply = self._decide(key, _Request(Event.LEASE, ballot, now, configuration, token, ttl))
         if reply.kind is not Kind.GRANTED:
             return reply
         promised = max(register.promised, ballot)
@@ -165,7 +165,7 @@ class Acceptor(Generic[Key]):
         register.promised, register.holder, register.token, register.ttl = promised, ballot, token, ttl
         register.grantee = ballot.proposer
         register.until, register.touched_at = now + ttl, now
-        if before != (promised, ballot, token, ttl):  # D1: what is answered is noted before
+        if before != (promised, ballot, token, ttl):  # D1: durable before the reply
             self.log.keep(key)
         return self._reply(Kind.GRANTED, register, now)
 
@@ -179,12 +179,12 @@ class Acceptor(Generic[Key]):
         token: int = 0,
         gives_back: bool = False,
     ) -> Reply:
-        """Accept ``value`` for ever.
+        """Accept ``value`` permanently.
 
-        With ``gives_back`` a holder says that its own lease is given back (its device is at rest), and kept for it so
-        long.  ``token`` is the highest that the proposer knows.
+        With ``gives_back`` a holder whose device is at rest allows the acceptance during its own lease.
+        ``token`` is the highest token that the proposer knows.
         """
-        register, reply = self._judge(key, _Question(Event.ACCEPT, ballot, now, configuration, token, 0.0, gives_back))
+        register, reply = self._decide(key, _Request(Event.ACCEPT, ballot, now, configuration, token, 0.0, gives_back))
         if reply.kind is not Kind.GRANTED:
             return reply
         is_new = (register.accepted, register.value) != (ballot, value)
@@ -197,19 +197,20 @@ class Acceptor(Generic[Key]):
         return self._reply(Kind.GRANTED, register, now)
 
     def release(self, key: Key, ballot: Ballot, now: float, rest: float = 0.0) -> Reply:
-        """End what was promised or leased under ``ballot``, or an older one of its life; what was accepted stays.
+        """Release promises and leases under ``ballot`` and older ballots of its life; accepted values stay.
 
-        ``rest`` is how long the holder's device may still move: until then the lease is promised, but not granted.
+        ``rest`` is the time in seconds in which the holder's device may still move: meanwhile the lease can be
+        promised but not granted.
         """
-        question = _Question(Event.RELEASE, ballot, now)
-        register, reply = self._judge(key, question)
+        request = _Request(Event.RELEASE, ballot, now)
+        register, reply = self._decide(key, request)
         if reply.kind is not Kind.GRANTED:
             return reply
-        if self._stand(register, question) is Stand.HELD:
-            # It was promised for the time after another's lease, which goes on.
+        if self._stand(register, request) is Stand.HELD:
+            # The promise was for the time after another's lease, which stays valid.
             register.promised = max(register.promised, Ballot(ballot.counter + 1, self.log.codec.nobody))
         else:
-            # B3: a request of that ballot may still be on its way: it comes too late.
+            # B3: a delayed request under this ballot is refused.
             register.spent = ballot
         if register.promised <= ballot:
             register.reserve, register.reserved_until = 0.0, now
@@ -220,13 +221,13 @@ class Acceptor(Generic[Key]):
         return self._reply(Kind.GRANTED, register, now)
 
     def close(self, key: Key, proposer: Name, configuration: int, token: int, now: float) -> Reply:
-        """Grant nothing any more; ``remaining`` is how long another may still act.
+        """Close the register, so that it grants nothing; ``remaining`` is the time in which a holder may still act.
 
-        A proposer names the token that it was granted here, even if it has given the lease back since.  Token 0 is the
-        word of a caller that needs no lease.  Where the configuration has changed, or may have, the next one has to be
-        asked as well.
+        A proposer proves itself by the token that it was granted here, even if it has released the lease since; token
+        0 is for callers without a lease.  If the reply shows that the configuration has changed or may have, the
+        caller must close the next configuration as well.
         """
-        register = self._known(key, now)
+        register = self._get_or_enter(key, now)
         if register is None:
             return NO_ROOM
         if token and (register.token, register.grantee) != (token, proposer):  # C5: a proof names the granted token
@@ -250,12 +251,12 @@ class Acceptor(Generic[Key]):
         ttl: float = 0.0,
         proof: bytes = b"",
     ) -> Reply:
-        """Learn that the configuration before has decided on ``value``, and above which token that goes on.
+        """Store the decision of the previous configuration for ``value``, and the token above which it continues.
 
-        The caller has checked the certificate ``proof``.  For ``ttl`` seconds the lease is kept for the proposer of
-        ``ballot``.
+        The caller has checked the certificate ``proof``.  The lease is reserved for the proposer of ``ballot`` for
+        ``ttl`` seconds.
         """
-        register = self._known(key, now)
+        register = self._get_or_enter(key, now)
         if register is None:
             return NO_ROOM
         if configuration > register.configuration:  # C3: configurations only rise
@@ -269,23 +270,23 @@ class Acceptor(Generic[Key]):
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
-    def _judge(self, key: Key, question: _Question) -> tuple[Register, Reply]:
-        """The register and the answer of the table; a register that nothing is granted in takes no room."""
-        event, ballot, now, *_ = question
+    def _decide(self, key: Key, request: _Request) -> tuple[Register, Reply]:
+        """Return the register and the reply by the table; store a new register only if something is granted."""
+        event, ballot, now, *_ = request
         known = self.log.get(key)
         register = known or self.log.blank(now)
-        quiet = self._silence(question.ttl) - now
-        if quiet > 0.0 and event is not Event.RELEASE:  # R1: it may have granted what it has forgotten
+        quiet = self._silence(request.ttl) - now
+        if quiet > 0.0 and event is not Event.RELEASE:  # R1: it may have forgotten a grant
             return register, Reply(Kind.QUIET, remaining=quiet)
         is_unknown = known is None and (self._terms.must_prepare or event is Event.RELEASE)
         state = State.UNKNOWN if is_unknown else state_of(register)
-        kind, _ = TABLE[state, event, self._stand(register, question)]
+        kind, _ = TABLE[state, event, self._stand(register, request)]
         if known is None and kind is Kind.GRANTED and ballot.counter > 0 and not self.log.enter(key, register, now):
             return register, NO_ROOM
         return register, self._reply(kind, register, now)
 
-    def _stand(self, register: Register, question: _Question) -> Stand:
-        event, ballot, now, configuration, token, _, gives_back = question
+    def _stand(self, register: Register, request: _Request) -> Stand:
+        event, ballot, now, configuration, token, _, gives_back = request
         lives = self.log.codec.lives
         left = register.until - now
         is_own = ballot.is_kin(register.holder, lives)  # L2: an earlier life of the holder is another holder
@@ -315,11 +316,11 @@ class Acceptor(Generic[Key]):
         return Stand.RESERVED if is_reserved else Stand.FREE
 
     def _silence(self, ttl: float) -> float:
-        """Until when nothing is granted."""
-        return -math.inf if self.log.is_whole else self._born_at + max(ttl, self.log.floor.longest)
+        """Return the time until which nothing is granted."""
+        return -math.inf if self.log.is_whole else self._started_at + max(ttl, self.log.floor.longest)
 
-    def _known(self, key: Key, now: float) -> Register | None:
-        """A register to learn something about, or None where there is no room."""
+    def _get_or_enter(self, key: Key, now: float) -> Register | None:
+        """Return the register, a new one if needed, or None if there is no room."""
         register = self.log.get(key) or self.log.blank(now)
         return register if key in self.log.registers or self.log.enter(key, register, now) else None
 
@@ -331,7 +332,7 @@ class Acceptor(Generic[Key]):
 
 
 def state_of(register: Register) -> State:
-    """Where a register stands in the table."""
+    """Return the state of a register for the table."""
     if register.is_over:
         return State.OVER
     return State.OPEN if register.accepted == NONE else State.SEALED

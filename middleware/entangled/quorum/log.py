@@ -1,7 +1,7 @@
-"""The durable log of an acceptor: a restart lets no token fall and forgets no promise.
+"""The durable log of an acceptor: a restart lowers no token and forgets no promise.
 
-Registers lie in buckets, each a note of a store.  What is forgotten to make room leaves a floor under ballots and
-tokens.
+Registers are grouped into buckets, each stored as one note.  Evicted registers leave a lower bound (floor) of ballots
+and tokens.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from middleware.entangled.quorum.ballot import NONE, Ballot, Ceiling, Name
 from middleware.entangled.quorum.register import Register
 
 MAX_REGISTERS = 4096
-LOOKED_AT = 256
-"""The oldest registers that are looked at when there is no room for a new one; all of them would take too long."""
+MAX_SEARCHED = 256
+"""Oldest registers examined for eviction; all of them would take too long."""
 
 Key = TypeVar("Key", bound=Hashable)
 
 
 class Floor(NamedTuple):
-    """What lies above everything forgotten: counters, tokens; and the longest ttl ever granted."""
+    """Upper bounds of the counters and tokens of evicted registers, and the longest ttl ever granted."""
 
     counter: int = 0
     token: int = 0
@@ -29,22 +29,22 @@ class Floor(NamedTuple):
 
 
 class Notes(Protocol):
-    """Where small facts are kept under a name; a ``Store`` does it."""
+    """A durable map of small values; ``Store`` implements it."""
 
     def note(self, name: str, value: bytes) -> None:
-        """Keep ``value``."""
+        """Store ``value`` under ``name``."""
 
     def noted(self, name: str) -> bytes | None:
-        """What was kept, or None."""
+        """Return the value under ``name``, or None."""
 
 
 @dataclass(frozen=True)
 class Codec(Generic[Key]):
-    """How the registers of one use stand in notes; no decoder raises.
+    """The encoding of the registers of one use as notes; no decoder raises.
 
-    ``name`` is the format of the names of its ``buckets``, ``nobody`` is below all names of proposers, and the counters
-    of two lives of a proposer differ modulo ``lives`` (1 where their names differ).  ``unpack`` also says whether that
-    was all.
+    ``name`` is the format of the names of the ``buckets``; ``nobody`` is a name below all names of proposers.  The
+    counters of two lives of a proposer differ modulo ``lives`` (1 if their names differ).  ``unpack`` also returns
+    whether the note was complete.
     """
 
     floor_name: str
@@ -67,8 +67,8 @@ class Codec(Generic[Key]):
 class Log(Generic[Key]):
     """The registers of one acceptor, in memory and in ``notes``.
 
-    ``is_whole`` says that nothing which an earlier process noted is missing, ``may_forget`` whether a register can be
-    asked for no more.
+    ``is_whole`` is False if notes of an earlier process are missing or corrupt; ``may_forget`` returns whether a
+    register may be evicted.
     """
 
     def __init__(
@@ -96,26 +96,26 @@ class Log(Generic[Key]):
         return len(self.registers)
 
     def get(self, key: Key) -> Register | None:
-        """What is known of a register."""
+        """Return the register under ``key``, or None."""
         return self.registers.get(key)
 
     def blank(self, now: float) -> Register:
-        """A new register, not entered yet."""
+        """Return a new register that is not in the log yet."""
         counter, token, _ = self.floor
-        # R3: a ballot that may have been promised, or outbid, before it was forgotten is lower.
+        # R3: ballots that an evicted register may have promised or outbid are lower.
         promised = Ballot(counter + 1, self.codec.nobody) if counter else NONE
         ceiling = Ceiling(now, self.codec.lives, counter, token)
         return Register(ceiling, promised=promised, token=token, touched_at=now)
 
     def enter(self, key: Key, register: Register, now: float) -> bool:
-        """Take in a new register, if there is room."""
+        """Add a register; return False if there is no room."""
         if len(self.registers) >= MAX_REGISTERS and not self._make_room(now):
             return False
         self._add(key, register)
         return True
 
     def keep(self, key: Key) -> None:
-        """Note a register as it is now."""
+        """Write the present state of a register to the notes."""
         longest = self.registers[key].ttl
         if longest > self.floor.longest:
             self.floor = self.floor._replace(longest=longest)
@@ -123,7 +123,7 @@ class Log(Generic[Key]):
         self._note(self.codec.bucket_of(key))
 
     def clear(self) -> None:
-        """Forget everything: what others rely on of this acceptor is void."""
+        """Remove all registers and the floor, once no proposer relies on this acceptor's votes."""
         self.registers.clear()
         self._buckets.clear()
         self.floor, self.is_whole = Floor(), True
@@ -137,22 +137,22 @@ class Log(Generic[Key]):
         self._buckets.setdefault(self.codec.bucket_of(key), {})[key] = None
 
     def _make_room(self, now: float) -> bool:
-        """Forget old registers that can harm nothing."""
-        gone = set()
-        for key in list(self.registers)[:LOOKED_AT]:
+        """Evict old registers that are no longer needed; return whether there is room."""
+        buckets = set()
+        for key in list(self.registers)[:MAX_SEARCHED]:
             register = self.registers.pop(key)
             if not self._may_forget(key, register, now):
                 self.registers[key] = register  # to the end of the queue
                 continue
             counter, token, longest = self.floor
-            # R3: nothing that was forgotten lies above the floor.
+            # R3: all evicted numbers are at most the floor.
             self.floor = Floor(max(counter, register.promised.counter), max(token, register.token), longest)
             name = self.codec.bucket_of(key)
             del self._buckets[name][key]
-            gone.add(name)
-        if gone:
-            self._note_floor()  # before what it stands for goes
-        for name in sorted(gone):
+            buckets.add(name)
+        if buckets:
+            self._note_floor()  # before the registers are removed from their buckets
+        for name in sorted(buckets):
             self._note(name)
         return len(self.registers) < MAX_REGISTERS
 

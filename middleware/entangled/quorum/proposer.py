@@ -1,4 +1,4 @@
-"""The proposer: it prepares, completes what was accepted before or proposes its own value, and backs off."""
+"""The proposer: prepares a ballot, completes an accepted value or proposes its own, and backs off."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from middleware.entangled.quorum.register import Kind
 from middleware.entangled.quorum.round import Tally
 
 BACK_OFF = (0.05, 2.0)
-"""Seconds of the first and of the longest pause between two attempts; each is twice the one before it."""
+"""Seconds of the first and the longest pause between two attempts; the pause doubles each time."""
 
 
 class Result(Enum):
-    """How a round ended."""
+    """The result of a round."""
 
     WON = "won"
     """A majority agrees."""
     DECIDED = "decided"
-    """``value`` was decided, by whichever proposer."""
+    """A majority has accepted ``value``, proposed by any proposer."""
     HELD = "held"
     OUTBID = "outbid"
     SILENT = "silent"
@@ -31,8 +31,8 @@ class Result(Enum):
 class Outcome(NamedTuple):
     """The end of a round.
 
-    ``value``: of ``DECIDED`` what was decided; of ``WON`` what must be proposed instead of an own value, if anything.
-    ``counter``: the highest promised.  ``remaining``: seconds until what another holds runs out.
+    ``value`` is the decided value (``DECIDED``), or the value that must be proposed, if any (``WON``).  ``counter`` is
+    the highest promised counter.  ``remaining`` is the time in seconds until another proposer's lease expires.
     """
 
     result: Result
@@ -42,7 +42,7 @@ class Outcome(NamedTuple):
 
 
 def conclude(tally: Tally) -> Outcome:
-    """What the answers of a round say, at its end."""
+    """Return the outcome of a finished round."""
     replies = tally.replies.values()
     counter = max((reply.promised.counter for reply in replies), default=0)
     if tally.chosen is not None:
@@ -64,9 +64,10 @@ async def decide(
     sleep: Callable[[float], Awaitable[None]],
     rng: random.Random,
 ) -> tuple[Ballot, Any]:
-    """See a decision through, from ``ballot`` on, whatever it takes; return the last ballot and what was decided.
+    """Retry from ``ballot`` on until a value is decided; return the last ballot and the decided value.
 
-    ``value`` is proposed where nothing else was; with None nothing is, and None is returned where nothing was accepted.
+    Proposes ``value`` if no other value was accepted.  With None it proposes none, and returns None if no value was
+    accepted.
     """
     pause = BACK_OFF[0]
     while True:
@@ -82,7 +83,7 @@ async def decide(
                 return ballot, chosen
         if outcome.result is Result.DECIDED:
             return ballot, outcome.value
-        # Not for the whole of another's lease: it may end sooner, or with a decision.
+        # Shorter than another's lease, which may be released early or end in a decision.
         await sleep(max(min(outcome.remaining, BACK_OFF[1]), pause * (0.5 + rng.random())))
         pause = min(2 * pause, BACK_OFF[1])
         ballot = Ballot(counter + 1, ballot.proposer)

@@ -1,4 +1,4 @@
-"""What an acceptor knows of one register, and what it answers; plain data."""
+"""The state of one register at an acceptor, and the acceptor's replies; plain data."""
 
 from __future__ import annotations
 
@@ -10,32 +10,33 @@ from middleware.entangled.quorum.ballot import FIRST, NONE, Ballot, Ceiling, Nam
 
 
 class Kind(Enum):
-    """The answer of an acceptor."""
+    """The kind of an acceptor's reply."""
 
     GRANTED = "granted"
     HELD = "held"
-    """The lease of another, or its leased promise, has not run out; ``remaining`` says when it will."""
+    """Another proposer's lease or reservation expires in ``remaining`` seconds."""
     OUTBID = "outbid"
-    """A higher ballot was promised, a higher token granted, or the ballot was given back."""
+    """A higher ballot was promised, a higher token was granted, or the ballot was released."""
     UNPREPARED = "unprepared"
-    """The register is unknown here, or the ballot has no part in it: prepare first."""
+    """The register or the ballot is unknown here: prepare first."""
     QUIET = "quiet"
-    """The acceptor may have forgotten what it granted, or has no room; ``remaining`` says when to ask again."""
+    """The acceptor may have forgotten a grant, or has no room; ask again in ``remaining`` seconds."""
     BEHIND = "behind"
-    """The acceptor has not been told of that configuration."""
+    """The acceptor does not know that configuration yet."""
     SEALED = "sealed"
-    """The ballot is promised, but a value was accepted before: only that value may follow."""
+    """The ballot is promised, but a value was accepted before: only that value may be proposed."""
     MOVED = "moved"
-    """That configuration is over; ``configuration`` and ``proof`` tell the present one."""
+    """That configuration was replaced; ``configuration`` and ``proof`` are of the present one."""
     OVER = "over"
     """The register is closed."""
 
 
 class Reply(NamedTuple):
-    """What an acceptor answers; ``remaining`` counts from the answer on.
+    """The reply of an acceptor; ``remaining`` counts from the time of the reply.
 
-    ``promised`` is the highest ballot promised, ``token`` the highest granted, ``accepted`` and ``value`` what was
-    accepted.  ``proof`` is the certificate of the configuration that ``MOVED`` names, or a signature of the acceptor.
+    ``promised`` is the highest promised ballot, ``token`` the highest granted token; ``value`` was accepted under the
+    ballot ``accepted``.  ``proof`` is the certificate of the configuration in a ``MOVED`` reply, or a signature of the
+    acceptor.
     """
 
     kind: Kind
@@ -50,13 +51,13 @@ class Reply(NamedTuple):
 
 @dataclass(slots=True)
 class Register:
-    """What an acceptor has promised, leased and accepted.
+    """The promises, the lease and the accepted value of one register at an acceptor.
 
-    ``promised`` is the highest ballot promised, leased for ``reserve`` seconds, ``reserved_until`` then.  ``holder`` is
-    the ballot of the lease, granted for ``ttl`` seconds ``until`` then; ``spent`` the highest ballot given back.
-    ``token`` is the fencing token, ``grantee`` the proposer to which it was granted here, empty where it was only heard
-    of.  ``value`` was accepted for ever under ``accepted``; where that is none it is the present configuration, as far
-    as known, and ``proof`` its certificate.  Moments are on the clock of one process and are not stored.
+    ``promised`` is the highest promised ballot, reserved for ``reserve`` seconds, until ``reserved_until``.  ``holder``
+    is the ballot of the lease, granted for ``ttl`` seconds, until ``until``; ``spent`` is the highest released ballot.
+    ``token`` is the fencing token, ``grantee`` the proposer to which it was granted here, empty if only reported by
+    others.  ``value`` was accepted under ``accepted``; if that is ``NONE``, ``value`` is the newest configuration known
+    here and ``proof`` its certificate.  Times are on the clock of one process and are not stored.
     """
 
     ceiling: Ceiling
@@ -79,16 +80,16 @@ class Register:
 
     @property
     def is_given_back(self) -> bool:
-        """Whether the holder acts no more: at most its device still moves, until it is at rest."""
+        """Whether the holder has released the lease; its device may still move until it is at rest."""
         return self.holder <= self.spent
 
     def hear_token(self, token: int, grantee: Name = "") -> None:
-        """Take note of a token that others granted, to ``grantee`` where that is known."""
+        """Record a token that other acceptors granted, to ``grantee`` if known."""
         if token > self.token:  # T1: the token never falls
             self.token, self.grantee = token, grantee
 
     def wake(self, now: float, lives: int) -> None:
-        """Count leases anew from ``now`` on: their moments were on the clock of an earlier process."""
+        """Restart all leases at ``now``, because their times were on the clock of an earlier process."""
         self.touched_at = now
         self.until = now + self.ttl if self.holder != NONE else 0.0  # R2: a restart shortens no lease
         self.reserved_until = now + self.reserve

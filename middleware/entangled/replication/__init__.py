@@ -1,1 +1,1 @@
-"""Replication: what a node holds for others, what it owns, reads and watches."""
+"""Replicas, own records, reads and watches of a node."""

@@ -1,6 +1,6 @@
-"""PathCache: copies of popular records on the way to them (Kademlia, section 2.3).
+"""Cached copies of popular records on the lookup path to their replicas (Kademlia, section 2.3).
 
-A copy is no replica: it is never counted in a majority, never handed on, lives in memory only, and goes first.
+A copy is no replica: it counts in no majority, is never handed over, is kept in memory only, and is evicted first.
 """
 
 from __future__ import annotations
@@ -10,18 +10,18 @@ from middleware.entangled.record import Record
 MAX_KEYS = 256
 MAX_BYTES = 256 * 1024
 MAX_AGE = 60.0
-"""Seconds that a copy at the very next node lives; each node between halves it."""
+"""Seconds that a copy is kept at the node next to the closest; each node in between halves it."""
 
 
 class PathCache:
-    """The copies of one node, at most ``MAX_KEYS`` keys and ``MAX_BYTES``; the least recently read goes first."""
+    """The cached copies of one node, at most ``MAX_KEYS`` keys and ``MAX_BYTES``, with least-recently-read eviction."""
 
     def __init__(self) -> None:
         self._copies: dict[bytes, tuple[float, int, list[Record]]] = {}
         self._bytes = 0
 
     def put(self, key: bytes, records: list[Record], ttl: float, now: float) -> None:
-        """Keep ``records`` for ``ttl`` seconds, at most ``MAX_AGE``."""
+        """Cache ``records`` for ``ttl`` seconds, at most ``MAX_AGE``."""
         size = sum(record.message_bytes for record in records)
         self.drop(key)
         if size > MAX_BYTES or not ttl > 0.0:
@@ -32,7 +32,7 @@ class PathCache:
             self.drop(next(iter(self._copies)))
 
     def get(self, key: bytes, now: float) -> list[Record] | None:
-        """The copy under ``key``, or None."""
+        """Return the copy under ``key``, or None."""
         copy = self._copies.get(key)
         if copy is None:
             return None
@@ -43,7 +43,7 @@ class PathCache:
         return copy[2]
 
     def drop(self, key: bytes) -> None:
-        """Let go of the copy under ``key``, if there is one."""
+        """Remove the copy under ``key``, if there is one."""
         copy = self._copies.pop(key, None)
         if copy is not None:
             self._bytes -= copy[1]

@@ -1,6 +1,6 @@
-"""Overlap: what this node holds and a peer should hold, too: in parts with a digest each, listed and given in pages.
+"""The records that this node and a peer should both hold: digests of parts, lists of slots, and pages of records.
 
-It answers DIGESTS, PLACES, FETCH and LACKING; who compares with whom, and when, stands in ``handover``.
+Answers DIGESTS, PLACES, FETCH and LACKING; ``handover`` sends these requests.
 """
 
 from __future__ import annotations
@@ -20,25 +20,25 @@ from middleware.entangled.replication.watch import digest_of
 from middleware.entangled.wire.endpoint import Endpoint
 
 GROUPS = 16
-"""Parts of the id space with a digest each, so that one difference does not mean to compare everything."""
+"""Parts of the id space with a digest each, so that a difference in one does not require comparing all."""
 PLACES = 12
-"""Places, and records, in one message."""
+"""Maximum slots or records in one message."""
 LISTED_S = 2.0
-"""Seconds for which who pages through the places gets to see them as they were when it asked for the digests."""
-MAX_LISTED = 8
+"""Seconds that a snapshot of the slots is kept for a peer after its request for digests."""
+MAX_SNAPSHOTS = 8
 MAX_ASKED = 1024
-"""Peers of which is kept when they asked; the one that asked longest ago is forgotten first."""
+"""Peers whose last request is remembered; the oldest is dropped first."""
 BITS = 512
-"""Bits of a signature: one of them, which the asker draws, says which records are in a sum of lives."""
+"""Bits of a signature; the requester picks one at random to select the records in a sum of lifetimes."""
 
 Mark = tuple[int, bytes]
-"""Which record a slot holds: its sequence and the first bytes of its signature; (-1, b"") where it holds none."""
+"""Version of a slot: the record's sequence and the first bytes of its signature; (-1, b"") if empty."""
 
 
 class Overlap:
-    """The team records of one node, as seen by its peers; ``asked_at`` is when each of them last asked for digests.
+    """The team records of one node as its peers see them.
 
-    ``standing`` says that of this node.
+    ``asked_at`` maps peers to the time of their last request for digests; ``standing`` returns this node's sync state.
     """
 
     def __init__(self, replica: Replica, overlay: Overlay, endpoint: Endpoint, clock: IReactorTime) -> None:
@@ -48,7 +48,7 @@ class Overlap:
         self._overlay = overlay
         self._clock = clock
         self._own_id = overlay.own_id
-        self._listed: dict[bytes, tuple[float, list[list[Record]]]] = {}
+        self._snapshots: dict[bytes, tuple[float, list[list[Record]]]] = {}
         self._near: dict[bytes, list[bytes]] = {}
         self._near_version = -1
         endpoint.expose("digests", self._answer_digests)
@@ -57,7 +57,7 @@ class Overlap:
         endpoint.expose("lacking", self._answer_lacking)
 
     def both(self, peer: Contact) -> tuple[list[list[Record]], list[Record]]:
-        """What is held here and should be at the peer as well: by parts, and what should not be here any more."""
+        """Return the records that both nodes should hold, by parts, and the records only the peer should hold."""
         groups: list[list[Record]] = [[] for _ in range(GROUPS)]
         extra = []
         if self._near_version != self._overlay.roster.version or not self._overlay.is_complete:
@@ -75,24 +75,25 @@ class Overlap:
         return groups, extra
 
     def life(self, group: list[Record], bit: int) -> int:
-        """Whole seconds left to the records of ``group``, summed over those whose signature has that bit.
+        """Return the whole seconds left, summed over the records of ``group`` with ``bit`` set in their signature.
 
-        What is left of a life is no owner's word, so the digest cannot have it.  Who named a short one to one holder
-        could hide that in the sum of all by records of its own, but not in that of a part which it does not know.
+        The owner does not sign the remaining lifetime, so the digest cannot cover it.  A node that reported a short
+        lifetime to one replica could balance a sum over all records by its own records, but not a sum over a random
+        subset.
         """
         byte, mask = bit >> 3, 1 << (bit & 7)
         return sum(int(self._replica.left(r)) for r in group if len(r.signature) > byte and r.signature[byte] & mask)
 
-    # -- what peers ask ---------------------------------------------------------------------------------------------
+    # -- requests of peers ---------------------------------------------------------------------------------------------
 
     def _answer_digests(self, peer: Contact, bit: int, standing: int) -> list[object]:
-        """DIGESTS: of each part of the id space, what both should hold; how much the peer alone should; the lives.
+        """DIGESTS: the digest of each part, the number of records that only the peer should hold, and the lifetimes.
 
-        The standings of both are told along with it.
+        Both nodes exchange their sync states as well.
         """
         if not 0 <= bit < BITS:
             raise Refused(f"a signature has the bits 0 to {BITS - 1}")
-        *groups, extra = self._lists(peer)
+        *groups, extra = self._snapshot(peer)
         self.asked_at.pop(peer.node_id, None)
         self.asked_at[peer.node_id] = self._clock.seconds()
         if len(self.asked_at) > MAX_ASKED:
@@ -102,15 +103,15 @@ class Overlap:
         return [[digest_of(group) for group in groups], len(extra), lives, self.standing()]
 
     def _answer_places(self, peer: Contact, group: int, after: list[object]) -> list[object]:
-        """PLACES: what is held here of a part of the id space (-1: of what only the peer should hold), in order."""
+        """PLACES: a page of slots with marks in one part (-1: records for the peer only), in order."""
         if not -1 <= group < GROUPS:
             raise Refused(f"a group is a number from -1 to {GROUPS - 1}")
         cursor = slot_unpacked(after)
         if after and cursor is None:
             raise Refused("a page begins after a key, an owner and a name")
-        listed_at, lists = self._listed.get(peer.node_id, (-LISTED_S, []))
+        listed_at, lists = self._snapshots.get(peer.node_id, (-LISTED_S, []))
         if self._clock.seconds() - listed_at >= LISTED_S:
-            lists = self._lists(peer)
+            lists = self._snapshot(peer)
         records = lists[group]
         begin = bisect_right(records, cursor, key=lambda record: record.slot) if cursor else 0
         return [
@@ -119,7 +120,7 @@ class Overlap:
         ]
 
     def _answer_fetch(self, peer: Contact, slots: list[object]) -> list[object]:
-        """FETCH: of each slot the record in it and the seconds left to that, or None; as many as make a page."""
+        """FETCH: the record in each slot and its seconds left, or None; cut to one page."""
         page: list[object] = []
         size = 0
         for place in slots[:PLACES]:
@@ -134,7 +135,7 @@ class Overlap:
         return page
 
     def _answer_lacking(self, peer: Contact, places: list[object]) -> list[bool]:
-        """LACKING: of each place whether the record in it is newer than what is held here."""
+        """LACKING: whether the record of each given slot and mark is newer than the local one."""
         answer = []
         for place in places[:PLACES]:
             if not (isinstance(place, list) and [type(part) for part in place] == [bytes, bytes, str, int, bytes]):
@@ -144,19 +145,19 @@ class Overlap:
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
-    def _lists(self, peer: Contact) -> list[list[Record]]:
-        """What both should hold, by parts, and last what only ``peer`` should: in order, and kept while it pages."""
+    def _snapshot(self, peer: Contact) -> list[list[Record]]:
+        """Return ``both`` as sorted lists, records for the peer only last; keep them as its snapshot."""
         groups, extra = self.both(peer)
         lists = [sorted(records, key=lambda record: record.slot) for records in (*groups, extra)]
         now = self._clock.seconds()
-        self._listed.pop(peer.node_id, None)
-        for other, (at, _) in list(self._listed.items()):
-            if now - at >= LISTED_S or len(self._listed) >= MAX_LISTED:
-                del self._listed[other]  # it may hold what is replaced meanwhile
-        self._listed[peer.node_id] = (now, lists)
+        self._snapshots.pop(peer.node_id, None)
+        for other, (at, _) in list(self._snapshots.items()):
+            if now - at >= LISTED_S or len(self._snapshots) >= MAX_SNAPSHOTS:
+                del self._snapshots[other]  # snapshots keep replaced records in memory
+        self._snapshots[peer.node_id] = (now, lists)
         return lists
 
 
 def mark_of(record: Record | None) -> Mark:
-    """What tells ``record`` from others in its slot, and which of two is newer."""
+    """Return the version mark of ``record``; a newer record has a higher one."""
     return (-1, b"") if record is None else (record.sequence, record.signature[:8])

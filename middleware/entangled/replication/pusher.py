@@ -1,7 +1,7 @@
-"""Pusher: tells those who watch a key what changes here.
+"""Notification of watchers: pushes changes of a key to the peers that watch it.
 
-Soft state: a watcher counts for some seconds after it last asked, ``WATCH_TTL`` where it names no others.  Pushes to
-one watcher of one key are numbered without a gap, so that it notices what it missed, and asks again.
+Soft state: a peer counts as a watcher for the seconds that it names in its request, by default ``WATCH_TTL``.  Pushes
+to one watcher of one key are numbered without gaps, so that the watcher notices a missed push and asks again.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from middleware.entangled.wire.endpoint import Endpoint
 WATCH_TTL, MAX_TTL = 8.0, 60.0
 MAX_WATCHERS = 1000
 FEW, GATHERED = 64, 0.1
-"""Watchers of a key up to which each change is pushed by itself, and seconds for which they are gathered beyond."""
+"""Watchers of a key up to which each change is pushed at once; beyond, seconds of changes that share a push."""
 PUSH_BYTES, MOST_GONE = 12_000, 100
-"""What one push of several changes carries, about."""
+"""Approximate bytes, and the number of removed slots, in one push of several changes."""
 MAX_WATCHED = 10_000
-"""Keys that are watched here at the same time."""
+"""Keys with watchers at the same time."""
 
 
 @dataclass(slots=True)
 class _Watcher:
-    """Who watches, until when, and the number of the last push to it."""
+    """A watcher, the time when its watch expires, and the number of the last push to it."""
 
     contact: Contact
     until: float
@@ -49,17 +49,17 @@ class Pusher:
         self._gathered: dict[bytes, dict[Slot, tuple[Record, bool]]] = {}
 
     def start(self) -> None:
-        """Forget who does not ask again, from now on."""
+        """Start to remove expired watchers periodically."""
         self._chores.every(WATCH_TTL, self._prune)
 
     def watched(self, key: bytes, peer: Contact, ttl: float = WATCH_TTL) -> int:
-        """``peer`` watches ``key`` from now on; the number of the last push to it.  Raises ``Refused``."""
+        """Add or renew a watcher of ``key``; return the number of the last push to it.  Raises ``Refused``."""
         if not 0.0 < ttl <= MAX_TTL:
-            raise Refused(f"a watch counts for up to {MAX_TTL:g} s")
+            raise Refused(f"a watch lasts at most {MAX_TTL:g} s")
         watchers = self._watchers.get(key, {})
         is_full = len(watchers) >= MAX_WATCHERS or (not watchers and len(self._watchers) >= MAX_WATCHED)
         if peer.node_id not in watchers and is_full:
-            raise Refused("too many watchers of this key")
+            raise Refused("too many watchers; try again later")
         until = self._clock.seconds() + ttl
         watcher = watchers.setdefault(peer.node_id, _Watcher(peer, until))
         watcher.contact, watcher.until = peer, until
@@ -67,7 +67,7 @@ class Pusher:
         return watcher.number
 
     def push(self, key: bytes, records: Iterable[Record], gone: Iterable[Record]) -> None:
-        """Tell the watchers of ``key`` that ``records`` are held now, and those in ``gone`` no longer."""
+        """Notify the watchers of ``key`` that this node now holds ``records``, and no longer those in ``gone``."""
         watchers = self._watchers.get(key)
         if not watchers:
             return
@@ -76,10 +76,10 @@ class Pusher:
             return
         if key not in self._gathered:
             self._chores.later(GATHERED, self._push_gathered, key)
-        # Of each slot the last word only: it was there and went, or went and is there again.
-        words = self._gathered.setdefault(key, {})
-        words.update((record.slot, (record, True)) for record in records)
-        words.update((record.slot, (record, False)) for record in gone)
+        # Only the last change of each slot is pushed.
+        changes = self._gathered.setdefault(key, {})
+        changes.update((record.slot, (record, True)) for record in records)
+        changes.update((record.slot, (record, False)) for record in gone)
 
     def _push_gathered(self, key: bytes) -> None:
         packed: list[object] = []
@@ -111,7 +111,7 @@ class Pusher:
             pushed.addErrback(_ignore_weather)
 
     def forget(self, peer: Contact) -> None:
-        """``peer`` left."""
+        """Remove ``peer``, which left the network, from all keys."""
         for watchers in self._watchers.values():
             watchers.pop(peer.node_id, None)
 

@@ -1,7 +1,7 @@
-"""Reader: what a key holds, asked of its replicas; fast from one of them, or sure from a majority.
+"""Reads of a key from its replicas: fast from one of them, or consistent from a majority.
 
-A read never says that nothing is there because replicas could not be reached: it fails with ``Unavailable``.  One that
-takes longer than nearly all answers in this team is not waited for: others are asked beside it.
+A read never returns an empty result because replicas are unreachable: it fails with ``Unavailable``.  If a reply takes
+longer than nearly all replies in this team, the reader sends further requests to other replicas (hedging).
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from middleware.entangled.replication.watch import digest_of
 
 ReadConcern = Literal["fast", "majority"]
 CATCHING_UP, CATCHING_UP_STEP = 1.5, 0.1
-"""Seconds for which a read waits for its own node to catch up, and after which it is tried again."""
+"""Seconds that a read waits for its own node to catch up, and seconds between two attempts meanwhile."""
 MAX_PAGES = 2000
 
 
 class Answer(NamedTuple):
-    """What one replica said: its records, tombstones included, what that is worth, and whom it knows nearer."""
+    """The reply of one replica: its records, tombstones included, its ``worth``, and contacts nearer to the key."""
 
     records: list[Record]
     worth: int
@@ -38,7 +38,7 @@ class Answer(NamedTuple):
 
 
 class Reader:
-    """The reads of one node."""
+    """Reads keys for one node."""
 
     def __init__(self, replica: Replica, overlay: Overlay, owner: Owner, chores: Background) -> None:
         self._replica = replica
@@ -47,21 +47,21 @@ class Reader:
         self._chores = chores
 
     async def read(self, key: bytes, concern: ReadConcern) -> list[Record]:
-        """The records of ``key``, without tombstones, in the order of (owner, name); raises ``Unavailable``.
+        """Return the records of ``key``, without tombstones, in the order of (owner, name); raise ``Unavailable``.
 
-        A node that has just come has no vote of its own until it has caught up: its reads give it a moment for that.
+        A new node has no vote until it has caught up, so its reads wait up to ``CATCHING_UP`` seconds until it has.
         """
-        over: list[bool] | None = None
+        timed_out: list[bool] | None = None
         while True:
             try:
                 records = list((await self.newest(key)).values()) if concern == "majority" else await self._fast(key)
                 break
             except Unavailable:
-                if over or self._replica.is_sure():
+                if timed_out or self._replica.is_sure():
                     raise
-            if over is None:
-                over = []
-                self._chores.later(CATCHING_UP, over.append, True)
+            if timed_out is None:
+                timed_out = []
+                self._chores.later(CATCHING_UP, timed_out.append, True)
             await self._chores.sleep(CATCHING_UP_STEP)
         return sorted((r for r in records if not r.is_tombstone), key=lambda r: (r.owner, r.name))
 
@@ -73,9 +73,9 @@ class Reader:
         wants_sure: bool = True,
         same: list[Record] | None = None,
     ) -> Answer:
-        """What ``contact`` holds under ``key``, from ``page`` on (None: from the first one).
+        """Read the records that ``contact`` holds under ``key``, from ``page`` on (None: from the first one).
 
-        Where it holds just what is in ``same``, it sends no record.
+        If its records are exactly ``same``, it sends none.
         """
         records: list[Record] = []
         if page is None:
@@ -87,10 +87,10 @@ class Reader:
         for _ in range(MAX_PAGES):
             if not (isinstance(page, list) and len(page) >= 2 and isinstance(page[0], list)):
                 break
-            told = [record for record in map(unpacked, page[0]) if record is not None]
-            await self._replica.certificates.learn(contact, (record.owner for record in told))
-            records += [record for record in told if self.is_credible(record, key, contact)]
-            # What it was worth at the end counts: it may have fallen behind in between.
+            received = [record for record in map(unpacked, page[0]) if record is not None]
+            await self._replica.certificates.learn(contact, (record.owner for record in received))
+            records += [record for record in received if self.is_credible(record, key, contact)]
+            # The last page counts: the replica may have lost contact in between.
             worth = page[2] if len(page) > 2 and page[2] in (SURE, CACHED) else UNSURE
             nearer = contacts_of(page[3]) if len(page) > 3 else []
             if page[1] is None or not page[0]:
@@ -99,7 +99,7 @@ class Reader:
         return Answer(records, worth, nearer)
 
     def is_credible(self, record: Record, key: bytes, contact: Contact) -> bool:
-        """Whether ``record``, told by ``contact``, is one of ``key`` and its owner's own word."""
+        """Return whether ``record``, received from ``contact``, belongs to ``key`` and is authentic."""
         if record.key != key:
             return False
         if record.owner == contact.public:
@@ -110,32 +110,32 @@ class Reader:
 
     async def _fast(self, key: bytes) -> list[Record]:
         here = self._replica.held(key)
-        # What is left of a time when this node was among the closest may be old.
+        # Records from a time when this node was among the closest may be outdated.
         if _is_something(here) and self._replica.is_sure() and self._overlay.belongs(key, self._overlay.me()):
             return here
         if self._overlay.is_sparse:
-            return await self._walk(key)
+            return await self._find_value(key)
         targets = await self._overlay.holders(key)
         voters = self._overlay.voters(key, targets)
-        answers = await self._asked(key, targets, voters, lambda given: _is_clear(given, voters), width=1)
+        answers = await self._query(key, targets, voters, lambda given: _is_clear(given, voters), width=1)
         for answer in answers.values():
             if _is_something(answer.records):
                 return answer.records
-        return self._nothing(answers, voters)
+        return self._confirm_empty(answers, voters)
 
     async def newest(self, key: bytes) -> dict[Slot, Record]:
-        """What a majority knows of ``key``, tombstones included; raises ``Unavailable``."""
+        """Return the newest records of ``key`` at a majority, tombstones included; raise ``Unavailable``."""
         targets = await self._overlay.holders(key)
         voters = self._overlay.voters(key, targets)
         needed = voters.majority
-        answers = await self._asked(key, targets, voters, lambda given: _votes(given, voters) >= needed, width=needed)
+        answers = await self._query(key, targets, voters, lambda given: _votes(given, voters) >= needed, width=needed)
         _check_votes(_votes(answers, voters), voters)
         newest = newest_of(answer.records for answer in answers.values())
         await self._repair(newest, targets, voters, answers)
         return newest
 
-    def _nothing(self, answers: dict[bytes, Answer], voters: Voters) -> list[Record]:
-        """No records, where a majority says so; raises ``Unavailable`` where they cannot be asked."""
+    def _confirm_empty(self, answers: dict[bytes, Answer], voters: Voters) -> list[Record]:
+        """Return no records if a majority has answered; otherwise raise ``Unavailable``."""
         _check_votes(_votes(answers, voters), voters)
         return []
 
@@ -146,7 +146,7 @@ class Reader:
         voters: Voters,
         answers: dict[bytes, Answer],
     ) -> None:
-        """Bring what only some hold to a majority, before anybody is told of it: who reads next shall see no less."""
+        """Store records that a minority holds at a majority before returning them, so that later reads see them too."""
         has: dict[Slot, set[bytes]] = {slot: set() for slot in newest}
         for node_id, answer in answers.items():
             for record in answer.records:
@@ -154,10 +154,10 @@ class Reader:
                     has[record.slot].add(node_id)
         for slot, record in newest.items():
             if record.lifetime == "leased" or voters.count_known(has[slot]) >= voters.majority:
-                continue  # nobody stores a lease but its owner, whose beat mends it
+                continue  # only its owner stores a leased record, with each renewal
             holding = has[slot]
 
-            async def mend(contact: Contact, record: Record = record, holding: set[bytes] = holding) -> None:
+            async def repair_at(contact: Contact, record: Record = record, holding: set[bytes] = holding) -> None:
                 try:
                     reply = await self._owner.store_at(contact, record, self._owner.left(record))
                     if reply.outcome is Outcome.UNSYNCED:
@@ -165,13 +165,13 @@ class Reader:
                 except Refused as error:
                     if error.code not in OWNERS_FAULT:
                         raise
-                holding.add(contact.node_id)  # it took it, has a newer one, or lets this owner have no more
+                holding.add(contact.node_id)  # stored, superseded there, or refused because of its owner
 
-            lacking = [mend(c) for c in targets if c.node_id not in holding]
+            lacking = [repair_at(c) for c in targets if c.node_id not in holding]
             await until(lambda _, holding=holding: voters.count_known(holding) >= voters.majority, lacking)  # type: ignore
             _check_votes(voters.count_known(holding), voters)
 
-    async def _asked(
+    async def _query(
         self,
         key: bytes,
         targets: list[Contact],
@@ -179,9 +179,9 @@ class Reader:
         is_enough: Callable[[dict[bytes, Answer]], bool],
         width: int,
     ) -> dict[bytes, Answer]:
-        """The answers of ``targets``, ``width`` of them asked at once, and two more beside each that is slow.
+        """Collect the answers of ``targets``: ask ``width`` at once, and two more for each that is slow or fails.
 
-        Who falls silent seldom does so alone: with half of a team gone, the next one is silent as likely as not.
+        Two, because failures are correlated: with half of the team gone, every second replica is silent.
         """
         answers: dict[bytes, Answer] = {}
         own_id = self._overlay.own_id
@@ -192,53 +192,53 @@ class Reader:
             width -= 1
         waiting = self._overlay.quickest(c for c in targets if c.node_id != own_id)
         done: Deferred[None] = Deferred()
-        under_way = 0
+        pending = 0
 
         def settle() -> None:
-            if not done.called and (is_enough(answers) or not (waiting or under_way)):
+            if not done.called and (is_enough(answers) or not (waiting or pending)):
                 done.callback(None)
 
-        def next_one() -> None:
+        def ask_next() -> None:
             if waiting and not done.called:
                 self._chores.fork(ask(waiting.pop(0)))
 
         def hedge(contact: Contact) -> None:
             self._overlay.slow(contact)
-            next_one()
-            next_one()
+            ask_next()
+            ask_next()
 
         async def ask(contact: Contact) -> None:
-            nonlocal under_way
-            under_way += 1
+            nonlocal pending
+            pending += 1
             in_time = self._chores.later(self._overlay.hedge(), hedge, contact)
             more = 1
             try:
                 answer = answers[contact.node_id] = await self.pages(contact, key, same=here)
                 if answer.worth == SURE and contact.node_id in voters.ids:
-                    more = 2 if at_first == 1 else 0
+                    more = 2 if initial == 1 else 0
             except EntangledError:
                 pass
             in_time()
-            under_way -= 1
+            pending -= 1
             settle()
-            # One at first is to find something; where it finds nothing, a majority is asked, in two or three waves.
-            for _ in range(more if under_way else max(more, 1)):
-                next_one()
+            # A fast read asks one replica first; if that has nothing, a majority, in two or three waves.
+            for _ in range(more if pending else max(more, 1)):
+                ask_next()
 
         settle()
-        at_first = max(width, 1)
-        for _ in range(at_first):
-            next_one()
+        initial = max(width, 1)
+        for _ in range(initial):
+            ask_next()
         settle()
         await done
         return dict(answers)
 
-    async def _walk(self, key: bytes) -> list[Record]:
-        """FIND_VALUE in a large network: ask nearer and nearer nodes until one has it (Kademlia, section 2.3).
+    async def _find_value(self, key: bytes) -> list[Record]:
+        """FIND_VALUE in a large network: ask ever nearer nodes until one has the key (Kademlia, section 2.3).
 
-        One that is not among the closest, or has yet to catch up, may have only some: its word counts where no better
-        one is found.  The nearest node that did not have it gets a copy, which lives the shorter the more nodes are
-        nearer.
+        The records of a node that is not among the closest, or not synced, may be incomplete; they are used only if no
+        other node has any.  The nearest node without the key gets a cached copy, with a lifetime that halves for each
+        node nearer to the key.
         """
         lookup = Lookup(key, K, ALPHA, self._overlay.nearest(key), exclude=self._overlay.own_id)
         found: list[Record] = []
@@ -258,18 +258,18 @@ class Reader:
             voters = self._overlay.voters(key, nearest)
             self._overlay.note_found(key, nearest)
             some = list(newest_of(answer.records for answer in answers.values()).values())
-            return some if _is_something(some) else self._nothing(answers, voters)
-        without = [contact for contact in nearest if contact.node_id in answers]
-        if without and all(record.lifetime == "team" for record in found):
-            between = nearest.index(without[0])
+            return some if _is_something(some) else self._confirm_empty(answers, voters)
+        lacking_nodes = [contact for contact in nearest if contact.node_id in answers]
+        if lacking_nodes and all(record.lifetime == "team" for record in found):
+            between = nearest.index(lacking_nodes[0])
             packed = [record.packed() for record in found]
-            copy = self._overlay.ask(without[0], "cache", key, packed, MAX_AGE / 2**between, changes=True)
+            copy = self._overlay.ask(lacking_nodes[0], "cache", key, packed, MAX_AGE / 2**between, changes=True)
             self._chores.fork(copy)
         return found
 
 
 def newest_of(opinions: Iterable[list[Record]]) -> dict[Slot, Record]:
-    """Of each slot the record that beats the others."""
+    """Return the record of each slot that beats the others."""
     newest: dict[Slot, Record] = {}
     for records in opinions:
         for record in records:
@@ -283,7 +283,7 @@ def _votes(answers: dict[bytes, Answer], voters: Voters) -> int:
 
 
 def _check_votes(votes: int, voters: Voters) -> None:
-    """Raise ``Unavailable`` where ``votes`` are fewer than a majority of ``voters``."""
+    """Raise ``Unavailable`` if ``votes`` are fewer than a majority of ``voters``."""
     if votes < voters.majority:
         raise Unavailable(votes, voters.majority)
 
@@ -294,5 +294,5 @@ def _is_clear(answers: dict[bytes, Answer], voters: Voters) -> bool:
 
 
 def _is_something(records: list[Record]) -> bool:
-    """Whether there is more than tombstones: a replica that has only these may have missed the rest."""
+    """Return whether there is more than tombstones; a replica with only tombstones may lack records."""
     return any(not record.is_tombstone for record in records)

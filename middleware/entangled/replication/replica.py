@@ -1,7 +1,7 @@
-"""Replica: what a node does for the records of others that it holds.
+"""The records that a node holds as one of the replicas of their keys.
 
-It answers STORE and FIND_VALUE, keeps the leases of owners, tells ``pusher`` what changes, and lets go of what has
-run out.  It decides nothing about where records belong; ``overlay`` does.
+Answers STORE and FIND_VALUE, extends leases on renewal by their owners, passes changes to ``pusher``, and removes
+expired records.  ``overlay`` decides where records belong.
 """
 
 from __future__ import annotations
@@ -31,27 +31,27 @@ from middleware.entangled.wire.door import Authority
 from middleware.entangled.wire.endpoint import Endpoint
 
 PAGE_BYTES = 12_000
-"""A page of small records goes out in one burst: ten datagrams are the first window of a parcel."""
+"""Bytes of a page; it fits into the first congestion window, ten datagrams."""
 SWEEP, LONGEST_SWEEP = 0.1, 60.0
-"""Seconds between two looks for what ran out, and those after which is looked though nothing can have."""
+"""Minimum and maximum seconds between two checks for expired records."""
 MAX_LEASE = 3600.0
 MARKS = 100
 MAX_DOUBTFUL = 4096
-"""Leased records that are named in one message."""
+"""Peers remembered whose last ALIVE did not match the records held."""
 
 UNSURE, SURE, CACHED = 0, 1, 2
-"""What an answer is worth: of a replica that has yet to catch up, of one that has, a copy from the path."""
+"""Worth of a reply: from a replica that is not synced, from one that is, or a cached copy."""
 
 
 class Replica:
-    """The records of others, held for them; ``keepsakes`` are the node's own copies, which nobody else gets to see.
+    """The records that one node holds for other owners; ``keepsakes`` are its watched copies, invisible to peers.
 
-    ``may_store`` says whether the owner of a slot may write there, by its certificate as it is at present, ``may_stay``
-    whether what is held there may be held on and shown; that is the same but for few slots.  ``is_sure`` says whether
-    this node has caught up with the others.
+    ``may_store`` returns whether the owner of a slot may write there by its present certificate; ``may_stay`` whether
+    a record in it may be kept and served, which differs for few slots.  ``is_sure`` returns whether this node is
+    synced.
 
-    ``on_record`` is told of every record that was accepted, ``on_gone`` of every one that is let go of, ``on_silent``
-    of every owner (its public key) whose lease ran out or that said goodbye.
+    ``on_record`` is called with each accepted record, ``on_gone`` with each removed one, ``on_silent`` with the public
+    key of each owner whose lease expired or that said goodbye.
     """
 
     def __init__(
@@ -70,14 +70,14 @@ class Replica:
         self.may_stay: Callable[[Slot], bool] = endpoint.door.may_stay
         self._authorities: dict[bytes, Authority] = {}
         self.is_sure: Callable[[], bool] = lambda: True
-        self._doubtful: set[bytes] = set()
+        self._mismatched: set[bytes] = set()
         self._swept_at = self._sweep_at = -1.0
-        self._no_sweep: Callable[[], None] = lambda: None
+        self._cancel_sweep: Callable[[], None] = lambda: None
         self.on_record = Listeners[[Record]]()
         self.on_gone = Listeners[[Record]]()
         self.on_silent = Listeners[[bytes]]()
         self._chores = chores
-        endpoint.expose("store", self._once_written(self.answer_store), changes=True, idempotent=True)
+        endpoint.expose("store", self._after_write(self.answer_store), changes=True, idempotent=True)
         endpoint.expose("find_value", self.answer_find_value, early=True)
         endpoint.expose("cache", self.answer_cache, changes=True, idempotent=True)
         endpoint.expose("watch", self.answer_watch, changes=True, idempotent=True)
@@ -86,42 +86,42 @@ class Replica:
         endpoint.expose("goodbye", self.answer_goodbye, changes=True)
 
     def start(self) -> None:
-        """Let go of what runs out from now on."""
+        """Start to remove expired records and watchers."""
         self._swept_at = self._clock.seconds()
-        self._sweep_later()
+        self._schedule_sweep()
         self.pusher.start()
 
     def held(self, key: bytes) -> list[Record]:
-        """What is held under ``key`` as a replica, tombstones included."""
-        kept = self.keepsakes.under(key)
-        return [r for r in self._store.get(key, tombstones=True) if r.slot not in kept and self.may_stay(r.slot)]
+        """Return the records held under ``key`` as a replica, tombstones included."""
+        copies = self.keepsakes.under(key)
+        return [r for r in self._store.get(key, tombstones=True) if r.slot not in copies and self.may_stay(r.slot)]
 
     def shown(self, slot: Slot) -> Record | None:
-        """What the slot holds as a replica, for others to see."""
+        """Return the record held in ``slot`` as a replica, if peers may see it."""
         return None if slot in self.keepsakes or not self.may_stay(slot) else self._store.slot(slot)
 
     def team_records(self) -> list[Record]:
-        """The team records that are held as a replica, tombstones included, for others to see."""
-        kept = self.keepsakes
+        """Return the team records held as a replica that peers may see, tombstones included."""
+        copies = self.keepsakes
         return [
-            r for r in self._store.records() if r.lifetime == "team" and r.slot not in kept and self.may_stay(r.slot)
+            r for r in self._store.records() if r.lifetime == "team" and r.slot not in copies and self.may_stay(r.slot)
         ]
 
     def holds(self, record: Record) -> bool:
-        """Whether this very record is held as a replica."""
+        """Return whether exactly ``record`` is held as a replica."""
         return self._store.slot(record.slot) == record and record.slot not in self.keepsakes
 
     def keep(self, record: Record, left: float | None = None) -> StoreReply:
-        """Hold ``record`` if it beats what its slot holds: STORED, or SUPERSEDED.
+        """Store ``record`` if it beats the record in its slot; return STORED or SUPERSEDED.
 
-        It is held for ``left`` seconds, as long as whoever handed it on would have; by default a whole ttl.
+        It expires after ``left`` seconds, the lifetime remaining at its sender; by default after a whole ttl.
         """
         self.keepsakes.release(record.slot)
         self.cache.drop(record.key)
         before = self._store.slot(record.slot)
         life = record.ttl if left is None else min(left, record.ttl)
         if self._store.put(record, self._clock.seconds() + life):
-            self._sweep_in_time()
+            self._sweep_earlier()
             self.on_record(record)
             self.pusher.push(record.key, [record], [])
         elif before is not None and before.sequence >= record.sequence and before.signature != record.signature:
@@ -129,37 +129,37 @@ class Replica:
         return STORED
 
     def store(self, record: Record, left: float | None = None) -> StoreReply:
-        """Hold ``record`` as ``keep`` does; UNSYNCED instead of STORED if this replica is not sure."""
+        """Store ``record`` as ``keep`` does; return UNSYNCED instead of STORED if this replica is not synced."""
         reply = self.keep(record, left)
         return UNSYNCED if reply is STORED and not self.is_sure() else reply
 
     def left(self, record: Record) -> float:
-        """Seconds for which ``record`` is still held here; its ttl where it is not."""
+        """Return the seconds until the record in this slot expires here; the ttl of ``record`` if the slot is empty."""
         expiry = self._store.expiry(record.slot)
         return record.ttl if expiry is None else expiry - self._clock.seconds()
 
     def review(self) -> bool:
-        """Judge the held records of those owners whose authority has changed; whether that was any.
+        """Check the records of owners with a changed authority; return whether there are any such owners.
 
-        What an owner may not write is gone for those who watch.  It is dropped where that is final; where only a clock
-        or a certificate that is missing stands against it, it is not shown until it may be, or runs out.
+        Watchers are notified that a record is gone if its owner may no longer write it.  The record is removed if that
+        is final; if the reason is the clock or a missing certificate, it is hidden until it is allowed or expires.
         """
         before, door = self._authorities, self.certificates.door
         self._authorities = {owner: door.authority(owner) for owner in self._store.owners()}
         changed = [owner for owner, authority in self._authorities.items() if before.get(owner) != authority]
         for owner in changed:
-            self._judge(owner, self._authorities[owner], before.get(owner))
+            self._apply_authority(owner, self._authorities[owner], before.get(owner))
         return bool(changed)
 
-    # -- what peers ask ---------------------------------------------------------------------------------------------
+    # -- requests of peers ---------------------------------------------------------------------------------------------
 
     def answer_store(
         self, peer: Contact, packed: list[object], left: list[object] | None = None
     ) -> list[int] | Deferred[list[int]]:
-        """STORE: keep records; answers the code of a ``StoreReply`` for each.
+        """STORE: store records; return the code of a ``StoreReply`` for each.
 
-        ``left`` are the seconds that each is to be kept, where it does not come from its owner.  The peer is asked for
-        certificates that are not known here.
+        ``left`` is the remaining lifetime in seconds of each record, if the sender is not its owner.  Unknown
+        certificates are requested from ``peer``.
         """
         self._overlay.heard(peer)
         records = [record for record in map(unpacked, packed) if record is not None]
@@ -168,9 +168,9 @@ class Replica:
             raise Refused("not a record")
         owners = [record.owner for record in records]
         if self.certificates.lacking(peer, owners):
-            learnt = Deferred.fromCoroutine(self.certificates.learn(peer, owners))
-            return learnt.addCallback(lambda _: self._stored(peer, records, lives))
-        return self._stored(peer, records, lives)
+            learning = Deferred.fromCoroutine(self.certificates.learn(peer, owners))
+            return learning.addCallback(lambda _: self._store_all(peer, records, lives))
+        return self._store_all(peer, records, lives)
 
     def answer_find_value(
         self,
@@ -180,12 +180,12 @@ class Replica:
         wants_sure: bool = False,
         digest: bytes = b"",
     ) -> list[object]:
-        """FIND_VALUE: a page of the records under ``key``, where the next page begins (None: that was all), its worth.
+        """FIND_VALUE: return a page of the records under ``key``, the cursor of the next page or None, and its worth.
 
-        Where nothing is held, the contacts that are closest to the key follow, and a copy from the path may be given
-        unless ``wants_sure``.  Whose way leads past a node that is not one of the closest gets these contacts too: what
-        is held there, such as the node's own record, may be all that was not let go of.  Where ``digest`` is that of
-        all that is held, None stands for the records.
+        Without records, the contacts closest to the key follow, and unless ``wants_sure`` a cached copy may be
+        returned.  A node that is not among the closest to the key also returns these contacts to a lookup, since its
+        records, such as its own, may be incomplete.  If ``digest`` equals the digest of all records held, None is
+        returned instead of them.
         """
         if digest and digest == digest_of(self.held(_checked_key(key))):
             return [None, None, self._worth()]
@@ -201,7 +201,7 @@ class Replica:
         return [page, following, UNSURE if is_aside else self._worth(), near]
 
     def answer_cache(self, peer: Contact, key: bytes, packed: list[object], ttl: float) -> None:
-        """CACHE: keep a copy of what a lookup found, for those whose way leads past here (Kademlia, section 2.3)."""
+        """CACHE: keep a copy of records that a lookup found, for later lookups on its path (Kademlia, section 2.3)."""
         records = [record for record in map(unpacked, packed) if record is not None]
         if len(records) < len(packed) or any(record.key != _checked_key(key) for record in records):
             raise Refused("not records of this key")
@@ -209,42 +209,44 @@ class Replica:
             self.cache.put(key, records, ttl, self._clock.seconds())
 
     def answer_watch(self, peer: Contact, key: bytes, digest: bytes, ttl: float = WATCH_TTL) -> list[object]:
-        """WATCH: push changes of ``key`` to ``peer`` for ``ttl`` seconds, a minute at most.
+        """WATCH: push changes of ``key`` to ``peer`` for ``ttl`` seconds, at most one minute.
 
-        Answers the number of the last push, and the first page (None where ``digest`` is that of what is held).
+        Returns the number of the last push and the first page of records, None if ``digest`` equals their digest.
         """
         self._overlay.heard(peer)
         number = self.pusher.watched(_checked_key(key), peer, ttl)
         return [number, None if digest == digest_of(self.held(key)) else list(self._page(key, None))]
 
     def answer_alive(self, peer: Contact, lease: float, digest: bytes) -> None:
-        """ALIVE: extend the leases of ``peer``; where what is held differs from what it says twice, tell it.
+        """ALIVE: extend the leases of ``peer``; send MISSING after two mismatches of its digest with the records held.
 
-        Where nothing is held, they have run out here though the peer lives: it is told at once.
+        If none are held, they expired here though the peer is alive, and MISSING is sent at once.
         """
         self._overlay.heard(peer)
         held = self._leased(peer.public)
         self._store.extend(peer.public, self._clock.seconds() + min(float(lease), MAX_LEASE))
         if digest == digest_of(held):
-            self._doubtful.discard(peer.node_id)
-        elif peer.node_id in self._doubtful or not held:
-            self._doubtful.discard(peer.node_id)
+            self._mismatched.discard(peer.node_id)
+        elif peer.node_id in self._mismatched or not held:
+            self._mismatched.discard(peer.node_id)
             self._endpoint.tell(peer, "missing", [digest_of([r]) for r in held[:MARKS]])
         else:
-            if len(self._doubtful) >= MAX_DOUBTFUL:
-                self._doubtful.clear()  # these are told one sign later
-            self._doubtful.add(peer.node_id)
+            if len(self._mismatched) >= MAX_DOUBTFUL:
+                self._mismatched.clear()  # these get MISSING one renewal later
+            self._mismatched.add(peer.node_id)
 
     def answer_let_go(self, peer: Contact, marks: list[object]) -> None:
-        """LET_GO: these leased records of ``peer`` (a digest each) do not belong here any more."""
-        self._gone([r for r in self._leased(peer.public) if digest_of([r]) in marks and self._store.discard(r.slot)])
+        """LET_GO: remove leased records of ``peer``, identified by their digests, that no longer belong here."""
+        self._notify_gone(
+            [r for r in self._leased(peer.public) if digest_of([r]) in marks and self._store.discard(r.slot)]
+        )
 
     def answer_goodbye(self, peer: Contact) -> None:
-        """GOODBYE: the peer leaves, and what it leased leaves with it (thesis, section 4.2.2)."""
-        self._gone(self._store.drop_leased(peer.public))
+        """GOODBYE: remove the leased records of ``peer``, which leaves the network (thesis, section 4.2.2)."""
+        self._notify_gone(self._store.drop_leased(peer.public))
         self.on_silent(peer.public)
         self.pusher.forget(peer)
-        self._doubtful.discard(peer.node_id)
+        self._mismatched.discard(peer.node_id)
         self._overlay.left(peer)
 
     def _refusal(self, record: Record, peer: Contact) -> StoreReply | None:
@@ -253,26 +255,26 @@ class Replica:
         return None if self.is_lawful(record, peer) else StoreReply(Outcome.FORGED)
 
     def is_lawful(self, record: Record, peer: Contact) -> bool:
-        """Whether ``peer`` may store ``record``.
+        """Return whether ``peer`` may store ``record``.
 
-        Its owner's own session vouches for it; second-hand a signature has to, and a lease is taken from its owner
-        only, for it shall not outlive the owner's own sign of life.
+        The session of its owner authenticates a record.  From another peer a team record needs a valid signature;
+        leased records are accepted from their owner only, because they must not outlive its last sign of life.
         """
         return record.owner == peer.public or (record.lifetime == "team" and self.is_genuine(record))
 
     def is_genuine(self, record: Record) -> bool:
-        """Whether ``record`` is its owner's own word, and one that it may give.
+        """Return whether the owner may write ``record`` and did.
 
-        So is the very one that is held here, and one with a good signature.
+        A record that this node already holds needs no second check of its signature.
         """
         return self.may_store(record.slot) and (self.holds(record) or self._signed.is_genuine(record))
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
-    def _once_written(
+    def _after_write(
         self, answer: Callable[..., list[int] | Deferred[list[int]]]
     ) -> Callable[..., Deferred[list[int]]]:
-        """``answer``, given only when what it took would survive the end of this process."""
+        """Wrap ``answer`` so that its reply is sent only after the store has written the changes durably."""
 
         def written(answers: list[int]) -> Deferred[list[int]]:
             return self._store.written().addCallback(lambda _: answers)
@@ -284,8 +286,8 @@ class Replica:
 
         return acknowledged
 
-    def _stored(self, peer: Contact, records: list[Record], lives: Sequence[float | None]) -> list[int]:
-        """Keep those of ``records`` that are lawful; one whose owner has too many does not keep the others out."""
+    def _store_all(self, peer: Contact, records: list[Record], lives: Sequence[float | None]) -> list[int]:
+        """Store the valid ones of ``records``; a full share of one owner does not affect the others."""
         replies = []
         for record, life in zip(records, lives, strict=True):
             try:
@@ -296,21 +298,21 @@ class Replica:
                 replies.append(StoreReply(Outcome.NO_ROOM))
         return [reply.encode() for reply in replies]
 
-    def _judge(self, owner: bytes, authority: Authority, before: Authority | None) -> None:
-        """Let go of what ``owner`` may not write now, or show again what it may."""
-        out = []
+    def _apply_authority(self, owner: bytes, authority: Authority, before: Authority | None) -> None:
+        """Hide or remove the records that ``owner`` may not write, and show the others again."""
+        hidden = []
         for record in self._store.owned(owner):
             if not self.may_stay(record.slot):
-                out.append(record)
+                hidden.append(record)
             elif before is not None and before.refusal and record.slot not in self.keepsakes:
                 self.on_record(record)
                 self.pusher.push(record.key, [record], [])
-        self._gone(out)
-        for record in out if authority.is_final else ():
+        self._notify_gone(hidden)
+        for record in hidden if authority.is_final else ():
             self._store.discard(record.slot)
 
     def _leased(self, owner: bytes) -> list[Record]:
-        """What is held of ``owner`` on lease."""
+        """Return the leased records of ``owner`` held as a replica."""
         return [r for r in self._store.owned(owner) if r.lifetime == "leased" and r.slot not in self.keepsakes]
 
     def _worth(self) -> int:
@@ -325,7 +327,7 @@ class Replica:
         following: list[object] | None = [page[-1].owner, page[-1].name] if len(page) < len(left) else None
         return [record.packed() for record in page], following
 
-    def _gone(self, records: list[Record]) -> None:
+    def _notify_gone(self, records: list[Record]) -> None:
         for record in records:
             if record.slot in self.keepsakes:
                 self.keepsakes.release(record.slot)
@@ -333,34 +335,34 @@ class Replica:
             self.pusher.push(record.key, [], [record])
             self.on_gone(record)
 
-    def _sweep_in_time(self) -> None:
-        """Sweep earlier than was thought, where something that was taken in runs out sooner."""
+    def _sweep_earlier(self) -> None:
+        """Schedule the next sweep earlier if a new record expires before it."""
         if self._swept_at >= 0 and self._store.due() <= self._sweep_at - SWEEP:
-            self._no_sweep()
-            self._sweep_later()
+            self._cancel_sweep()
+            self._schedule_sweep()
 
-    def _sweep_later(self) -> None:
-        """Sweep in a multiple of ``SWEEP``: as soon as something may have run out."""
+    def _schedule_sweep(self) -> None:
+        """Schedule the next sweep for the next expiry, rounded up to a multiple of ``SWEEP``."""
         now, at = self._clock.seconds(), self._swept_at + SWEEP
         due = min(self._store.due(), now + LONGEST_SWEEP)
         while at < due or at <= now:
             at += SWEEP
         self._sweep_at = at
-        self._no_sweep = self._chores.later(at - now, self._sweep)
+        self._cancel_sweep = self._chores.later(at - now, self._sweep)
 
     def _sweep(self) -> None:
         self._swept_at = self._sweep_at
         try:
             ended = self._store.expire(self._clock.seconds())
         finally:
-            self._sweep_later()
-        self._gone(ended)
+            self._schedule_sweep()
+        self._notify_gone(ended)
         for owner in dict.fromkeys(r.owner for r in ended if r.lifetime == "leased"):
             self.on_silent(owner)
 
 
 def pages_of(records: list[Record], most: int | None = None) -> Iterator[list[Record]]:
-    """``records``, in order, in pages of about ``PAGE_BYTES`` and at most ``most`` each."""
+    """Split ``records`` into pages of about ``PAGE_BYTES`` and at most ``most`` records each."""
     page: list[Record] = []
     size = 0
     for record in records:
@@ -389,5 +391,5 @@ def _checked_cursor(after: list[object] | None) -> tuple[bytes, str] | None:
 
 def _checked_life(life: object) -> float:
     if type(life) is not float or not math.isfinite(life):
-        raise Refused("what is left of a life is a number of seconds")
+        raise Refused("a remaining lifetime is a finite float of seconds")
     return life

@@ -1,7 +1,7 @@
-"""Shipper: brings a node's own records to their replicas, those that come close together in one question.
+"""Batching of a node's own records on the way to their replicas.
 
-After Nagle (RFC 896): a record for a replica that has not yet answered earlier ones waits for that answer, and goes
-with all that came meanwhile.  So a single write loses no time, and a flood of them shares datagrams and their cost.
+After Nagle (RFC 896): while a replica has not answered the last request, further records wait and then share one
+request.  A single write is not delayed, and many writes share datagrams.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from middleware.entangled.record import Record
 ROOM = 1300
 """Bytes of records in one datagram."""
 MAX_WAITING = 2048
-"""Records that wait for one replica."""
+"""Maximum records that wait for one replica."""
 
 
 Waiting = deque[tuple[Record, Deferred[object]]]
-"""The records that wait for one replica, and who is told what becomes of them."""
+"""The records that wait for one replica, each with the Deferred of its result."""
 
 
 class Shipper:
-    """The own records of a node on their way to others."""
+    """Sends the own records of a node to their replicas."""
 
     def __init__(self, overlay: Overlay, chores: Background) -> None:
         self._overlay = overlay
@@ -35,82 +35,82 @@ class Shipper:
         self._waiting: dict[bytes, Waiting] = {}
 
     async def store(self, contact: Contact, record: Record, left: float | None = None) -> object:
-        """What ``contact`` says to ``record`` (see STORE); raises what asking it raises.
+        """Send STORE for ``record`` and return the reply; raise the errors of the request.
 
-        Another's record, which is to be kept for ``left`` seconds, goes by itself.
+        A record of another owner, with ``left`` seconds of remaining lifetime, is sent at once by itself.
         """
         if left is not None:
-            return (await self._asked(contact, [record], [left]))[0]
+            return (await self._send(contact, [record], [left]))[0]
         if record.message_bytes > ROOM:
-            return (await self._asked(contact, [record]))[0]  # it goes as a parcel, and takes its time
+            return (await self._send(contact, [record]))[0]  # sent in fragments, so it takes longer
         waiting = self._waiting.get(contact.node_id)
         if waiting is not None:
             if len(waiting) >= MAX_WAITING:
-                raise Crowded(f"too many records wait for {contact.address}; put more slowly")
-            verdict: Deferred[object] = Deferred()
-            waiting.append((record, verdict))
-            return await verdict
+                raise Crowded(f"more than {MAX_WAITING} records wait for {contact.address}; write more slowly")
+            result: Deferred[object] = Deferred()
+            waiting.append((record, result))
+            return await result
         waiting = self._waiting[contact.node_id] = deque()
         try:
-            verdicts = await self._asked(contact, [record])
+            results = await self._send(contact, [record])
         except NoAnswer:
-            self._rush(waiting, contact)
+            self._send_all(waiting, contact)
             raise
         finally:
-            self._next(waiting, contact)
-        return verdicts[0]
+            self._finish_request(waiting, contact)
+        return results[0]
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
-    def _next(self, waiting: Waiting, contact: Contact) -> None:
-        """The question has ended: send the next one, if anything waits for it."""
+    def _finish_request(self, waiting: Waiting, contact: Contact) -> None:
+        """Send the next request after the last one ended, if records wait."""
         if waiting:
-            self._chores.fork(self._ship(waiting, contact))
+            self._chores.fork(self._send_next(waiting, contact))
         else:
             del self._waiting[contact.node_id]
 
-    def _rush(self, waiting: Waiting, contact: Contact) -> None:
-        """Let nobody wait any longer for one that is silent: each gets its own chance now."""
+    def _send_all(self, waiting: Waiting, contact: Contact) -> None:
+        """Send all waiting records at once after a request was not answered."""
         while waiting:
             self._chores.fork(self._deliver(contact, _take_load(waiting)))
 
-    async def _ship(self, waiting: Waiting, contact: Contact) -> None:
+    async def _send_next(self, waiting: Waiting, contact: Contact) -> None:
         try:
             await self._deliver(contact, _take_load(waiting))
         except NoAnswer:
-            self._rush(waiting, contact)
+            self._send_all(waiting, contact)
         finally:
-            self._next(waiting, contact)
+            self._finish_request(waiting, contact)
 
     async def _deliver(self, contact: Contact, load: list[tuple[Record, Deferred[object]]]) -> None:
-        """Ask with these records, and tell each of those who wait; raises ``NoAnswer``, too."""
+        """Send ``load`` in one request and fire its Deferreds; also raise ``NoAnswer``."""
         try:
-            answers = await self._asked(contact, [record for record, _ in load])
+            answers = await self._send(contact, [record for record, _ in load])
         except Refused as error:
             if len(load) == 1:
                 load[0][1].errback(error)
-            else:  # one that is refused shall not take the others with it
+            else:  # send each by itself, so that only the refused one fails
                 for one in load:
                     self._chores.fork(self._deliver(contact, [one]))
         except EntangledError as error:
-            for _, verdict in load:
-                verdict.errback(error)
+            for _, result in load:
+                result.errback(error)
             if isinstance(error, NoAnswer):
                 raise
         else:
-            for (_, verdict), answer in zip(load, answers, strict=True):
-                verdict.callback(answer)
+            for (_, result), answer in zip(load, answers, strict=True):
+                result.callback(answer)
 
-    async def _asked(self, contact: Contact, records: list[Record], *lives: list[float]) -> list[object]:
+    async def _send(self, contact: Contact, records: list[Record], *lives: list[float]) -> list[object]:
         packed = [record.packed() for record in records]
         answer = await self._overlay.ask(contact, "store", packed, *lives, changes=True)
         if not isinstance(answer, list) or len(answer) != len(records):
-            raise Refused(f"{contact.address} does not take the record")
+            raise Refused(f"{contact.address} refuses the record")
         return answer
 
 
 def _take_load(waiting: Waiting) -> list[tuple[Record, Deferred[object]]]:
-    """Take the next of those that wait, as many as one datagram carries."""
+    """Remove and return the next waiting records, as many as fit into one datagram."""
     room = ROOM
     load: list[tuple[Record, Deferred[object]]] = []
     while waiting and (waiting[0][0].message_bytes <= room or not load):

@@ -1,7 +1,7 @@
-"""Standing: whether what this node says about records counts, and whose word it needs before it does.
+"""Sync state of a replica: whether its replies count in a majority, and which replies it needs before they do.
 
-A *novice* never caught up with others; an *elder* once did, and holds what it acknowledged since; who is *sure* has
-caught up and was in touch with a majority ever since.
+A replica in state NOVICE has never caught up with others.  In state ELDER it once did, and holds all records that it
+acknowledged since.  In state SURE (*synced*) it has caught up and been in contact with a majority since.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from middleware.entangled.kademlia.overlay import K
 NOVICE, ELDER, SURE = range(3)
 
 NOTE = "settled"
-"""The note of a node that once was sure, ``SETTLED``, or was and then lost what it held, ``LOST``."""
+"""The note of a node that was synced once: ``SETTLED``, or ``LOST`` if it then lost its records."""
 SETTLED, LOST = b"1", b"lost"
 
 
 class Standing:
-    """What one node remembers of its part in majorities; ``is_sure`` is for its caller to take back."""
+    """The sync state of one node; its owner clears ``is_sure`` when the node loses contact to a majority."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
@@ -26,7 +26,7 @@ class Standing:
         self.is_sure = False
 
     def start(self, forgot: bool) -> None:
-        """Take up the earlier life; ``forgot``: what it held is not here any more, though others may count on it."""
+        """Load the state of the earlier run; ``forgot``: its records were dropped, though others may count on them."""
         noted = self._store.noted(NOTE)
         is_bare = forgot or self._store.origin == "replaced" or self._store.rotten > 0
         self._has_lost = noted == LOST or (noted == SETTLED and is_bare)
@@ -40,7 +40,7 @@ class Standing:
         return SURE if self.is_sure else ELDER if self._is_elder else NOVICE
 
     def settle(self) -> bool:
-        """Be sure from now on; whether that is news to those who count members."""
+        """Become synced; return whether that is the first time, so that other nodes must learn of it."""
         is_first = not self._is_elder
         self.is_sure = self._is_elder = True
         self._has_lost = False
@@ -49,21 +49,23 @@ class Standing:
         return is_first
 
     def is_enough(self, reached: list[int | None], away: int) -> bool:
-        """Whether whatever a majority holds is held by one of those reached, whose standings these are (None: failed).
+        """Return whether the nodes in ``reached`` together have every record that a majority has.
 
-        ``away`` more are absent.  A novice has nothing to tell, and no part in a majority.  Where somebody is sure,
-        only such count: elders may come from a time when there were other members.  A memory that was lost may have
-        been one vote.  A newcomer is let in by a majority of those before it, or each half could grow to one.
+        ``reached`` lists the sync states of the nodes asked (None: failed); ``away`` more are absent.  A novice has no
+        records to give and counts in no majority.  If a synced node answered, only synced nodes count, because an
+        elder may stem from a time with other members.  A node that lost its records may have been one of the voters.
+        A new node is admitted by a majority of the nodes before it; otherwise each half of a partition could grow to a
+        majority.
         """
         missing = reached.count(None) + away
-        heard = reached.count(SURE) or reached.count(ELDER)
+        answered = reached.count(SURE) or reached.count(ELDER)
         if self._has_lost:
-            return missing + 1 < _majority(heard + missing + 1)
+            return missing + 1 < _majority(answered + missing + 1)
         if self._is_elder:
-            return missing < _majority(heard + missing + (0 if SURE in reached else 1))
-        return not missing or (heard > missing and missing < _majority(heard + missing))
+            return missing < _majority(answered + missing + (0 if SURE in reached else 1))
+        return not missing or (answered > missing and missing < _majority(answered + missing))
 
 
 def _majority(members: int) -> int:
-    """How many of the holders of a key are a majority of them."""
+    """Return the majority of the replicas of a key."""
     return min(members, K) // 2 + 1

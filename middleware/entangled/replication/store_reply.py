@@ -8,15 +8,15 @@ from typing import NamedTuple
 from middleware.entangled.record import Record
 
 MAX_SEQUENCE = 2**62
-"""A reply with a higher sequence is malformed: no owner could go on above it."""
+"""Largest sequence in a valid reply: above it an owner would run out of sequence numbers."""
 
 
 class Outcome(Enum):
-    """The value is the code on the wire; a later record that stands in the slot is told by its sequence instead."""
+    """The result of a request to store; the value is its code on the wire, except for SUPERSEDED."""
 
     STORED = 0
     SUPERSEDED = 1
-    """The slot holds a record with the same or a higher sequence."""
+    """The slot holds a record with the same or a higher sequence, which is the code on the wire."""
     FORGED = -1
     """The signature is wrong, or the sender may not store this record."""
     UNSYNCED = -2
@@ -28,7 +28,7 @@ class Outcome(Enum):
 
 
 class StoreReply(NamedTuple):
-    """The ``outcome`` and, if it is SUPERSEDED, the ``sequence`` that stands in the slot."""
+    """The ``outcome`` and, if it is SUPERSEDED, the ``sequence`` of the record in the slot."""
 
     outcome: Outcome
     sequence: int = 0
@@ -39,7 +39,7 @@ class StoreReply(NamedTuple):
         return self.outcome in (Outcome.STORED, Outcome.UNSYNCED)
 
     def encode(self) -> int:
-        """Return the integer that stands for the reply in a message."""
+        """Return the code of the reply on the wire."""
         return self.sequence if self.outcome is Outcome.SUPERSEDED else self.outcome.value
 
 

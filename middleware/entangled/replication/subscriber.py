@@ -1,6 +1,6 @@
-"""Subscriber: the watches of a node, renewed at the replicas of their keys and kept up to date by what those push.
+"""The watches of a node: registration at the replicas of the keys, and processing of their pushes.
 
-Pushes are numbered.  A gap means that something was missed, so the replica is asked at once for what it holds.
+Pushes are numbered.  On a gap the subscriber asks the replica at once for its records.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from middleware.entangled.replication.watch import Changed, Watch
 from middleware.entangled.wire.endpoint import Endpoint
 
 RENEW = 2.0
-"""Four renewals in the time for which a replica remembers a watcher."""
+"""Seconds between two renewals of a watch: four within ``WATCH_TTL``."""
 LARGE_RENEW, LARGE_TTL = 20.0, 60.0
-"""The same in a large network, where to find the holders takes a walk: three renewals."""
+"""Seconds between two renewals, and of a watch, in a large network, where finding the replicas takes a lookup."""
 ASKED = 3
-"""Holders of a key that push to one watcher in a large network, where thousands may watch the same key."""
+"""Replicas that push to one watcher in a large network, where thousands may watch the same key."""
 
 
 class Subscriber:
@@ -50,20 +50,20 @@ class Subscriber:
         self._clock = clock
         self._chores = chores
         self._watches: list[Watch] = []
-        replica.on_silent.add(self._silent)
+        replica.on_silent.add(self._forget_silent)
         endpoint.expose("push", self._answer_push, changes=True, idempotent=True)
 
     def start(self) -> None:
-        """Renew the watches from now on."""
+        """Start to renew the watches periodically."""
         self._chores.every(RENEW, self._renew_all)
 
     def stop(self) -> None:
-        """End every watch; nothing is told any more, and no copy is kept."""
+        """End all watches without further notifications, and remove their copies."""
         self._watches.clear()
         self._replica.keepsakes.clear()
 
     def watch(self, key: bytes, changed: Changed, keep: bool) -> Watch:
-        """Begin a watch; see ``EntangledNode.watch``."""
+        """Start a watch; see ``EntangledNode.watch``."""
         watch = Watch(key, changed, self._forget_watch, self._own_id, keep)
         self._watches.append(watch)
         watch.view.replace(self._own_id, self._replica.held(key))
@@ -72,13 +72,13 @@ class Subscriber:
         return watch
 
     def refresh(self, watch: Watch) -> None:
-        """Ask every holder of the key now whether it holds anything else than what is believed."""
+        """Ask all replicas of the key now for records that differ from the view."""
         self._chores.fork(self._renew(watch))
 
-    # -- what the node hears ----------------------------------------------------------------------------------------
+    # -- events ----------------------------------------------------------------------------------------
 
     def welcome(self, contact: Contact) -> None:
-        """Hear what a newcomer holds of watched keys."""
+        """Register the watches at a new node that is a replica of their keys."""
         for watch in self._watches:
             if self._overlay.belongs(watch.key, contact):
                 if self._overlay.is_large:
@@ -87,32 +87,32 @@ class Subscriber:
                     self._chores.fork(self._renew_at(watch, contact))
 
     def forget(self, replica: bytes) -> None:
-        """What the node with the id ``replica`` said does not count any more."""
+        """Discard the records reported by the node with the id ``replica``."""
         for watch in list(self._watches):
             if replica in watch.asked:
                 watch.due_at = 0.0
             watch.forget(replica)
             self._settle(watch)
 
-    def _silent(self, owner: bytes) -> None:
-        """Whoever let its lease run out no longer speaks for others either."""
+    def _forget_silent(self, owner: bytes) -> None:
+        """Discard the records reported by a node whose own lease expired."""
         if node_id(owner) != self._own_id:
             self.forget(node_id(owner))
 
     def held_here(self, record: Record) -> None:
-        """This node now holds ``record``."""
+        """Update the watches after this node stored ``record``."""
         for watch in [w for w in self._watches if w.key == record.key]:
             watch.view.add(self._own_id, record)
             self._settle(watch)
 
     def gone_here(self, record: Record) -> None:
-        """This node no longer holds ``record``."""
+        """Update the watches after this node removed ``record``."""
         for watch in [w for w in self._watches if w.key == record.key]:
             watch.view.remove(self._own_id, record.slot)
             self._settle(watch)
 
     def review(self) -> None:
-        """Forget the records that their owners may not write any more."""
+        """Drop the records that their owners may no longer write."""
         for watch in list(self._watches):
             if not all(self._replica.may_stay(record.slot) for record in watch.records):
                 watch.view.retain(self._replica.may_stay)
@@ -121,21 +121,21 @@ class Subscriber:
     # -- inside -----------------------------------------------------------------------------------------------------
 
     def _forget_watch(self, watch: Watch) -> None:
-        """Forget ``watch``; replicas forget it by themselves when it is not renewed."""
+        """Remove ``watch``; replicas drop it when it is not renewed."""
         if watch in self._watches:
             self._watches.remove(watch)
             if watch.keep:
-                self._copy(watch.key)
+                self._update_copies(watch.key)
 
     def _settle(self, watch: Watch) -> None:
         try:
             watch.settle()
         except Exception:
-            self._log.failure("a subscriber of {key} failed", key=watch.key.hex())
+            self._log.failure("the callback of a watch of {key} raised", key=watch.key.hex())
         if watch.keep and watch in self._watches:
-            self._copy(watch.key)
+            self._update_copies(watch.key)
 
-    def _copy(self, key: bytes) -> None:
+    def _update_copies(self, key: bytes) -> None:
         records = {r.slot: r for w in self._watches if w.keep and w.key == key for r in w.records}
         self._replica.keepsakes.keep(key, records.values(), self._clock.seconds())
 
@@ -151,10 +151,10 @@ class Subscriber:
         if watch not in self._watches:
             return
         if self._overlay.is_large:
-            targets = closest(targets, self._own_id, ASKED)  # each watcher has its own ones
+            targets = closest(targets, self._own_id, ASKED)  # watchers choose different replicas
         ids = [c.node_id for c in targets]
         for replica in watch.view.replicas():
-            # Whoever is not asked any more will not tell when its opinion ends.
+            # A replica that is no longer asked does not report removals.
             if replica not in ids and replica != self._own_id:
                 watch.forget(replica)
         self._settle(watch)
@@ -169,20 +169,20 @@ class Subscriber:
             ttl = (LARGE_TTL,) if self._overlay.is_large else ()
             try:
                 answer = await self._overlay.ask(contact, "watch", watch.key, digest, *ttl, changes=True)
-            except Refused:  # too many watch there: what it holds now has to do
+            except Refused:  # too many watchers there: read once instead
                 watch.view.replace(contact.node_id, (await self._reader.pages(contact, watch.key)).records)
                 return self._settle(watch)
             number, page = answer if isinstance(answer, list) and len(answer) == 2 else (0, [[], None])
             if type(number) is not int:
                 return
-            # What was pushed while the answer was under way has moved the count on already.
+            # Pushes that overtook the reply have advanced the number already.
             watch.pushed[contact.node_id] = max(number, watch.pushed.get(contact.node_id, 0) if page is None else 0)
             if page is None:
                 return
             records = (await self._reader.pages(contact, watch.key, page)).records
         except EntangledError:
             if is_first and watch in self._watches:
-                await self._renew_at(watch, contact, is_first=False)  # one that rain swallowed is no death
+                await self._renew_at(watch, contact, is_first=False)  # a lost message alone does not end the watch
             elif watch in self._watches:
                 watch.forget(contact.node_id)
                 self._settle(watch)
@@ -191,23 +191,22 @@ class Subscriber:
             watch.view.replace(contact.node_id, records)
             self._settle(watch)
 
-    def _answer_push(self, peer: Contact, key: bytes, number: int, packed: list[object], gone: list[object]) -> None:
+    def _answer_push(self, peer: Contact, key: bytes, number: int, packed: list[object], removed: list[object]) -> None:
         self._overlay.heard(peer)
-        told = [record for record in map(unpacked, packed) if record is not None]
-        is_lacking = bool(self._replica.certificates.lacking(peer, (record.owner for record in told)))
-        records = [record for record in told if self._reader.is_credible(record, key, peer)]
-        slots = [slot for place in gone if (slot := _slot_of(key, place)) is not None]
+        received = [record for record in map(unpacked, packed) if record is not None]
+        is_lacking = bool(self._replica.certificates.lacking(peer, (record.owner for record in received)))
+        records = [record for record in received if self._reader.is_credible(record, key, peer)]
+        slots = [slot for place in removed if (slot := _slot_of(key, place)) is not None]
         for watch in [w for w in self._watches if w.key == key and peer.node_id in w.asked]:
             last = watch.pushed.get(peer.node_id, 0)
             watch.pushed[peer.node_id] = max(last, number)
             for record in records:
                 watch.view.add(peer.node_id, record)
-            if number > last:  # one that was overtaken may speak of what is there again
+            if number > last:  # an overtaken push may remove a record that is back
                 for slot in slots:
                     watch.view.remove(peer.node_id, slot)
             self._settle(watch)
-            # The last one may be here for the second time.  Of an owner that is unknown here, the certificate is asked
-            # for with the records.
+            # The last push may arrive twice.  A renewal also requests unknown certificates of owners.
             if is_lacking or number not in (last, last + 1):
                 self._chores.fork(self._renew_at(watch, peer))
 

@@ -1,8 +1,8 @@
-"""Watch: what is known of one key, kept up to date by those who hold it.
+"""The view of one watched key, merged from its replicas.
 
-``View`` merges what several replicas say; it is pure.  A slot is present while any replica that still counts says so;
-of several records of one slot the one that beats the others holds.  No node testifies for its own lease, except to
-itself: when a node dies, what it said of itself would otherwise outlive it.
+``View`` merges the reports of several replicas; it is pure.  A slot is present while any valid report contains it; of
+several records of one slot the one that beats the others wins.  Reports about the reporting node's own leased records
+are ignored, except by that node, because they would outlive it.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from middleware.entangled.record import Record, Slot
 Changed = Callable[[list[Record]], None]
 
 
-_OF_NOTHING = hashlib.blake2s(digest_size=8).digest()
+_EMPTY_DIGEST = hashlib.blake2s(digest_size=8).digest()
 
 
 def digest_of(records: Iterable[Record]) -> bytes:
-    """Eight bytes that tell whether two replicas hold the same of a key."""
+    """Return an 8-byte digest of ``records``, independent of their order."""
     records = list(records)
     if not records:
-        return _OF_NOTHING
+        return _EMPTY_DIGEST
     h = hashlib.blake2s(digest_size=8)
     for record in sorted(records, key=lambda r: (r.key, r.owner, r.name)):
         place = record.owner + record.name.encode() + b"\0"
@@ -32,47 +32,47 @@ def digest_of(records: Iterable[Record]) -> bytes:
 
 
 class View:
-    """The opinions of all replicas of one key, merged for the node ``own_id``."""
+    """The reports of all replicas of one key, merged for the node ``own_id``."""
 
     def __init__(self, own_id: bytes = b"") -> None:
         self._own_id = own_id
-        self._opinions: dict[bytes, dict[Slot, Record]] = {}
+        self._reports: dict[bytes, dict[Slot, Record]] = {}
 
     def replace(self, replica: bytes, records: Iterable[Record]) -> None:
-        """``replica`` (a node id) holds exactly ``records``, tombstones included."""
-        self._opinions[replica] = {r.slot: r for r in records}
+        """Set the report of ``replica`` (a node id) to ``records``, tombstones included."""
+        self._reports[replica] = {r.slot: r for r in records}
 
     def add(self, replica: bytes, record: Record) -> None:
-        """``replica`` now holds ``record``."""
-        held = self._opinions.setdefault(replica, {})
+        """Add ``record`` to the report of ``replica``."""
+        held = self._reports.setdefault(replica, {})
         if record.beats(held.get(record.slot)):
             held[record.slot] = record
 
     def remove(self, replica: bytes, slot: Slot) -> None:
-        """``replica`` no longer holds the record of ``slot``: its lease or its time is over there."""
-        self._opinions.get(replica, {}).pop(slot, None)
+        """Remove the record of ``slot``, which expired at ``replica``, from its report."""
+        self._reports.get(replica, {}).pop(slot, None)
 
     def retain(self, is_lawful: Callable[[Slot], bool]) -> None:
-        """Forget the records in those slots of which ``is_lawful`` does not hold, whichever replica has them."""
-        for replica, held in self._opinions.items():
-            self._opinions[replica] = {slot: record for slot, record in held.items() if is_lawful(slot)}
+        """Drop all records in slots for which ``is_lawful`` returns False."""
+        for replica, held in self._reports.items():
+            self._reports[replica] = {slot: record for slot, record in held.items() if is_lawful(slot)}
 
     def forget(self, replica: bytes) -> None:
-        """``replica`` is gone; what it said does not count any more."""
-        self._opinions.pop(replica, None)
+        """Discard the report of ``replica``."""
+        self._reports.pop(replica, None)
 
     def replicas(self) -> list[bytes]:
-        """The node ids whose opinions count, in the order in which they came."""
-        return list(self._opinions)
+        """Return the node ids with a report, in order of arrival."""
+        return list(self._reports)
 
     def digest(self, replica: bytes) -> bytes:
-        """The digest of what ``replica`` is believed to hold."""
-        return digest_of(self._opinions.get(replica, {}).values())
+        """Return the digest of the report of ``replica``."""
+        return digest_of(self._reports.get(replica, {}).values())
 
     def merged(self) -> list[Record]:
-        """What the key holds, without tombstones, in the order of (owner, name)."""
+        """Return the merged records, without tombstones, in the order of (owner, name)."""
         best: dict[Slot, Record] = {}
-        for replica, held in self._opinions.items():
+        for replica, held in self._reports.items():
             for slot, record in held.items():
                 is_own_lease = record.lifetime == "leased" and node_id(record.owner) == replica
                 if is_own_lease and replica != self._own_id:
@@ -84,11 +84,11 @@ class View:
 
 
 class Watch:
-    """One subscription to one key; ``records`` is what is known now.
+    """One subscription to one key; ``records`` are the records known now.
 
-    ``asked`` are the node ids of the replicas that were asked to push; nobody else is believed.  ``keep`` says whether
-    what is known is to be kept in the node's own store as well.  ``pushed`` is the number of each replica's last push,
-    ``due_at`` when the replicas of a large network are asked again.  ``unwatch`` is called at the end.
+    ``asked`` are the node ids of the replicas that were asked to push; pushes of other nodes are ignored.  ``keep``
+    says whether the records are also kept in the node's own store.  ``pushed`` maps replicas to the number of their
+    last push; ``due_at`` is the time of the next renewal in a large network.  ``unwatch`` is called at the end.
     """
 
     def __init__(
@@ -110,19 +110,19 @@ class Watch:
         self._unwatch = unwatch
 
     def settle(self) -> None:
-        """Merge the view again and tell the subscriber, if anything is different from what it knows."""
+        """Merge the view, and notify the subscriber if the records changed."""
         records = self.view.merged()
         if records != self.records:
             self.records = records
             self._changed(list(records))
 
     def forget(self, replica: bytes) -> None:
-        """What ``replica`` says does not count until it is asked again."""
+        """Discard the report of ``replica`` and ignore its pushes until the next request to it."""
         self.asked.discard(replica)
         self.pushed.pop(replica, None)
         self.view.forget(replica)
 
     def stop(self) -> None:
-        """End the subscription; nothing is told any more."""
+        """End the subscription without further notifications."""
         self._changed = lambda _records: None
         self._unwatch(self)

@@ -1,1 +1,1 @@
-"""What the data store is used through: publishing by keyword, and the tuple space in which each tuple is taken once."""
+"""Interfaces to the stored data: publishing by keyword, and a tuple space in which each tuple is taken once."""

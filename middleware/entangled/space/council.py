@@ -1,6 +1,6 @@
-"""Council: the conversation of a claimant with the members that are pinned in a tuple.
+"""The proposer's requests to the council of a tuple, the members named in its record.
 
-It claims, confirms and sees a decision through to its end; it knows no node, only a way to ask a member.
+It claims tuples, confirms takes, and completes unfinished decisions; it depends only on a function that asks a member.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from middleware.entangled.quorum.round import Round, Tally
 from middleware.entangled.space.posting import Member, Posted
 from middleware.entangled.space.take_codec import unpack_reply
 
-RESOLVE_LEASE = 2.0
+RESOLVE_LEASE_S = 2.0
 
 Ask = Callable[[Contact, str, tuple[object, ...]], "Deferred[Any]"]
-"""Ask a member: (contact, method, arguments)."""
+"""Calls a method of a member: (contact, method, arguments)."""
 
 
 class Council:
-    """How one claimant talks with councils; ``chores`` are its own, and end with it."""
+    """The requests of one claimant to councils; ``chores`` ends with the claimant."""
 
     def __init__(self, ask: Ask, clock: IReactorTime, rng: random.Random, chores: Background) -> None:
         self._ask = ask
@@ -39,44 +39,44 @@ class Council:
         self._chores = chores
 
     async def claim(self, posted: Sequence[Posted], ballot: Ballot, lease: float) -> list[Outcome]:
-        """One round of claims for tuples of one key and council; what was not won is given free again."""
+        """Run one round of claims for tuples of one key and council; release the others afterwards."""
         outcomes = await self.renew(posted, ballot, lease)
         lost = [p for p, o in zip(posted, outcomes, strict=True) if o.result not in (Result.WON, Result.DECIDED)]
         if lost:
-            # What a minority promised must not keep a luckier claimant waiting.
+            # The promises of a minority must not delay another claimant.
             self.release(lost, ballot)
         return outcomes
 
     async def renew(self, posted: Sequence[Posted], ballot: Ballot, lease: float) -> list[Outcome]:
-        """One round of claims under a ballot that has won before; where it fails, what is left of the lease stays."""
+        """Run one round of claims under a ballot that has won before; if it fails, the present lease stays valid."""
         return await self._round(posted, "decree.claim", Event.PREPARE, ballot, lease)
 
     async def confirm(self, posted: Sequence[Posted], ballot: Ballot, value: bytes) -> list[Outcome]:
-        """One round of confirmation, of tuples of one key and council."""
+        """Run one round that confirms takes of tuples of one key and council."""
         return await self._round(posted, "decree.confirm", Event.ACCEPT, ballot, value)
 
     def release(self, posted: Sequence[Posted], ballot: Ballot) -> None:
-        """Give leases back, as far as the members can be heard; the others let them run out."""
+        """Release the leases at all reachable members; at the others they expire."""
         for member in posted[0].council:
-            asked = self._ask(member.contact, "decree.release", _arguments(posted, member, ballot))
-            asked.addErrback(lambda failure: failure.trap(EntangledError))
+            request = self._ask(member.contact, "decree.release", _arguments(posted, member, ballot))
+            request.addErrback(lambda failure: failure.trap(EntangledError))
 
     async def resolve(self, posted: Posted, bidder: bytes, value: bytes | None, counter: int = 0) -> bytes | None:
-        """See a decree through, whatever it takes, and return what was decided.
+        """Retry until the council has decided about a tuple, and return the decided value.
 
-        ``value`` is proposed where nothing else was; with None nothing is, and None is returned where nothing was
-        accepted.  Ends only when the council has decided; raises ``NotRunning`` when the claimant itself is stopped.
+        Proposes ``value`` if no other value was accepted.  With None it proposes none, and returns None if no value was
+        accepted.  Raises ``NotRunning`` when the claimant is stopped.
         """
 
         async def prepare(ballot: Ballot) -> Outcome:
-            return (await self.claim([posted], ballot, RESOLVE_LEASE))[0]
+            return (await self.claim([posted], ballot, RESOLVE_LEASE_S))[0]
 
         async def accept(ballot: Ballot, chosen: bytes) -> Outcome:
             return (await self.confirm([posted], ballot, chosen))[0]
 
         async def sleep(seconds: float) -> None:
             if self._chores.is_stopped:
-                raise NotRunning("the tuple space was stopped while a take was being confirmed")
+                raise NotRunning("the tuple space stopped during the confirmation of a take")
             await self._chores.sleep(seconds)
 
         ballot = Ballot(counter + 1, bidder)
@@ -86,12 +86,12 @@ class Council:
         return decided  # type: ignore[no-any-return]
 
     async def _round(
-        self, posted: Sequence[Posted], method: str, event: Event, ballot: Ballot, last: object
+        self, posted: Sequence[Posted], method: str, event: Event, ballot: Ballot, argument: object
     ) -> list[Outcome]:
         council = posted[0].council
 
         def ask(place: int) -> Deferred[Any]:
-            return self._ask(council[place].contact, method, (*_arguments(posted, council[place], ballot), last))
+            return self._ask(council[place].contact, method, (*_arguments(posted, council[place], ballot), argument))
 
         def decode(place: int, answer: object) -> list[Reply | None] | None:
             replies = answer if isinstance(answer, list) and len(answer) == len(posted) else None
@@ -103,5 +103,5 @@ class Council:
 
 
 def _arguments(posted: Sequence[Posted], member: Member, ballot: Ballot) -> tuple[object, ...]:
-    places = [one.place.packed() for one in posted]
+    places = [each.place.packed() for each in posted]
     return (posted[0].place.key, places, member.incarnation, ballot.counter, ballot.proposer)

@@ -1,6 +1,7 @@
-"""Keeper: keeps the records of a space in order; it notes what was taken, and uses the slots of what is over again.
+"""Maintenance of a node's records in a tuple space: notes of taken tuples, and reuse of their slots.
 
-Nothing depends on it for safety: the council knows who took a tuple.  A note only spares readers a tuple that is gone.
+Safety does not depend on it, since the council knows the taker of a tuple.  A note only saves readers from trying a
+tuple that is taken.
 """
 
 from __future__ import annotations
@@ -24,91 +25,91 @@ from middleware.entangled.space.posting import (
 )
 from middleware.entangled.space.template import Tuple
 
-GRACE = 2.0
-"""Seconds that whoever took a tuple has to note that, before one who found out does it instead."""
-TIDY = 30.0
-HURRY = 2.0
-"""Seconds until slots are tidied where they run up faster than that."""
-SLACK = 8
-"""Slots in use that are never worth a hurry."""
+GRACE_S = 2.0
+"""Seconds that a taker has to note its take, before another node that detected it writes the note instead."""
+TIDY_INTERVAL_S = 30.0
+EARLY_TIDY_S = 2.0
+"""Seconds before the slots are tidied if their number grows quickly."""
+MIN_SLOTS = 8
+"""Slots in use up to which they are not tidied early."""
 
 
 @dataclass
-class _Ledger:
-    """The own slots under one key: what they hold, and which may be used again."""
+class _Slots:
+    """The own slots under one key: their contents, and which may be reused."""
 
     holds: dict[str, Place] = field(default_factory=dict)
     free: list[str] = field(default_factory=list)
     orphans: frozenset[str] = frozenset()
-    enough: int = SLACK
-    is_hurried: bool = False
+    tidy_above: int = MIN_SLOTS
+    is_tidy_scheduled: bool = False
 
 
 class Keeper:
-    """The slots of one node in the keys of one space."""
+    """Maintains the slots of one node in one space."""
 
     def __init__(self, node: Peer, rng: random.Random, chores: Background) -> None:
         self._node = node
         self._rng = rng
         self._chores = chores
-        # A former life may have left tuples in its slots, which must not be written over.
-        self._life = rng.randbytes(4).hex()
-        self._made = 0
-        self._ledgers: dict[bytes, _Ledger] = {}
-        self._doubtful: dict[Place, bytes] = {}
+        # Slot names are unique to this run: tuples of earlier runs must not be overwritten.
+        self._run_id = rng.randbytes(4).hex()
+        self._slot_count = 0
+        self._slots_by_key: dict[bytes, _Slots] = {}
+        self._unconfirmed: dict[Place, bytes] = {}
 
     @property
     def keys(self) -> list[bytes]:
-        """The keys that are kept in order here."""
-        return list(self._ledgers)
+        """The keys maintained here."""
+        return list(self._slots_by_key)
 
     def look_after(self, key: bytes) -> None:
-        """Keep what this node has under ``key`` in order from now on."""
-        if key not in self._ledgers:
-            if not self._ledgers:
-                self._chores.every(TIDY, self._tidy_all)
-            self._ledgers[key] = _Ledger()
+        """Start to maintain this node's slots under ``key``."""
+        if key not in self._slots_by_key:
+            if not self._slots_by_key:
+                self._chores.every(TIDY_INTERVAL_S, self._tidy_all)
+            self._slots_by_key[key] = _Slots()
 
     async def post(self, key: bytes, fields: Tuple, council: list[Member], ttl: float | None) -> None:
-        """Put a tuple, and take it out after ``ttl`` seconds where nobody took it; fails as ``Peer.put``."""
+        """Put a tuple, and remove it after ``ttl`` seconds if it was not taken; fails as ``Peer.put`` does."""
         name = self._slot(key)
         place = Place(key, self._node.identity.public, name, self._rng.randbytes(MARK_BYTES))
-        self._ledgers[key].holds[name] = place
+        self._slots_by_key[key].holds[name] = place
         if ttl is not None:
             self._chores.later(ttl, self._withdraw, place)
         await self._node.put(key, name, packed_tuple(place.mark, fields, council))
 
     async def note(self, place: Place, taker: bytes) -> None:
-        """Write down that the tuple of ``place`` was taken; readers do not see it any more."""
+        """Write a note that the tuple of ``place`` was taken, which hides it from readers."""
         name = self._slot(place.key)
-        self._ledgers[place.key].holds[name] = place
+        self._slots_by_key[place.key].holds[name] = place
         await self._node.put(place.key, name, packed_taken(place, taker))
 
     def doubt(self, place: Place, taker: bytes) -> None:
-        """Look later whether whoever took the tuple has noted that."""
-        if not self._doubtful:
-            self._chores.later(GRACE, lambda: self._chores.fork(self._dispel()))
-        self._doubtful[place] = taker
+        """Check after ``GRACE_S`` seconds whether ``taker`` has noted its take, and note it otherwise."""
+        if not self._unconfirmed:
+            self._chores.later(GRACE_S, lambda: self._chores.fork(self._check_unconfirmed()))
+        self._unconfirmed[place] = taker
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
     def _slot(self, key: bytes) -> str:
-        """The name of an own slot under ``key`` that holds nothing any more."""
+        """Return the name of a free own slot under ``key``."""
         self.look_after(key)
-        ledger = self._ledgers[key]
-        if len(ledger.holds) >= ledger.enough and not ledger.is_hurried:
-            ledger.is_hurried = True
-            self._chores.later(HURRY, lambda: self._chores.fork(self._hurried(key)))
-        if ledger.free:
-            return ledger.free.pop()
-        self._made += 1
-        return f"{self._life}/{self._made:x}"
+        slots = self._slots_by_key[key]
+        if len(slots.holds) >= slots.tidy_above and not slots.is_tidy_scheduled:
+            slots.is_tidy_scheduled = True
+            self._chores.later(EARLY_TIDY_S, lambda: self._chores.fork(self._tidy_early(key)))
+        if slots.free:
+            return slots.free.pop()
+        self._slot_count += 1
+        return f"{self._run_id}/{self._slot_count:x}"
 
     def _withdraw(self, place: Place) -> None:
-        ledger = self._ledgers[place.key]
-        if ledger.holds.get(place.name) == place:
-            del ledger.holds[place.name]
-            ledger.free.append(place.name)
+        slots = self._slots_by_key[place.key]
+        if slots.holds.get(place.name) == place:
+            del slots.holds[place.name]
+            slots.free.append(place.name)
             self._remove(place.key, place.name)
 
     def _remove(self, key: bytes, name: str) -> None:
@@ -117,52 +118,52 @@ class Keeper:
 
         self._chores.fork(removed())
 
-    async def _dispel(self) -> None:
-        doubtful, self._doubtful = self._doubtful, {}
+    async def _check_unconfirmed(self) -> None:
+        doubtful, self._unconfirmed = self._unconfirmed, {}
         for key in dict.fromkeys(place.key for place in doubtful):
-            for one in standing(await self._node.get(key))[0]:
-                if one.place in doubtful:
-                    self._chores.fork(self.note(one.place, doubtful[one.place]))
+            for item in standing(await self._node.get(key))[0]:
+                if item.place in doubtful:
+                    self._chores.fork(self.note(item.place, doubtful[item.place]))
 
     def _tidy_all(self) -> None:
-        for key in self._ledgers:
+        for key in self._slots_by_key:
             self._chores.fork(self._tidy(key, is_thorough=True))
 
-    async def _hurried(self, key: bytes) -> None:
+    async def _tidy_early(self, key: bytes) -> None:
         try:
             await self._tidy(key)
         finally:
-            self._ledgers[key].is_hurried = False
+            self._slots_by_key[key].is_tidy_scheduled = False
 
     async def _tidy(self, key: bytes, is_thorough: bool = False) -> None:
-        """Free the own slots under ``key`` that hold what is over: tuples that were taken, and notes about such.
+        """Free the own slots under ``key`` with taken tuples, or with notes about tuples that no longer exist.
 
-        A slot is free only where the very thing was seen in it that was put there last, for replicas may lag behind.  A
-        tuple that is not seen once may only have been missed; its note goes when it is not seen twice.  Slots that were
-        free the last time as well are emptied by a thorough round, so that they cost readers nothing.
+        A slot is freed only after this node has read back its last write, because replicas may lag.  A note is freed
+        only when its tuple was missing in two reads, because one read may miss it.  A thorough run also removes the
+        records of slots that were free in the last run already, to make reads smaller.
         """
-        ledger = self._ledgers[key]
-        idle = set(ledger.free)
+        slots = self._slots_by_key[key]
+        idle = set(slots.free)
         own = self._node.identity.public
         records: list[Record] = await self._node.get(key)
-        said = {record.slot: posting(record) for record in records}
-        there = {one.place for one in said.values() if isinstance(one, Posted)}
-        taken = {one.place for one in said.values() if isinstance(one, Taken)}
+        postings = {record.slot: posting(record) for record in records}
+        present = {item.place for item in postings.values() if isinstance(item, Posted)}
+        taken = {item.place for item in postings.values() if isinstance(item, Taken)}
         orphans = []
-        for slot, one in said.items():
-            is_orphan = isinstance(one, Taken) and one.place not in there
-            is_over = one is not None and one.place in taken and not isinstance(one, Taken)
-            if slot.owner != own or one is None or not (is_orphan or is_over):
+        for slot, item in postings.items():
+            is_orphan = isinstance(item, Taken) and item.place not in present
+            is_over = item is not None and item.place in taken and not isinstance(item, Taken)
+            if slot.owner != own or item is None or not (is_orphan or is_over):
                 continue
             name = slot.name
             if is_orphan:
                 orphans.append(name)
-            if is_orphan and name not in ledger.orphans:
+            if is_orphan and name not in slots.orphans:
                 continue
-            if ledger.holds.get(name) == one.place:
-                del ledger.holds[name]
-                ledger.free.append(name)
-            elif not name.startswith(self._life) or (is_thorough and name in idle and name in ledger.free):
+            if slots.holds.get(name) == item.place:
+                del slots.holds[name]
+                slots.free.append(name)
+            elif not name.startswith(self._run_id) or (is_thorough and name in idle and name in slots.free):
                 self._remove(key, name)
-        ledger.orphans = frozenset(orphans)
-        ledger.enough = 2 * len(ledger.holds) + SLACK
+        slots.orphans = frozenset(orphans)
+        slots.tidy_above = 2 * len(slots.holds) + MIN_SLOTS

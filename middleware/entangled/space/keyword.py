@@ -1,8 +1,8 @@
-"""Keyword: publish data under a name, and find it by the words of that name.
+"""Publishing of data under a name, and search by the words of that name.
 
-Each word has an index under a key of its own; an entry is a record in the publisher's own slot, so two who publish
-under one word at the same moment both stay.  An entry carries the whole name, so a search for several words reads the
-index of one of them.
+Each word has an index under its own key; an entry is a record in the publisher's slot, so concurrent publications under
+one word do not conflict.  An entry carries the whole name, so a search for several words reads the index of one of
+them.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class BadName(LocalError):
 
 @dataclass(frozen=True)
 class Match:
-    """Something that was published: its name, its publisher's public key, and the data."""
+    """One publication: its name, its publisher's public key, and the data."""
 
     name: str
     owner: bytes
@@ -37,19 +37,19 @@ class Match:
 
 
 def words(text: str) -> list[str]:
-    """The different words of ``text`` in their order: runs of letters and digits, without regard to case."""
+    """Return the distinct words of ``text``, in order and case-folded: runs of letters and digits."""
     folded = unicodedata.normalize("NFKC", text).casefold()
     parted = "".join(letter if letter.isalnum() else " " for letter in folded)
     return list(dict.fromkeys(parted.split()))
 
 
 def keyword_key(word: str) -> bytes:
-    """The key of the index of ``word``."""
+    """Return the key of the index of ``word``."""
     return hashed_key(f"keyword/{word}")
 
 
 def matches(records: Iterable[Record], wanted: Sequence[str]) -> list[Match]:
-    """What ``records`` of an index offer to whoever wants all of the words ``wanted``."""
+    """Return the publications in the index ``records`` whose names have all words ``wanted``."""
     return [
         Match(record.name, record.owner, record.value)
         for record in records
@@ -58,16 +58,16 @@ def matches(records: Iterable[Record], wanted: Sequence[str]) -> list[Match]:
 
 
 class Keywords:
-    """Keyword publishing over one node."""
+    """Publishing and search by keyword through one node."""
 
     def __init__(self, node: Records) -> None:
         self._node = node
 
     def publish(self, name: str, data: bytes) -> Deferred[None]:
-        """Publish ``data`` under every word of ``name``, or replace what this node published under that name.
+        """Publish ``data`` under every word of ``name``, replacing this node's earlier publication of that name.
 
-        Raises ``BadName`` and ``TooLarge`` at once; fails with ``NoAnswer`` where the index of some word could not be
-        reached (those that could have it).
+        Raises ``BadName`` and ``TooLarge`` at once; fails with ``NoAnswer`` if the index of a word is unreachable; the
+        other indexes may have the entry.
         """
         if len(data) > MAX_VALUE:
             raise TooLarge(f"{name}: data of {len(data)} bytes; at most {MAX_VALUE} can be published under a name")
@@ -77,29 +77,29 @@ class Keywords:
         return Deferred.fromCoroutine(_all(name, [self._node.put(key, name, data) for key in keys]))
 
     def remove(self, name: str) -> Deferred[None]:
-        """Take back what this node published under ``name``; fails as ``publish`` does."""
+        """Remove this node's publication under ``name``; fails as ``publish`` does."""
         keys = [keyword_key(word) for word in _checked(name)]
         return Deferred.fromCoroutine(_all(name, [self._node.remove(key, name) for key in keys]))
 
     def search(self, keywords: str | Sequence[str]) -> Deferred[list[Match]]:
-        """What was published under all of ``keywords`` (several, or one text of them); raises ``BadName``."""
+        """Fire with the publications with all ``keywords`` (a text or a sequence); raise ``BadName``."""
         wanted = _checked(keywords if isinstance(keywords, str) else " ".join(keywords))
         # The longest word is likely the rarest, and its index the shortest to read.
         found = self._node.get(keyword_key(max(wanted, key=len)))
         return found.addCallback(matches, wanted)
 
     def watch_keyword(self, word: str, changed: Callable[[list[Match]], None]) -> Watch:
-        """Call ``changed`` with all matches of ``word`` whenever they differ, until ``stop()`` of what is returned."""
+        """Call ``changed`` with all matches of ``word`` on each change, until ``stop()`` of the returned watch."""
         wanted = _checked(word)
-        told: list[Match] = []
+        reported: list[Match] = []
 
-        def tell(records: list[Record]) -> None:
+        def report(records: list[Record]) -> None:
             found = matches(records, wanted)
-            if found != told:
-                told[:] = found
+            if found != reported:
+                reported[:] = found
                 changed(found)
 
-        return self._node.watch(keyword_key(max(wanted, key=len)), tell)
+        return self._node.watch(keyword_key(max(wanted, key=len)), report)
 
 
 def _checked(text: str) -> list[str]:
@@ -110,9 +110,9 @@ def _checked(text: str) -> list[str]:
 
 
 async def _all(name: str, work: list[Deferred[Stored]]) -> None:
-    done = await first(len(work), [_awaited(one) for one in work])
+    done = await first(len(work), [_awaited(each) for each in work])
     if len(done) < len(work):
-        raise NoAnswer(f"{name}: the index of {len(work) - len(done)} of its {len(work)} words did not answer")
+        raise NoAnswer(f"{name}: the indexes of {len(work) - len(done)} of its {len(work)} words did not answer")
 
 
 async def _awaited(work: Deferred[Stored]) -> int:

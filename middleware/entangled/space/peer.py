@@ -1,6 +1,6 @@
-"""The interface through which a tuple space uses a node; ``EntangledNode`` implements it.
+"""The interface of a node to its tuple spaces; ``EntangledNode`` implements it.
 
-The space reads and writes records, finds the nodes closest to a key and asks them; it needs to know nothing else.
+A space reads and writes records, finds the nodes closest to a key and calls their methods.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from middleware.entangled.space.seat import Seat
 
 
 class Asking(Protocol):
-    """An endpoint that asks peers."""
+    """An endpoint that calls methods of peers."""
 
     def ask(self, contact: Contact, method: str, *arguments: object, changes: bool = False) -> Deferred[Any]:
-        """Ask ``contact``; the Deferred fires with its answer, or fails with an ``EntangledError``."""
+        """Call ``method`` of ``contact``; fire with its answer, or fail with an ``EntangledError``."""
 
 
 class Records(Protocol):
@@ -38,14 +38,14 @@ class Records(Protocol):
         """Read all records under ``key``."""
 
     def watch(self, key: bytes, changed: Changed) -> Watch:
-        """Call ``changed`` with all records of ``key`` whenever they differ."""
+        """Call ``changed`` with all records of ``key`` on each change."""
 
     def refresh(self, watch: Watch) -> None:
         """Poll the replicas of a watched key now."""
 
 
 class Peer(Records, Protocol):
-    """A node that takes tuples and sits in councils."""
+    """A node that takes tuples and is a member of councils."""
 
     @property
     def identity(self) -> Identity:
@@ -65,10 +65,10 @@ class Peer(Records, Protocol):
 
     @property
     def seat(self) -> Seat:
-        """Its acceptor of takes."""
+        """Its acceptor for takes."""
 
     def find_node(self, node_id: bytes) -> Deferred[list[Contact]]:
         """Look up the k live nodes closest to ``node_id``."""
 
     def newest(self, contact: Contact) -> Contact:
-        """Return the node of ``contact`` with the last address it was heard from."""
+        """Return ``contact`` with the last address it was observed at."""

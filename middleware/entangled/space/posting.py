@@ -1,6 +1,6 @@
-"""Posting: how a tuple, and the note that it was taken, stand in records; pure.
+"""The records of a tuple space: tuples, and notes that a tuple was taken; pure.
 
-A publisher uses its slots again once their tuples are taken, so a tuple is known by its slot and a mark of its own.
+A publisher reuses the slots of taken tuples, so a tuple is identified by its slot and a random mark.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _POSTED, _TAKEN = 1, 2
 
 
 class Place(NamedTuple):
-    """Which tuple: the slot it stands in, and its mark, which no other tuple of that slot has."""
+    """The identity of a tuple: its slot and its mark, unique among the tuples of that slot."""
 
     key: bytes
     owner: bytes
@@ -34,17 +34,17 @@ class Place(NamedTuple):
 
     @property
     def slot(self) -> Slot:
-        """Where its record lives."""
+        """The slot of its record."""
         return Slot(self.key, self.owner, self.name)
 
     def packed(self) -> list[object]:
-        """The place as it stands in a message or record beside its key."""
+        """Return the fields for a message or record that contains the key separately."""
         return [self.owner, self.name, self.mark]
 
 
 @dataclass(frozen=True)
 class Member:
-    """A council member, and in which life it was asked to be one: a member that has lost its memory has no say."""
+    """A council member and its incarnation at its enrolment; a member that lost its votes has another one."""
 
     contact: Contact
     incarnation: bytes
@@ -52,7 +52,7 @@ class Member:
 
 @dataclass(frozen=True)
 class Posted:
-    """A tuple as its publisher put it, with the council that decides who takes it."""
+    """A tuple with the council that decides about its taker."""
 
     place: Place
     fields: Tuple
@@ -61,7 +61,7 @@ class Posted:
 
 @dataclass(frozen=True)
 class Taken:
-    """A note in a slot of whoever took the tuple of ``place``, or of whoever found out that it was taken."""
+    """A note that ``taker`` took the tuple of ``place``, written by the taker or by a node that detected it."""
 
     place: Place
     taker: bytes
@@ -71,26 +71,26 @@ Standing = tuple[list[Posted], dict[Place, Taken]]
 
 
 def space_key(space: str, arity: int) -> bytes:
-    """The key under which the tuples of one space with ``arity`` fields are kept."""
+    """Return the key of the tuples of one space with ``arity`` fields."""
     return hashed_key(f"tuples/{space}/{arity}")
 
 
 def packed_tuple(mark: bytes, fields: Tuple, council: Sequence[Member]) -> bytes:
-    """The value of the record of a tuple."""
+    """Return the value of a tuple's record."""
     members = [[*member.contact.packed(), member.incarnation] for member in council]
     return bytes(msgpack.packb([_POSTED, mark, list(fields), members]))
 
 
 def packed_taken(place: Place, taker: bytes) -> bytes:
-    """The value of the record that notes that a tuple was taken."""
+    """Return the value of a note that a tuple was taken."""
     return bytes(msgpack.packb([_TAKEN, place.packed(), taker]))
 
 
 def posting(record: Record) -> Posted | Taken | None:
-    """What a record of a space says, or None where it says nothing lawful."""
+    """Parse a record of a space; None if it is invalid."""
     try:
         fields = msgpack.unpackb(record.value or b"", strict_map_key=True, max_ext_len=0)
-    except Exception:  # foreign code on foreign bytes
+    except Exception:  # msgpack on bytes from peers
         return None
     match fields:
         case [1, bytes(mark), values, list(members)] if len(mark) == MARK_BYTES and 0 < len(members) <= MAX_COUNCIL:
@@ -108,12 +108,12 @@ def posting(record: Record) -> Posted | Taken | None:
 
 
 def is_name(value: object) -> bool:
-    """Whether ``value`` may be the name of a taker."""
+    """Return whether ``value`` may be the name of a taker."""
     return type(value) is bytes and 0 < len(value) <= MAX_NAME_BYTES
 
 
 def place_unpacked(key: bytes, fields: object) -> Place | None:
-    """The place under ``key`` that ``Place.packed`` made, or None where the fields cannot be one."""
+    """Parse the fields of ``Place.packed`` for ``key``; None if they are invalid."""
     match fields:
         case [bytes(owner), str(name), bytes(mark)] if (
             len(owner) == 32 and 0 < len(name) <= MAX_NAME and len(mark) == MARK_BYTES
@@ -123,28 +123,28 @@ def place_unpacked(key: bytes, fields: object) -> Place | None:
 
 
 class Reader:
-    """Reads the postings of one key again and again; what has not changed is not decoded again."""
+    """Parses the records of one key repeatedly, with a cache for unchanged records."""
 
     def __init__(self) -> None:
         self._known: dict[tuple[bytes, bytes], Posted | Taken | None] = {}
 
     def standing(self, records: Iterable[Record]) -> Standing:
-        """The tuples in ``records`` that nobody took, in their order, and what was taken."""
+        """Return the tuples in ``records`` that were not taken, in order, and the notes of taken ones."""
         before, self._known = self._known, {}
         posted: list[Posted] = []
         taken: dict[Place, Taken] = {}
         for record in records:
             mark = (record.owner, record.signature)
-            said = self._known[mark] = before[mark] if mark in before else posting(record)
-            if isinstance(said, Posted):
-                posted.append(said)
-            elif said is not None:
-                taken[said.place] = said
+            parsed = self._known[mark] = before[mark] if mark in before else posting(record)
+            if isinstance(parsed, Posted):
+                posted.append(parsed)
+            elif parsed is not None:
+                taken[parsed.place] = parsed
         return [one for one in posted if one.place not in taken], taken
 
 
 def standing(records: Iterable[Record]) -> Standing:
-    """The tuples in ``records`` that nobody took, in their order, and what was taken."""
+    """Return the tuples in ``records`` that were not taken, in order, and the notes of taken ones."""
     return Reader().standing(records)
 
 

@@ -1,8 +1,8 @@
-"""Seat: what a node does as a member of councils; it votes, remembers how it voted, and decides nothing.
+"""The acceptor of a node for takes of tuples: answers claims, confirmations and releases.
 
-Votes are kept as notes in the node's store, so they survive a restart.  A node that finds none starts a new life with
-a new incarnation: tuples name the incarnation that they count upon, so a member that has lost its memory keeps silent
-about everything it may have voted on before.
+It stores its votes as notes in the node's store, so they survive a restart.  A node without notes starts with a new
+incarnation.  Tuples name the incarnation of each member, so a member that lost its votes does not vote about tuples
+that it may have voted on before.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from middleware.entangled.space.posting import INCARNATION_BYTES, Place, Posted,
 from middleware.entangled.space.take_codec import CODEC, MAX_LEASE, is_counter, pack_reply
 
 MAX_PLACES = 12
-"""Decrees in one question: more would not fit into a datagram."""
-UNSETTLED = 3.0
-"""Seconds after which a member looks after a confirmation of which it has not heard the end."""
+"""Tuples in one request: more would not fit into a datagram."""
+UNSETTLED_S = 3.0
+"""Seconds after which a member completes a confirmation that it has not seen the end of."""
 TERMS = Terms(finish=1.0, must_prepare=True)
 _INCARNATION: Final = "decree/incarnation"
 
@@ -36,17 +36,17 @@ Answers = list[object] | Deferred[list[object]]
 
 
 class Exposing(Protocol):
-    """What lets peers call a method; an ``Endpoint`` does."""
+    """Makes methods callable by peers; ``Endpoint`` implements it."""
 
     def expose(self, name: str, answer: Callable[..., object], changes: bool = False) -> None:
         """Let peers call ``answer(peer, *arguments)`` under ``name``."""
 
 
 class Seat:
-    """A node's seat in every council that it is called to.
+    """The acceptor of one node for all councils that it is a member of.
 
-    ``written`` may be set to a callable whose Deferred fires when everything noted so far is on disk; answers then wait
-    for it, and not even a loss of power can make the node forget what it has said.
+    ``written`` may be set to a function that returns a Deferred which fires when all notes are on disk; answers then
+    wait for it, so that even a power failure loses no vote that was sent.
     """
 
     def __init__(self, endpoint: Exposing, store: Store, clock: IReactorTime, rng: random.Random) -> None:
@@ -63,50 +63,50 @@ class Seat:
         endpoint.expose("decree.release", self.answer_release, changes=True)
 
     def __len__(self) -> int:
-        """How many votes are remembered."""
+        """Return the number of stored votes."""
         return len(self._votes.log)
 
     @property
     def incarnation(self) -> bytes:
-        """In which life this node is; another one means that it has lost its votes."""
+        """The random id of this node's set of votes; it changes if the node loses them."""
         self.sit()
         return self._life
 
     def sit(self) -> None:
-        """Take up the votes of an earlier life, or begin a new one."""
+        """Load the votes of an earlier run, or start a new incarnation."""
         if self._acceptor is None:
             self._acceptor = self._load()
 
     def vote(self, place: Place) -> Register | None:
-        """How this node has voted about the tuple of ``place``, if it has."""
+        """Return this node's vote about the tuple of ``place``, or None."""
         return self._votes.log.get(place)
 
     def unsettled(self) -> list[Posted]:
-        """The tuples whose take was accepted here a while ago, and of which it has not heard since how that ended.
+        """Return the tuples with a take accepted here that has had no known end for ``UNSETTLED_S`` seconds.
 
-        Each is named again after ``UNSETTLED`` seconds, until ``settle`` is called.
+        Each is returned again after ``UNSETTLED_S`` seconds, until ``settle`` is called.
         """
         now = self._clock.seconds()
-        late = [place for place, since in self._unsettled.items() if since + UNSETTLED <= now]
+        late = [place for place, since in self._unsettled.items() if since + UNSETTLED_S <= now]
         found = []
         for place in late:
             record = self._store.slot(place.slot)
-            said = posting(record) if record is not None else None
-            if isinstance(said, Posted) and said.place == place:
+            parsed = posting(record) if record is not None else None
+            if isinstance(parsed, Posted) and parsed.place == place:
                 self._unsettled[place] = now
-                found.append(said)
+                found.append(parsed)
             else:
-                self.settle(place)  # taken out, or kept by others, who will see to it
+                self.settle(place)  # removed, or stored at other nodes, which complete it
         return found
 
     def settle(self, place: Place) -> None:
-        """Take note that the decree on ``place`` has come to its end."""
+        """Note that the decision about ``place`` is complete."""
         self._unsettled.pop(place, None)
 
-    # -- what claimants ask -----------------------------------------------------------------------------------------
+    # -- requests of claimants --------------------------------------------------------------------------------------
 
     def answer_enrol(self, peer: Contact) -> bytes:
-        """ENROL: agree to be a member of councils, in this incarnation."""
+        """ENROL: agree to be a member of councils; return the incarnation."""
         return self.incarnation
 
     def answer_claim(
@@ -119,12 +119,12 @@ class Seat:
         taker: bytes,
         lease: float,
     ) -> Answers:
-        """CLAIM: promise the ballot for each of ``places`` under ``key`` and lease it, or say why not."""
-        wanted, ballot = self._question(key, places, incarnation, counter, taker)
+        """CLAIM: promise and lease the ballot for each of ``places`` under ``key``, or reply with the reason."""
+        wanted, ballot = self._parse_request(key, places, incarnation, counter, taker)
         if not 0.0 < lease <= MAX_LEASE:
             raise Refused(f"a lease lasts more than 0 and at most {MAX_LEASE:.0f} seconds")
         now = self._clock.seconds()
-        return self._answer(Event.PREPARE, [self._claimed(place, ballot, float(lease), now) for place in wanted])
+        return self._answer(Event.PREPARE, [self._prepare(place, ballot, float(lease), now) for place in wanted])
 
     def answer_confirm(
         self,
@@ -136,10 +136,10 @@ class Seat:
         taker: bytes,
         value: bytes,
     ) -> Answers:
-        """CONFIRM: accept ``value`` as the taker of each of ``places`` under the ballot, or say why not."""
-        wanted, ballot = self._question(key, places, incarnation, counter, taker)
+        """CONFIRM: accept ``value`` as the taker of each of ``places`` under the ballot, or reply with the reason."""
+        wanted, ballot = self._parse_request(key, places, incarnation, counter, taker)
         if not is_name(value):
-            raise Refused("decree.confirm takes the name of a taker")
+            raise Refused("decree.confirm needs the name of a taker")
         now, acceptor = self._clock.seconds(), self._votes
         replies = [acceptor.accept(place, FIRST, ballot, value, now) for place in wanted]
         for place, reply in zip(wanted, replies, strict=True):
@@ -150,25 +150,25 @@ class Seat:
     def answer_release(
         self, peer: Contact, key: bytes, places: list[object], incarnation: bytes, counter: int, taker: bytes
     ) -> Answers:
-        """RELEASE: end the lease of the ballot on each of ``places``."""
-        wanted, ballot = self._question(key, places, incarnation, counter, taker)
+        """RELEASE: end the ballot's lease on each of ``places``."""
+        wanted, ballot = self._parse_request(key, places, incarnation, counter, taker)
         now = self._clock.seconds()
         replies = [self._votes.release(place, ballot, now) for place in wanted]
         return [pack_reply(reply, Event.RELEASE) for reply in replies]
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
-    def _question(
+    def _parse_request(
         self, key: bytes, places: list[object], incarnation: bytes, counter: int, taker: bytes
     ) -> tuple[list[Place], Ballot]:
-        """What every question names: tuples, and the ballot that it is asked under; raises ``Refused``."""
+        """Check the common arguments of a request; return the tuples and the ballot; raise ``Refused``."""
         if incarnation != self.incarnation:
-            raise Refused("this member has lost its votes since it was called to that council")
+            raise Refused("this member has lost its votes since it joined that council")
         if len(key) != KEY_BYTES or not 0 < len(places) <= MAX_PLACES:
-            raise Refused(f"a question names a key and 1 to {MAX_PLACES} places")
+            raise Refused(f"a request names a key and 1 to {MAX_PLACES} places")
         wanted = [place for place in (place_unpacked(key, fields) for fields in places) if place is not None]
         if len(wanted) < len(places) or len(set(wanted)) < len(wanted):
-            raise Refused("a place is an owner, a name and a mark, and a question names each place once")
+            raise Refused("a place is an owner, a name and a mark, and a request names each place once")
         if not (is_counter(counter) and is_name(taker)):
             raise Refused("a ballot is a positive number and the name of a taker")
         return wanted, Ballot(counter, taker)
@@ -179,24 +179,24 @@ class Seat:
         assert self._acceptor is not None
         return self._acceptor
 
-    def _claimed(self, place: Place, ballot: Ballot, lease: float, now: float) -> Reply:
+    def _prepare(self, place: Place, ballot: Ballot, lease: float, now: float) -> Reply:
         if self.vote(place) is None and self._is_over(place):
             return Reply(Kind.OUTBID, ballot)
         reply = self._votes.prepare(place, FIRST, ballot, 0.0, now, lease)
         if reply.kind is Kind.QUIET:
-            raise Refused(f"this member has {MAX_REGISTERS} votes to remember and takes no more; try another tuple")
+            raise Refused(f"this member has room for {MAX_REGISTERS} votes and all are in use; try another tuple")
         return reply
 
     def _is_over(self, place: Place) -> bool:
-        """Whether the publisher has taken this tuple out, or put another one in its slot."""
+        """Return whether the publisher has removed this tuple or reused its slot."""
         record = self._store.slot(place.slot)
         if record is None:
             return False
-        said = posting(record)
-        return not isinstance(said, Posted) or said.place != place
+        parsed = posting(record)
+        return not isinstance(parsed, Posted) or parsed.place != place
 
     def _may_forget(self, place: Place, vote: Register, now: float) -> bool:
-        """Whether a vote can harm nothing any more: a lease that has ended, or a tuple that is no more."""
+        """Return whether a vote is no longer needed: its lease has expired, or its tuple does not exist."""
         return (vote.accepted == NONE and vote.reserved_until <= now) or self._is_over(place)
 
     def _answer(self, event: Event, replies: list[Reply]) -> Answers:

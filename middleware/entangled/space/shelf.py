@@ -1,7 +1,7 @@
-"""Shelf: the tuples of one space and arity as a node sees them while somebody waits for them.
+"""The tuples of one space and arity, kept up to date while calls wait for them.
 
-Pushes of the watch wake who waits; in between the holders are asked now and then whether they hold anything else, so
-that the loss of those that had promised a push costs less than a second.
+Pushes of a watch wake the waiting calls.  In addition the node polls the replicas, so that the loss of
+the pushing replicas delays a call by less than a second.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from middleware.entangled.space.peer import Peer
 from middleware.entangled.space.posting import Posted, Reader
 
 POLL = 0.7
-"""Seconds; a poll and the answers to it must fit into the one second that a wake-up may take."""
-LINGER = 5.0
-"""Seconds that a watch outlives the last who waited: who gets in a loop does not subscribe each time."""
+"""Seconds between two polls; a poll and its answers must fit into the second that a wake-up may take."""
+LINGER_S = 5.0
+"""Seconds that a watch outlives its last waiting call, so that calls in a loop share one subscription."""
 
 
 class Shelf:
-    """What stands under ``key``; ``posted`` are the tuples that nobody took, as far as is known."""
+    """The tuples under ``key``; ``posted`` are those not known to be taken."""
 
     def __init__(self, node: Peer, key: bytes, chores: Background) -> None:
         self.key = key
@@ -32,66 +32,66 @@ class Shelf:
         self._chores = chores
         self._reader = Reader()
         self._watch: Watch | None = None
-        self._waiting = 0
-        self._is_visited = False
+        self._wait_count = 0
+        self._was_visited = False
         self._sleepers: dict[Deferred[None], None] = {}
         self._stop_polling: Callable[[], None] = lambda: None
         self._stop_lingering: Callable[[], None] = lambda: None
 
     @property
     def is_open(self) -> bool:
-        """Whether the shelf is kept up to date now."""
+        """Whether the tuples are kept up to date at present."""
         return self._watch is not None
 
     def enter(self) -> None:
-        """Wait here; ``leave`` must follow."""
-        self._waiting += 1
+        """Register a waiting call; ``leave`` must follow."""
+        self._wait_count += 1
         self._stop_lingering()
         if self._watch is None:
             self._watch = self._node.watch(self.key, self._changed)
             self._changed(self._watch.records)
-        if self._waiting == 1:
+        if self._wait_count == 1:
             self._stop_polling = self._chores.later(POLL, self._poll)
 
     def leave(self) -> None:
-        """Wait no longer."""
-        self._waiting -= 1
-        if not self._waiting:
+        """Unregister a waiting call."""
+        self._wait_count -= 1
+        if not self._wait_count:
             self._stop_polling()
-            self._stop_lingering = self._chores.later(LINGER, self.close)
+            self._stop_lingering = self._chores.later(LINGER_S, self.close)
 
     def visit(self) -> None:
-        """Look in: for who comes again soon the shelf is kept up to date, which spares reading it each time."""
-        if self._is_visited:
+        """Note a call that does not wait; from the second within ``LINGER_S`` on, the tuples are kept up to date."""
+        if self._was_visited:
             self.enter()
             self.leave()
         else:
-            self._is_visited = True
-            self._chores.later(LINGER, self._forget_visit)
+            self._was_visited = True
+            self._chores.later(LINGER_S, self._forget_visit)
 
     def close(self) -> None:
-        """End the watch; the next who enters starts it again."""
+        """End the watch; the next call that waits starts it again."""
         if self._watch is not None:
             self._watch.stop()
             self._watch = None
 
     async def sleep(self, seconds: float | None) -> None:
-        """Return at the next change, when woken, or after ``seconds``."""
+        """Return at the next change, at ``wake``, or after ``seconds``."""
         woken: Deferred[None] = Deferred()
         self._sleepers[woken] = None
-        rest = self._chores.later(seconds, self._rouse, woken) if seconds is not None else lambda: None
+        rest = self._chores.later(seconds, self._wake_one, woken) if seconds is not None else lambda: None
         await woken
         rest()
 
     def wake(self) -> None:
-        """Rouse everybody who sleeps."""
+        """Wake all calls that sleep."""
         for woken in list(self._sleepers):
-            self._rouse(woken)
+            self._wake_one(woken)
 
     def _forget_visit(self) -> None:
-        self._is_visited = False
+        self._was_visited = False
 
-    def _rouse(self, woken: Deferred[None]) -> None:
+    def _wake_one(self, woken: Deferred[None]) -> None:
         if woken in self._sleepers:
             del self._sleepers[woken]
             woken.callback(None)

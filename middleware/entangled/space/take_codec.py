@@ -1,4 +1,4 @@
-"""How decisions about tuples stand in messages (``decree.*``) and in notes of the store; pure."""
+"""Encoding of decisions about tuples in messages (``decree.*``) and in notes of the store; pure."""
 
 from __future__ import annotations
 
@@ -22,33 +22,33 @@ _KINDS = {code: kind for kind, code in _OTHERS.items()}
 
 
 def is_counter(value: object) -> bool:
-    """Whether ``value`` may be the counter of a ballot."""
+    """Return whether ``value`` may be the counter of a ballot."""
     return type(value) is int and 0 < value < MAX_COUNTER
 
 
 def is_lease(value: object) -> bool:
-    """Whether ``value`` may be what is left of a lease, in seconds."""
+    """Return whether ``value`` may be the remaining seconds of a lease."""
     return type(value) is float and 0.0 <= value <= MAX_LEASE
 
 
 def pack_reply(reply: Reply, event: Event) -> list[object]:
-    """The reply to ``event`` as it stands in a message."""
+    """Encode the reply to ``event`` for a message."""
     code = _OTHERS.get(reply.kind, _GRANTED[event])
     return [code, reply.promised.counter, min(reply.remaining, MAX_LEASE), _pack_accepted(reply.accepted, reply.value)]
 
 
 def unpack_reply(fields: object, event: Event) -> Reply | None:
-    """The reply to ``event`` that ``pack_reply`` made, or None where the fields cannot be one."""
+    """Decode the fields of ``pack_reply``; None if they are invalid."""
     if not isinstance(fields, list) or len(fields) != 4:
         return None
     code, counter, remaining, accepted = fields
     if type(code) is not int or not (is_counter(counter) or (type(counter) is int and counter == 0)):
         return None
     kind = Kind.GRANTED if code == _GRANTED[event] else _KINDS.get(code)
-    told = _unpack_accepted(accepted)
-    if kind is None or not is_lease(remaining) or told is None:
+    decoded = _unpack_accepted(accepted)
+    if kind is None or not is_lease(remaining) or decoded is None:
         return None
-    return Reply(kind, Ballot(counter, b""), remaining=remaining, accepted=told[0], value=told[1])
+    return Reply(kind, Ballot(counter, b""), remaining=remaining, accepted=decoded[0], value=decoded[1])
 
 
 def _bucket_of(key: Place) -> str:
@@ -66,7 +66,7 @@ def _pack(registers: dict[Place, Register]) -> bytes:
 def _unpack(noted: bytes) -> tuple[dict[Place, Register], bool]:
     try:
         rows = msgpack.unpackb(noted, strict_map_key=True, max_ext_len=0)
-    except Exception:  # foreign code, and bytes that may have rotted
+    except Exception:  # msgpack on bytes that may be corrupt
         return {}, False
     pairs = [_unpack_row(row) for row in rows] if isinstance(rows, list) else [None]
     return dict(pair for pair in pairs if pair is not None), None not in pairs
@@ -84,10 +84,10 @@ def _unpack_row(row: object) -> tuple[Place, Register] | None:
     if not isinstance(row, list) or len(row) != 6 or not isinstance(row[0], bytes) or len(row[0]) != KEY_BYTES:
         return None
     key, fields, counter, taker, lease, accepted = row
-    place, told = place_unpacked(key, fields), _unpack_accepted(accepted)
-    if place is None or told is None or not (is_counter(counter) and is_name(taker) and is_lease(lease)):
+    place, decoded = place_unpacked(key, fields), _unpack_accepted(accepted)
+    if place is None or decoded is None or not (is_counter(counter) and is_name(taker) and is_lease(lease)):
         return None
-    ballot, value = told
+    ballot, value = decoded
     ceiling = Ceiling(0.0, 1)
     return place, Register(ceiling, promised=Ballot(counter, taker), accepted=ballot, value=value, reserve=lease)
 
@@ -97,7 +97,7 @@ def _pack_accepted(ballot: Ballot, value: object) -> list[object] | None:
 
 
 def _unpack_accepted(fields: object) -> tuple[Ballot, bytes | None] | None:
-    """The ballot and value that were accepted, ``NONE`` where nothing was, or None where the fields cannot be some."""
+    """Decode the accepted ballot, ``NONE`` if there is none, and value; None if the fields are invalid."""
     if fields is None:
         return NONE, None
     if not isinstance(fields, list) or len(fields) != 3:

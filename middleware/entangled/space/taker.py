@@ -1,4 +1,4 @@
-"""Taker: claims and takes tuples for a space, and completes what others began and left undone."""
+"""Claims and takes of tuples, and completion of takes that other nodes left unfinished."""
 
 from __future__ import annotations
 
@@ -27,25 +27,25 @@ from middleware.entangled.space.seat import MAX_PLACES
 from middleware.entangled.space.template import Template, Tuple
 
 MARGIN = 0.02
-"""Share by which two clocks of correct nodes may drift apart (1 % each)."""
-ENROLLED = 5.0
-"""Seconds for which the council of a key is not asked again whether it is there."""
-ENROLMENTS = 3
-"""Times that the nodes closest to a key are looked up and asked until a council is whole."""
-REPAIR = 2.0
-LEASED_RETRY = 0.5
-CONTEST_RETRY = (0.02, 0.08)
-SILENT_RETRY = (0.2, 0.6)
+"""Relative drift between the clocks of two correct nodes (1 % each)."""
+ENROLLED_S = 5.0
+"""Seconds that the enrolled council of a key is reused."""
+MAX_ENROLMENTS = 3
+"""Attempts to look up and enrol the nodes closest to a key."""
+REPAIR_INTERVAL_S = 2.0
+LEASED_RETRY_S = 0.5
+CONTEST_RETRY_S = (0.02, 0.08)
+SILENT_RETRY_S = (0.2, 0.6)
 MAX_REMEMBERED = 10_000
-OVER = "the claim was confirmed or released before"
+OVER = "the claim has already been confirmed or released"
 
 
 class ClaimLost(Refused):
-    """The tuple was taken by another; what was done about it must not count."""
+    """Another claimant took the tuple; the caller must discard its work on it."""
 
 
 class Wait:
-    """One call that waits for a tuple; ``is_over`` when it was answered, cancelled or timed out."""
+    """A call that waits for a tuple; ``is_over`` when it was answered, cancelled or timed out."""
 
     def __init__(self) -> None:
         self.is_over = False
@@ -53,7 +53,7 @@ class Wait:
         self.on_end = Listeners[[]]()
 
     def end(self) -> None:
-        """Let whoever works for this call know that nobody waits any more."""
+        """End the call, and notify ``on_end``."""
         if not self.is_over:
             self.is_over = True
             self.on_end()
@@ -61,10 +61,10 @@ class Wait:
 
 @dataclass
 class Claim:
-    """The sole right to take a tuple, until ``deadline`` (seconds of the own clock); then others may claim it.
+    """The exclusive right to take a tuple until ``deadline`` (seconds of the node's clock).
 
-    Confirm it when the work is done.  Whoever does neither that nor renew loses it, which is how a tuple comes back
-    from a taker that died.
+    Confirm the claim when the work is done.  A claim that is neither confirmed nor renewed expires, so that the tuple
+    of a failed taker becomes available again.
     """
 
     posted: Posted
@@ -80,29 +80,29 @@ class Claim:
         return self.posted.fields
 
     def confirm(self) -> Deferred[Tuple]:
-        """Take the tuple for good; fires when the council has decided.
+        """Take the tuple permanently; fires when the council has decided.
 
-        Fails with ``ClaimLost`` where it decided for another, which can happen only after the deadline.  Cancelled
-        meanwhile, the tuple is put back should the council decide for us.
+        Fails with ``ClaimLost`` if the council decided for another claimant, which is possible only after the deadline.
+        If the call is cancelled and the council decides for it, the tuple is put back.
         """
         return fail(ClaimLost(OVER)) if self.is_over else self._taker.confirm(self)
 
     def release(self) -> None:
-        """Give the tuple back at once."""
+        """Make the tuple available to others at once."""
         if not self.is_over:
             self.is_over = True
             self._taker.release(self)
 
     def renew(self) -> Deferred[None]:
-        """Hold the tuple for another lease from now; fails with ``ClaimLost``, or ``NoAnswer`` while time is left."""
+        """Renew the lease from now; fails with ``ClaimLost``, or with ``NoAnswer`` while the lease is valid."""
         return fail(ClaimLost(OVER)) if self.is_over else Deferred.fromCoroutine(self._taker.renew(self))
 
 
 class Taker:
-    """The takes of one node in one space; ``held`` are the tuples it holds, ``gone`` those it knows to be taken.
+    """The takes of one node in one space; ``held`` are its claimed tuples, ``gone`` the tuples known to be taken.
 
     ``freed`` is called when this node gives up a tuple that it held or failed to claim, ``put_back`` with a tuple
-    that was confirmed to a call for which nobody waits any more.
+    that was confirmed for a call that has ended.
     """
 
     def __init__(
@@ -131,42 +131,42 @@ class Taker:
         self._counters: dict[Place, int] = {}
         self._not_before: dict[Place, float] = {}
         self._members: dict[bytes, tuple[float, list[Member]]] = {}
-        chores.every(REPAIR, self._repair)
+        chores.every(REPAIR_INTERVAL_S, self._complete_unsettled)
 
     # -- councils ---------------------------------------------------------------------------------------------------
 
     async def enrolled(self, key: bytes) -> list[Member]:
-        """The council for a tuple that is put now: the live nodes closest to ``key``, this one among them.
+        """Return the council for a new tuple: the live nodes closest to ``key``, this one among them.
 
-        It is smaller than it should be only where the network is; fails with ``NoAnswer`` where nodes that are there
-        keep silent, for a council of two or one would not survive the loss of anybody.
+        It is smaller than configured only if the network is.  Fails with ``NoAnswer`` if other nodes do not answer,
+        because a council of one or two would not survive the loss of a member.
         """
         until, members = self._members.get(key, (0.0, []))
         if until > self._clock.seconds():
             return members
         members = []
-        for _ in range(ENROLMENTS):
+        for _ in range(MAX_ENROLMENTS):
             near = closest([*await self._node.find_node(key), self._node.contact], key, 2 * self._size)
             agreed = {member.contact.node_id for member in members}
             left, silent = [contact for contact in near if contact.node_id not in agreed], 0
             while left and len(members) < self._size:
-                asked, left = left[: self._size - len(members)], left[self._size - len(members) :]
-                answers = await first(len(asked), [self._enrol(contact) for contact in asked])
+                requested, left = left[: self._size - len(members)], left[self._size - len(members) :]
+                answers = await first(len(requested), [self._enrol(contact) for contact in requested])
                 members += [member for member in answers if member is not None]
-                silent += len(asked) - len(answers)
+                silent += len(requested) - len(answers)
             if members and (len(members) == self._size or not silent):
-                self._members[key] = (self._clock.seconds() + ENROLLED, members)
+                self._members[key] = (self._clock.seconds() + ENROLLED_S, members)
                 return members
-        raise NoAnswer(f"{len(members)} of {self._size} nodes agree to be in the council of a tuple, others are silent")
+        raise NoAnswer(f"{len(members)} of {self._size} nodes agreed to be in the council of a tuple; try again")
 
     async def _enrol(self, contact: Contact) -> Member | None:
-        """The node as a member, or None where it refuses."""
+        """Ask the node to be a member; return None if it refuses."""
         try:
             incarnation = await self._ask(contact, "decree.enrol", ())
         except Refused:
             return None
-        lawful = isinstance(incarnation, bytes) and len(incarnation) == INCARNATION_BYTES
-        return Member(contact, incarnation) if lawful else None
+        is_valid = isinstance(incarnation, bytes) and len(incarnation) == INCARNATION_BYTES
+        return Member(contact, incarnation) if is_valid else None
 
     def _ask(self, contact: Contact, method: str, arguments: tuple[object, ...]) -> Deferred[Any]:
         node = self._node
@@ -181,31 +181,31 @@ class Taker:
     def candidates(
         self, posted: Sequence[Posted], template: Template, is_patient: bool = True
     ) -> tuple[list[Posted], float | None]:
-        """The tuples to try now, in this node's own order, and the seconds until another may be tried.
+        """Return the tuples to try now, in this node's order, and the seconds until another may be tried.
 
-        Every node has another order, so that takers seldom fight for the same tuple.  What was missed comes after what
-        was not tried, the longest ago first: else two tuples whose councils are gone would keep the rest from us.
+        The order differs between nodes, so that takers rarely compete for a tuple.  Tuples that this node failed to
+        claim come last, the oldest failure first, so that tuples with an unreachable council do not block the others.
         """
         now = self._clock.seconds()
         open_ = [p for p in posted if p.place not in self.gone and p.place not in self.held]
         fitting = [p for p in open_ if template.matches(p.fields)]
         ready = [p for p in fitting if not is_patient or self._not_before.get(p.place, 0.0) <= now]
         ready.sort(key=lambda p: (self._not_before.get(p.place, 0.0), zlib.crc32(p.place.mark, self._seed), p.place))
-        moments = [self._not_before[p.place] for p in fitting if p.place in self._not_before]
-        return ready, min((max(0.001, moment - now) for moment in moments), default=None)
+        times = [self._not_before[p.place] for p in fitting if p.place in self._not_before]
+        return ready, min((max(0.001, time - now) for time in times), default=None)
 
     def batch(self, posted: Sequence[Posted], most: int) -> list[Posted]:
-        """The first of ``posted`` and as many with the same council as fit into one question."""
-        alike = [one for one in posted if one.council == posted[0].council]
-        return alike[: min(most, MAX_PLACES)]
+        """Return the first of ``posted`` and others with the same council, as many as fit into one request."""
+        same_council = [one for one in posted if one.council == posted[0].council]
+        return same_council[: min(most, MAX_PLACES)]
 
     # -- taking -----------------------------------------------------------------------------------------------------
 
     async def claim(self, posted: Sequence[Posted], lease: float) -> tuple[list[Claim], bool]:
-        """Claim tuples of one council; what was won, and whether too little of the council was to be heard."""
+        """Claim tuples of one council; return the claims won, and whether too few members answered."""
         places = [one.place for one in posted]
         self.held.update(places)
-        ballot = Ballot(1 + max(self._counters.get(place, 0) for place in places), self._bidder())
+        ballot = Ballot(1 + max(self._counters.get(place, 0) for place in places), self._new_bidder())
         sent = self._clock.seconds()
         outcomes = await self._council.claim(posted, ballot, lease)
         claims = []
@@ -216,19 +216,19 @@ class Taker:
                 claims.append(Claim(one, ballot, lease, deadline, self))
                 self._expire(claims[-1])
             elif outcome.result is Result.WON:
-                # A taker died while it was confirming: what it began is completed in its name.
+                # A taker failed during its confirmation: complete it in that taker's name.
                 self._chores.fork(self._complete(one, outcome.value))
             else:
-                self._missed(one.place, outcome)
+                self._note_failed_claim(one.place, outcome)
         _trim(self._counters)
         _trim(self._not_before)
         return claims, any(outcome.result is Result.SILENT for outcome in outcomes)
 
     async def decide(self, claims: Sequence[Claim], wait: Wait | None = None) -> list[bool]:
-        """Confirm claims of one ballot and say of each whether the tuple is ours.
+        """Confirm claims of one ballot; return for each whether this node took the tuple.
 
-        Goes on until the council has decided, for nobody else may take meanwhile what it may have given to us; what
-        is ours when nobody waits any more is put back.
+        Retries until the council has decided, because no other node can take a tuple that may have been given to this
+        one.  A tuple won after the call has ended is put back.
         """
         if not claims:
             return []
@@ -237,23 +237,23 @@ class Taker:
         ballot = claims[0].ballot
         outcomes = await self._council.confirm([claim.posted for claim in claims], ballot, ballot.proposer)
         pairs = zip(claims, outcomes, strict=True)
-        works = [Deferred.fromCoroutine(self._settled(claim, outcome, wait)) for claim, outcome in pairs]
+        works = [Deferred.fromCoroutine(self._finish_decision(claim, outcome, wait)) for claim, outcome in pairs]
         try:
             return await gatherResults(works, consumeErrors=True)
-        except FirstError as error:  # the node stops
+        except FirstError as error:  # the node is stopping
             error.subFailure.raiseException()
 
-    async def _settled(self, claim: Claim, outcome: Outcome, wait: Wait | None) -> bool:
+    async def _finish_decision(self, claim: Claim, outcome: Outcome, wait: Wait | None) -> bool:
         taker, place = claim.ballot.proposer, claim.posted.place
         winner = taker if outcome.result is Result.WON else outcome.value
         if winner is None:
             counter = max(claim.ballot.counter, outcome.counter)
             winner = await self._council.resolve(claim.posted, taker, taker, counter) or taker
-        self._over(place, winner)
+        self._forget_taken(place, winner)
         if winner != taker:
             self._keeper.doubt(place, winner)
             return False
-        with suppress(EntangledError):  # the node goes on to spread the note, and the council knows without it
+        with suppress(EntangledError):  # the node republishes the note later, and the council knows the taker
             await self._keeper.note(place, winner)
         if wait is not None and wait.is_over:
             self._put_back(claim.fields)
@@ -263,43 +263,43 @@ class Taker:
         place = posted.place
         self.held.add(place)
         try:
-            winner = await self._council.resolve(posted, self._bidder(), value, self._counters.get(place, 0))
+            winner = await self._council.resolve(posted, self._new_bidder(), value, self._counters.get(place, 0))
         finally:
             self.held.discard(place)
         if winner is not None:
-            self._over(place, winner)
+            self._forget_taken(place, winner)
             self._keeper.doubt(place, winner)
             self._node.seat.settle(place)
         else:
             self._freed(place)
 
-    def _missed(self, place: Place, outcome: Outcome) -> None:
+    def _note_failed_claim(self, place: Place, outcome: Outcome) -> None:
         now = self._clock.seconds()
         if outcome.result is Result.DECIDED and outcome.value is not None:
-            self._over(place, outcome.value)
+            self._forget_taken(place, outcome.value)
             self._keeper.doubt(place, outcome.value)
         elif outcome.result is Result.HELD:
-            self._not_before[place] = now + min(outcome.remaining, LEASED_RETRY) + self._rng.uniform(*CONTEST_RETRY)
+            self._not_before[place] = now + min(outcome.remaining, LEASED_RETRY_S) + self._rng.uniform(*CONTEST_RETRY_S)
         elif outcome.result is Result.OUTBID:
-            self._not_before[place] = now + self._rng.uniform(*CONTEST_RETRY)
+            self._not_before[place] = now + self._rng.uniform(*CONTEST_RETRY_S)
         else:
-            self._not_before[place] = now + self._rng.uniform(*SILENT_RETRY)
-        # Another call of this node may sleep because this one held the tuple: nothing else would wake it.
+            self._not_before[place] = now + self._rng.uniform(*SILENT_RETRY_S)
+        # Wake other calls of this node that wait because this one held the tuple.
         self._free(place)
 
-    def _over(self, place: Place, winner: bytes) -> None:
+    def _forget_taken(self, place: Place, winner: bytes) -> None:
         self.held.discard(place)
         self._counters.pop(place, None)
         self._not_before.pop(place, None)
         self.gone[place] = winner
         _trim(self.gone)
 
-    def _bidder(self) -> bytes:
-        """A name under which nobody has ever bid, not even this node in an earlier life."""
+    def _new_bidder(self) -> bytes:
+        """Return a new unique name for a ballot of this node."""
         return self._node.identity.node_id + self._rng.randbytes(8)
 
-    def _repair(self) -> None:
-        """See to what this node accepted as a council member and never heard the end of."""
+    def _complete_unsettled(self) -> None:
+        """Complete takes that this node accepted as a council member without seeing their end."""
         late = [posted for posted in self._node.seat.unsettled() if posted.place.key in self._keeper.keys]
         for key in dict.fromkeys(posted.place.key for posted in late):
             _, taken = standing(self._node.store.get(key))
@@ -309,10 +309,10 @@ class Taker:
                 elif posted.place.key == key and posted.place not in self.held:
                     self._chores.fork(self._complete(posted, None))
 
-    # -- claims that somebody holds ---------------------------------------------------------------------------------
+    # -- methods of a claim -----------------------------------------------------------------------------------------
 
     def confirm(self, claim: Claim) -> Deferred[Tuple]:
-        """Have the council decide on a claim; what it decides for a call that was cancelled is put back."""
+        """Confirm a claim; if the call is cancelled and the council decides for it, put the tuple back."""
         wait = Wait()
 
         async def work() -> None:
@@ -322,28 +322,28 @@ class Taker:
             if won:
                 wait.deferred.callback(claim.fields)
             else:
-                wait.deferred.errback(ClaimLost("the tuple was taken by another after the lease on it had ended"))
+                wait.deferred.errback(ClaimLost("another node took the tuple after the claim had expired"))
 
         self._chores.fork(work())
         return wait.deferred
 
     def release(self, claim: Claim) -> None:
-        """Give up a claim, and tell its council."""
+        """Give up a claim, and notify its council."""
         self._council.release([claim.posted], claim.ballot)
         self._free(claim.posted.place)
 
     async def renew(self, claim: Claim) -> None:
-        """Lease the tuple of a claim anew; raises ``ClaimLost`` and ``NoAnswer``."""
+        """Renew the lease of a claim; raises ``ClaimLost`` and ``NoAnswer``."""
         sent = self._clock.seconds()
         [outcome] = await self._council.renew([claim.posted], claim.ballot, claim.lease)
         if outcome.result is Result.SILENT:
-            raise NoAnswer("too little of the council answers to renew the lease")
+            raise NoAnswer("too few council members answer to renew the claim; try again before its deadline")
         if outcome.result is not Result.WON or outcome.value is not None:
-            raise ClaimLost("the tuple was claimed by another after the lease on it had ended")
+            raise ClaimLost("another node claimed the tuple after the claim had expired")
         claim.deadline = sent + claim.lease * (1.0 - MARGIN)
 
     def _expire(self, claim: Claim) -> None:
-        """Give up ``claim`` when its time is over, unless it was renewed."""
+        """Give up ``claim`` at its deadline, unless it was renewed."""
         left = claim.deadline - self._clock.seconds()
         if claim.is_over:
             return
@@ -358,6 +358,6 @@ class Taker:
 
 
 def _trim(remembered: dict[Place, Any]) -> None:
-    """Forget the oldest above the limit; whatever is forgotten the council knows."""
+    """Drop the oldest entries above the limit; the council still knows them."""
     while len(remembered) > MAX_REMEMBERED:
         del remembered[next(iter(remembered))]

@@ -1,8 +1,8 @@
-"""Template: what a tuple may hold, and which tuples a template matches; pure.
+"""Tuples and templates: their valid fields, and matching; pure.
 
 A tuple is a sequence of at most ``MAX_FIELDS`` values.  A template has as many fields, each a value, ``ANY``, a type
-(``int``, ``float``, ``str``, ``bytes``, ``bool``) or a predicate made by ``where``.  Kinds are strict: ``1``, ``1.0``
-and ``True`` are three values, and only predicates that compare take ``int`` and ``float`` for one kind.
+(``int``, ``float``, ``str``, ``bytes``, ``bool``) or a predicate made by ``where``.  Types are strict: ``1``, ``1.0``
+and ``True`` are three values; only predicates that compare numbers treat ``int`` and ``float`` alike.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Tuple = tuple[Value, ...]
 
 MAX_FIELDS = 32
 MAX_TUPLE = 600
-"""Bytes of a tuple or template as msgpack; a record must hold it beside its council."""
+"""Maximum bytes of a tuple or template in msgpack; a record also has to hold the council."""
 MAX_CHOICES = 32
 OPERATORS = ("<", "<=", ">", ">=", "!=", "in", "prefix")
 _COMPARE: Final[dict[str, Callable[[Any, Any], bool]]] = {"<": lt, "<=": le, ">": gt, ">=": ge}
@@ -30,12 +30,12 @@ _TYPES: Final = (bool, bytes, float, int, str)
 
 
 class BadTuple(LocalError):
-    """A tuple or template holds what it cannot hold; the message says which field and what is lawful."""
+    """A field of a tuple or template is invalid; the message names it and the valid ones."""
 
 
 @dataclass(frozen=True)
 class Wildcard:
-    """The field that everything fits; ``ANY`` is all that is needed of it."""
+    """A template field that matches any value; ``ANY`` is its only instance."""
 
 
 ANY: Final = Wildcard()
@@ -43,13 +43,13 @@ ANY: Final = Wildcard()
 
 @dataclass(frozen=True)
 class Predicate:
-    """A test of one field; ``where`` makes and checks it."""
+    """A test of one field, made by ``where``."""
 
     operator: str
     operand: Value | Tuple
 
     def holds(self, value: Value) -> bool:
-        """Whether ``value`` passes; what cannot be compared with the operand does not, except under ``!=``."""
+        """Return whether ``value`` passes; a value of another type does not, except under ``!=``."""
         operand = self.operand
         if isinstance(operand, tuple):
             return any(_same(value, choice) for choice in operand)
@@ -68,25 +68,25 @@ Field = Value | Wildcard | type | Predicate
 
 @dataclass(frozen=True)
 class Template:
-    """The fields that a tuple must have; ``template_of`` makes and checks it."""
+    """A pattern for tuples, made by ``template_of``."""
 
     fields: tuple[Field, ...]
 
     @property
     def arity(self) -> int:
-        """How many fields a matching tuple has."""
+        """The number of fields."""
         return len(self.fields)
 
     def matches(self, values: Sequence[Value]) -> bool:
-        """Whether the tuple ``values`` has what this template asks for."""
+        """Return whether the tuple ``values`` matches."""
         return len(values) == len(self.fields) and all(map(_fits, self.fields, values))
 
 
 def where(operator: str, operand: Value | Sequence[Value]) -> Predicate:
-    """A predicate over one field: ``where("<", 5)``, ``where("in", ("a", "b"))``, ``where("prefix", "job-")``.
+    """Return a predicate for one field: ``where("<", 5)``, ``where("in", ("a", "b"))``, ``where("prefix", "job-")``.
 
-    The operators are ``<  <=  >  >=  !=  in  prefix``.  Raises ``BadTuple`` for others, and for operands that they
-    cannot take.
+    The operators are ``<  <=  >  >=  !=  in  prefix``.  Raises ``BadTuple`` for other operators and for invalid
+    operands.
     """
     if isinstance(operand, Sequence) and not isinstance(operand, str | bytes):
         operand = tuple(operand)
@@ -105,22 +105,22 @@ def where(operator: str, operand: Value | Sequence[Value]) -> Predicate:
 
 
 def template_of(fields: Sequence[Field] | Template) -> Template:
-    """The template with these fields; raises ``BadTuple`` or ``TooLarge`` with the field that is wrong."""
+    """Return the template with these fields; raise ``BadTuple`` or ``TooLarge``."""
     if isinstance(fields, Template):
         return fields
     _check_count(fields)
     for place, field in enumerate(fields):
-        lawful = (
+        is_valid = (
             isinstance(field, Wildcard | Predicate) or (isinstance(field, type) and field in _TYPES) or is_value(field)
         )
-        if not lawful:
+        if not is_valid:
             raise BadTuple(f"field {place}: {field!r} is no value, ANY, type or predicate")
     _check_size([_packed_field(field) for field in fields])
     return Template(tuple(fields))
 
 
 def tuple_of(fields: Sequence[Value]) -> Tuple:
-    """The tuple with these fields; raises ``BadTuple`` or ``TooLarge`` with the field that is wrong."""
+    """Return the tuple with these fields; raise ``BadTuple`` or ``TooLarge``."""
     _check_count(fields)
     for place, field in enumerate(fields):
         if not is_value(field):
@@ -131,7 +131,7 @@ def tuple_of(fields: Sequence[Value]) -> Tuple:
 
 
 def is_value(value: object) -> TypeGuard[Value]:
-    """Whether ``value`` may stand in a tuple; NaN may not, for it would equal nothing."""
+    """Return whether ``value`` may be in a tuple; NaN may not, because it equals no value."""
     if value is None or isinstance(value, bool):
         return True
     if type(value) is int:
@@ -144,14 +144,14 @@ def is_value(value: object) -> TypeGuard[Value]:
 
 
 def tuple_unpacked(fields: object) -> Tuple:
-    """The tuple in a decoded message or record; raises ``Malformed`` and nothing else."""
+    """Return the tuple in a decoded message or record; raise only ``Malformed``."""
     if not isinstance(fields, list) or not 0 < len(fields) <= MAX_FIELDS or not all(map(is_value, fields)):
         raise Malformed("not a tuple")
     return tuple(fields)
 
 
 def _packed_field(field: Field) -> list[object]:
-    """The field as it counts against ``MAX_TUPLE``."""
+    """Encode the field to measure its size."""
     if isinstance(field, Wildcard):
         return [1]
     if isinstance(field, type):
@@ -189,7 +189,7 @@ def _check_count(fields: Sequence[object]) -> None:
 def _check_size(fields: list[object]) -> None:
     size = len(msgpack.packb(fields))
     if size > MAX_TUPLE:
-        raise TooLarge(f"tuple of {size} bytes; at most {MAX_TUPLE} fit, so put the bulk under a key of its own")
+        raise TooLarge(f"a tuple of {size} bytes; at most {MAX_TUPLE} fit: store large values under their own key")
 
 
 def _is_text(text: str) -> bool:

@@ -1,7 +1,7 @@
-"""TupleSpace: put, get, read and claim tuples by template; each is confirmed to at most one taker.
+"""The tuple space: put, get, read and claim tuples by template; at most one taker gets each tuple.
 
-A tuple is a record of its publisher, with the council that decides who takes it; ``decree`` has the agreement,
-``taker`` the conversation that leads to it.  What a call waits for is described in ``docs/reference/tuple-space.md``.
+A tuple is a record of its publisher that names the council which decides about its taker; ``seat`` has the acceptors,
+``taker`` the proposers.  ``docs/reference/tuple-space.md`` describes the conditions that calls wait for.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ from middleware.entangled.space.taker import Claim, Taker, Wait
 from middleware.entangled.space.template import Field, Template, Tuple, Value, template_of, tuple_of
 
 COUNCIL = 3
-GET_LEASE = 2.0
-PASSES = 4
-PASS_PAUSE = (0.01, 0.05)
+GET_LEASE_S = 2.0
+MAX_PASSES = 4
+PASS_PAUSE_S = (0.01, 0.05)
 
 T = TypeVar("T")
 
 
 class NoTuple(WeatherError):
-    """No matching tuple came within the time-out."""
+    """No matching tuple was found before the timeout."""
 
 
 class TupleSpace:
-    """The tuples of one space, seen from one node.
+    """The tuples of one space, used through one node.
 
-    ``council`` nodes decide about each tuple that is put here: more survive the loss of more of them (3 of 1, 5 of 2)
-    and cost more questions.  Spaces of different names never see each other's tuples.
+    ``council`` is the number of nodes that decide about each tuple put here: 3 survive the loss of 1, and 5 of 2, at
+    the cost of more requests.  Spaces with different names are separate.
     """
 
     _log = Logger()
@@ -72,7 +72,7 @@ class TupleSpace:
         self._waits: dict[Wait, None] = {}
 
     def stop(self) -> None:
-        """End every call with ``NotRunning`` and every timer; tuples that are held come back when their lease ends."""
+        """Fail all calls with ``NotRunning`` and stop all timers; claimed tuples return when their lease ends."""
         if self._chores.is_stopped:
             return
         self._chores.stop()
@@ -81,15 +81,15 @@ class TupleSpace:
         for wait in list(self._waits):
             if not wait.is_over:
                 wait.end()
-                wait.deferred.errback(NotRunning(f"the tuple space {self.name} was stopped"))
+                wait.deferred.errback(NotRunning(f"the tuple space {self.name} has stopped"))
 
     # -- put --------------------------------------------------------------------------------------------------------
 
     def put(self, fields: Sequence[Value], ttl: float | None = None) -> Deferred[None]:
-        """Put a tuple; fires when a majority of those who keep it has it, and it can then outlive this node.
+        """Put a tuple; fires when a majority of its replicas has stored it, so that it can outlive this node.
 
-        With ``ttl`` it is taken out after that many seconds, if this node lives.  Raises ``BadTuple`` and ``TooLarge``
-        at once.  Where it fails with ``NoAnswer`` the tuple may appear all the same: it can't be unsaid.
+        With ``ttl`` it is removed after that many seconds, if this node is alive.  Raises ``BadTuple`` and ``TooLarge``
+        at once.  If it fails with ``NoAnswer`` the tuple may appear nevertheless.
         """
         return self._work(self._put(tuple_of(fields), ttl))
 
@@ -100,28 +100,28 @@ class TupleSpace:
     # -- take -------------------------------------------------------------------------------------------------------
 
     def get(self, template: Sequence[Field] | Template, timeout: float | None = None) -> Deferred[Tuple]:
-        """Take a matching tuple, waiting for one; ``NoTuple`` after ``timeout`` seconds, and it may be cancelled.
+        """Take a matching tuple, waiting for one; fails with ``NoTuple`` after ``timeout`` seconds; can be cancelled.
 
-        Should the council just then decide for this call, the tuple is put back.
+        If the council decides for a call that was cancelled at that time, the tuple is put back.
         """
         return self._blocking(self._get, template_of(template), timeout)
 
     def get_if_exists(self, template: Sequence[Field] | Template) -> Deferred[Tuple | None]:
-        """Take a matching tuple, or fire with None where there is none that nobody holds.
+        """Take a matching tuple; fire with None if there is none, or all are claimed by others.
 
-        Fails with ``NoAnswer`` where there is one, but too little of its council can be reached.
+        Fails with ``NoAnswer`` if there is one, but too few members of its council are reachable.
         """
         many = self.get_many(template, 1)
         return many.addCallback(lambda found: found[0] if found else None)
 
     def get_many(self, template: Sequence[Field] | Template, most: int) -> Deferred[list[Tuple]]:
-        """Take up to ``most`` matching tuples that exist, many in one question; fails as ``get_if_exists`` does."""
+        """Take up to ``most`` existing matching tuples, many per request; fails as ``get_if_exists`` does."""
         return self._work(self._get_many(template_of(template), most))
 
     def claim(
         self, template: Sequence[Field] | Template, lease: float = 10.0, timeout: float | None = None
     ) -> Deferred[Claim]:
-        """Hold a matching tuple for ``lease`` seconds, waiting for one as ``get`` does; confirm it when it is used."""
+        """Claim a matching tuple for ``lease`` seconds, waiting for one as ``get`` does; confirm it after use."""
 
         async def work(wanted: Template, wait: Wait) -> Claim | None:
             claim = await self._claim(wanted, wait, lease)
@@ -133,7 +133,7 @@ class TupleSpace:
 
     async def _get(self, template: Template, wait: Wait) -> Tuple | None:
         while True:
-            claim = await self._claim(template, wait, GET_LEASE)
+            claim = await self._claim(template, wait, GET_LEASE_S)
             if claim is None:
                 return None
             if wait.is_over:
@@ -144,7 +144,7 @@ class TupleSpace:
                 return claim.fields
 
     async def _claim(self, template: Template, wait: Wait, lease: float) -> Claim | None:
-        """A claim on a matching tuple, or None when nobody waits for it any more."""
+        """Wait for and claim a matching tuple; return None when the call has ended."""
         shelf = self._shelf(space_key(self.name, template.arity))
         shelf.enter()
         wait.on_end.add(shelf.wake)
@@ -167,8 +167,8 @@ class TupleSpace:
         shelf.visit()
         taken: list[Tuple] = []
         is_silent = False
-        for number in range(PASSES):
-            # What somebody here watches anyway need not be read first: the council says whether it is still there.
+        for number in range(MAX_PASSES):
+            # Tuples under watch need no read: the council refuses a tuple that was taken.
             ready = self._taker.candidates(shelf.posted, template)[0] if shelf.is_open and not number else []
             if not ready:
                 posted, _ = standing(await self._node.get(key))
@@ -179,31 +179,31 @@ class TupleSpace:
             while left and len(taken) < most:
                 batch = self._taker.batch(left, most - len(taken))
                 left = [one for one in left if one not in batch]
-                claims, silent = await self._taker.claim(batch, GET_LEASE)
+                claims, silent = await self._taker.claim(batch, GET_LEASE_S)
                 is_silent = is_silent or silent
                 won = await self._taker.decide(claims)
                 taken += [claim.fields for claim, is_ours in zip(claims, won, strict=True) if is_ours]
             if taken:
                 return taken
-            # All of them were held by others: perhaps by nobody for long, as when three claim at once.
-            await self._chores.sleep(self._rng.uniform(*PASS_PAUSE))
+            # Others held all of them, perhaps briefly, as when three nodes claim at once.
+            await self._chores.sleep(self._rng.uniform(*PASS_PAUSE_S))
         if is_silent:
-            raise NoAnswer("a tuple matches, but not enough of its council can be reached to take it")
+            raise NoAnswer("a tuple matches, but too few members of its council answer to take it; try again")
         return taken
 
     # -- read -------------------------------------------------------------------------------------------------------
 
     def read(self, template: Sequence[Field] | Template, timeout: float | None = None) -> Deferred[Tuple]:
-        """A matching tuple, which stays, waiting for one; ``NoTuple`` after ``timeout`` seconds; may be cancelled."""
+        """Read a matching tuple, waiting for one; fails with ``NoTuple`` after ``timeout`` seconds; cancellable."""
         return self._blocking(self._read, template_of(template), timeout)
 
     def read_if_exists(self, template: Sequence[Field] | Template) -> Deferred[Tuple | None]:
-        """A matching tuple, which stays, or None."""
+        """Read a matching tuple; fire with None if there is none."""
         found = self.read_all(template)
         return found.addCallback(lambda tuples: tuples[0] if tuples else None)
 
     def read_all(self, template: Sequence[Field] | Template) -> Deferred[list[Tuple]]:
-        """All matching tuples that nobody took; those that are held under a lease are among them."""
+        """Read all matching tuples that were not taken, claimed ones included."""
         return self._work(self._read_all(template_of(template)))
 
     async def _read(self, template: Template, wait: Wait) -> Tuple | None:
@@ -239,7 +239,7 @@ class TupleSpace:
         async def checked() -> T:
             if self._chores.is_stopped:
                 work.close()
-                raise NotRunning(f"the tuple space {self.name} was stopped")
+                raise NotRunning(f"the tuple space {self.name} has stopped")
             return await work
 
         return Deferred.fromCoroutine(checked())
@@ -264,12 +264,12 @@ class TupleSpace:
                 wait.end()
                 wait.deferred.errback(failure)
             elif failure.check(EntangledError) is None:
-                self._log.failure("in a call that nobody waits for", failure)
+                self._log.failure("a call failed after it had ended", failure)
 
         def expired() -> None:
             if not wait.is_over:
                 wait.end()
-                wait.deferred.errback(NoTuple(f"no matching tuple came within {timeout} s"))
+                wait.deferred.errback(NoTuple(f"no matching tuple within {timeout} s"))
 
         if timeout is not None:
             wait.on_end.add(self._chores.later(timeout, expired))

@@ -84,7 +84,7 @@ class CommandTests(SynchronousTestCase):
         self.assertEqual((code, json.loads(output)), (0, [RECORD]))
         for line, answer, shown in (
             ("dht find a", [{"id": "00ff", "host": "h", "port": 7}], "00ff  h:7\n"),
-            ("dht put a b", {"replicas": 3}, "3 replicas have it\n"),
+            ("dht put a b", {"replicas": 3}, "stored at 3 replicas\n"),
             ("tuple get _", ["job", 7], '"job" 7\n'),
             ("tuple read _ --all", [["a"], [1]], '"a"\n1\n'),
             ("tuple put a", None, ""),
@@ -129,7 +129,7 @@ class CommandTests(SynchronousTestCase):
         self.assertEqual((code, json.loads(output)["error"]), (1, "Unavailable"))
         self.assertEqual(self.run_command("dht get a", {"error": "BadRequest", "text": "x"})[0], 2)
         self.assertEqual(self.run_command("dht get a --node b")[0], 2)
-        self.assertIn("there are a", self.said)
+        self.assertIn("run: a", self.said)
         self.assertEqual(self.run_command("tuple get ?number")[0], 2)
         self.assertEqual(self.run_command("dht get a", {"event": []})[0], 1)
 

@@ -30,8 +30,8 @@ class PlaceTests(SynchronousTestCase):
         made("a").touch()
         self.assertEqual(found(None), found("a"))
         made("b").touch()
-        self.assertIn("--node NAME, one of a, b", self.problem(None))
-        self.assertIn("there are a, b", self.problem("c"))
+        self.assertIn("--node NAME: a, b", self.problem(None))
+        self.assertIn("run: a, b", self.problem("c"))
         self.assertEqual(found("b").name, "b.control")
 
     def test_folder_is_the_owners_alone(self) -> None:
@@ -39,10 +39,10 @@ class PlaceTests(SynchronousTestCase):
         made("a")
         self.assertEqual(folder().stat().st_mode & 0o777, 0o700)
         folder().chmod(0o777)
-        self.assertIn("not yours alone", str(self.assertRaises(NoControl, made, "a")))
+        self.assertIn("accessible to other users", str(self.assertRaises(NoControl, made, "a")))
         folder().rmdir()
         folder().symlink_to(self.runtime)
-        self.assertIn("not yours alone", str(self.assertRaises(NoControl, made, "a")))
+        self.assertIn("accessible to other users", str(self.assertRaises(NoControl, made, "a")))
         folder().unlink()
         folder().touch()
         self.assertRaises(NoControl, made, "a")
