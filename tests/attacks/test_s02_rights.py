@@ -53,7 +53,7 @@ class MethodTests(SiegeCase):
         counted = team.houses[0].node.endpoint.counters["refused"] - refused
         self.assertEqual(counted, 2 * (len(names) - len(allowed)))
 
-    @settings(max_examples=60, deadline=None, derandomize=True, database=None)
+    @settings(max_examples=60)
     @given(st.sets(st.sampled_from(ROLES)), st.sampled_from([*METHODS, "made.up", ""]), st.sampled_from(ROLES))
     def test_more_roles_allow_no_less(self, which: set[str], method: str, more: str) -> None:
         """With one role more nobody may do less, and without any nobody may do anything."""
@@ -149,7 +149,7 @@ class OwnerTests(SiegeCase):
         self.attack(self.record)
         self.assertEqual([record.value for record in self.held()], [None])
 
-    @settings(max_examples=25, deadline=None, derandomize=True, database=None)
+    @settings(max_examples=25)
     @given(st.data())
     def test_any_mixture(self, data: Any) -> None:
         """Whatever is changed in whatever way, the record holds."""

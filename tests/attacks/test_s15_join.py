@@ -170,7 +170,7 @@ class JoinTests(SiegeCase):
 
 
 class SettingsTests(SynchronousTestCase):
-    @settings(max_examples=100, deadline=None, derandomize=True, database=None)
+    @settings(max_examples=100)
     @given(LINE, LINE)
     def test_no_text_becomes_structure(self, kind: str, membership: str) -> None:
         """Text in a settings file for a newcomer is read back as that text; it opens no table and sets no other key."""

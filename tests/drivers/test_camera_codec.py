@@ -139,7 +139,7 @@ class StreamReaderTests(SynchronousTestCase):
         self.assertLess(len(reader._rest), 20)
         self.assertEqual(reader.read(part(FIRST)), [FIRST])
 
-    @settings(derandomize=True, database=None, deadline=None, max_examples=300)
+    @settings(max_examples=300)
     @given(st.lists(st.binary(max_size=60), max_size=6), st.booleans(), st.integers(1, 80))
     def test_any_bytes_as_a_stream(self, pieces: list[bytes], is_chunked: bool, size: int) -> None:
         """Whatever stands behind a head, there are pictures in it, or none, or it is refused; nothing else happens."""
@@ -150,7 +150,7 @@ class StreamReaderTests(SynchronousTestCase):
             return
         self.assertTrue(all(len(one) <= len(data) for one in found))
 
-    @settings(derandomize=True, database=None, deadline=None, max_examples=300)
+    @settings(max_examples=300)
     @given(st.sampled_from(sorted(STREAMS)), st.data())
     def test_spoilt_streams(self, name: str, data: st.DataObject) -> None:
         """A stream with some bytes changed or lost is read or refused, the same whether it comes whole or in bytes."""

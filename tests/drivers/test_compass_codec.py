@@ -90,7 +90,7 @@ class SentenceReaderTests(SynchronousTestCase):
         self.assertEqual(reader.bad_frames, 5)
         self.assertEqual(len(reader.read(b"\n$HCHDM,10.0,M\n")), 1)
 
-    @settings(derandomize=True, database=None, deadline=None, max_examples=200)
+    @settings(max_examples=200)
     @given(st.lists(st.binary(max_size=30) | st.sampled_from([b"$HCHDG,", b"\r\n", b"1.0,E", b"*57", b"$HEHDT,1,T"])))
     def test_any_bytes(self, pieces: list[bytes]) -> None:
         """Whatever comes, headings are angles of the circle, and the same whether they come whole or in bytes."""

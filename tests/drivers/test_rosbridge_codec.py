@@ -7,16 +7,13 @@ import json
 import math
 from typing import Any
 
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
 from drivers.errors import BadFrame
 from drivers.rosbridge import codec
 from drivers.rosbridge.codec import Answered, Published, Status, decoded, encoded
-
-settings.register_profile("rosbridge", derandomize=True, database=None, deadline=None, max_examples=120)
-settings.load_profile("rosbridge")
 
 JPEG = b"\xff\xd8\xff\xc0\x00\x0b\x08\x00\x60\x00\x80\x01\x11\x00\x00\xff\xd9"
 STILL = {"linear": {"x": 0, "y": 0, "z": 0}, "angular": {"x": 0, "y": 0, "z": 0}}

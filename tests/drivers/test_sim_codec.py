@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import msgpack
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
@@ -46,8 +46,6 @@ MESSAGES: list[Message] = [
     Done(3, ""),
     Refused("dog1 is taken", False),
 ]
-settings.register_profile("yard", derandomize=True, database=None, deadline=None, max_examples=120)
-settings.load_profile("yard")
 
 
 def payload(*row: object) -> bytes:

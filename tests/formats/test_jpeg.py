@@ -22,7 +22,7 @@ class JpegTests(SynchronousTestCase):
         for data in broken + [b"\xff\xd8" + middle + b"\xff\xd9" for middle in between]:
             self.assertIsNone(size_of(data), data[:20])
 
-    @settings(derandomize=True, database=None, deadline=None, max_examples=100)
+    @settings(max_examples=100)
     @given(st.binary(max_size=40))
     def test_any_bytes(self, data: bytes) -> None:
         """Whatever stands between the ends of a JPEG, it has a size or none."""

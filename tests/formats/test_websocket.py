@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 from wsproto.events import AcceptConnection, RejectConnection, Request
@@ -10,9 +10,6 @@ from wsproto.events import AcceptConnection, RejectConnection, Request
 from formats.head import MAX_HEAD
 from formats.websocket import MAX_FRAMES, End
 from tests.formats.rfc6455 import BINARY, CLOSE, CONTINUATION, MASK, PING, PONG, TEXT, answer_to, framed
-
-settings.register_profile("websocket", derandomize=True, database=None, deadline=None, max_examples=80)
-settings.load_profile("websocket")
 
 LONGEST = 1 << 17
 

@@ -9,7 +9,7 @@ from twisted.trial.unittest import SynchronousTestCase
 from tests.fuzz import envelope, handshake, raw
 from tests.fuzz.ground import Ground, Violation
 
-BOUNDED = settings(max_examples=150, deadline=None, derandomize=True, database=None)
+BOUNDED = settings(max_examples=150)
 
 
 class TargetTests(SynchronousTestCase):

@@ -130,7 +130,7 @@ class LookupTest(SynchronousTestCase):
         self.assertEqual(asked, CROWD[:2])
         self.assertEqual(lookup.next(), [])
 
-    @settings(max_examples=30, deadline=None, derandomize=True, database=None)
+    @settings(max_examples=30)
     @given(st.integers(0, 2**32), st.integers(2, 60), st.binary(min_size=20, max_size=20))
     def test_exact(self, seed: int, size: int, target: bytes) -> None:
         """In a quiet network whose tables are whole the search finds exactly the k closest nodes in any order."""
@@ -155,7 +155,6 @@ IDS = st.binary(min_size=ID_BYTES, max_size=ID_BYTES)
 
 
 class DistanceTest(SynchronousTestCase):
-    @settings(deadline=None, derandomize=True, database=None)
     @given(IDS, IDS, IDS)
     def test_metric(self, a: bytes, b: bytes, c: bytes) -> None:
         """The distance is a metric: zero for one id only, the same both ways, and no way round is shorter."""
@@ -163,7 +162,6 @@ class DistanceTest(SynchronousTestCase):
         self.assertEqual(distance(a, b), distance(b, a))
         self.assertLessEqual(distance(a, c), distance(a, b) + distance(b, c))
 
-    @settings(deadline=None, derandomize=True, database=None)
     @given(IDS, IDS)
     def test_bucket_holds_its_range(self, own: bytes, other: bytes) -> None:
         """The bucket i of an id spans the distances from 2**i to below 2**(i+1)."""

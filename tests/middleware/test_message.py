@@ -52,7 +52,7 @@ def deep(value: object) -> int:
 class MessageTests(SynchronousTestCase):
     """Behaviour of ``encoded`` and ``decoded``."""
 
-    @settings(max_examples=150, deadline=None, derandomize=True, database=None)
+    @settings(max_examples=150)
     @given(number=st.integers(0, 2**64 - 1), value=_VALUES)
     def test_round_trip(self, number: int, value: Any) -> None:
         """Every kind of message comes back as it was."""
@@ -66,7 +66,7 @@ class MessageTests(SynchronousTestCase):
         for message in messages:
             self.assertEqual(decoded(encoded(message)), message)
 
-    @settings(max_examples=400, deadline=None, derandomize=True, database=None)
+    @settings(max_examples=400)
     @given(
         kind=st.sampled_from([0, 1, 2, 3, 4, 5, True, 1.0]),
         fields=st.lists(

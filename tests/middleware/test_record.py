@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import msgpack
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
@@ -107,7 +107,6 @@ class RecordTest(SynchronousTestCase):
         for other in others:
             self.assertIsNone(unpacked(other))
 
-    @settings(deadline=None, derandomize=True, database=None)
     @given(ANYTHING | st.lists(ANYTHING, min_size=8, max_size=8))
     def test_total(self, fields: object) -> None:
         """Anything a message can hold is a record or is not; nothing makes an accident."""

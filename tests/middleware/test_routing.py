@@ -180,7 +180,6 @@ class RoutingTableTest(SynchronousTestCase):
             self.table.searched(self.table.refresh_target(index, rng), 60.0)
         self.assertEqual(self.table.stale_buckets(60.0, 60.0), [158])
 
-    @settings(deadline=None, derandomize=True, database=None)
     @given(st.integers(0, 159), st.integers())
     def test_refresh_target_lies_in_its_bucket(self, index: int, seed: int) -> None:
         """The id to look up for a bucket belongs into it, and follows from the seed."""
@@ -189,7 +188,7 @@ class RoutingTableTest(SynchronousTestCase):
         self.assertEqual(bucket_index(OWN.node_id, target), index)
         self.assertEqual(target, table.refresh_target(index, random.Random(seed)))
 
-    @settings(max_examples=50, deadline=None, derandomize=True, database=None)
+    @settings(max_examples=50)
     @given(st.lists(st.tuples(st.sampled_from(["saw", "failed", "remove"]), st.integers(0, 40)), max_size=200))
     def test_invariants(self, events: list[tuple[str, int]]) -> None:
         """Whatever happens, no bucket holds more than k, nobody is there twice, and the length is what it holds."""

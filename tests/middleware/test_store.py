@@ -267,7 +267,7 @@ class MemoryStoreTest(StoreContract, SynchronousTestCase):
         self.assertLess(len(store._heap), 80)
         self.assertEqual(store.expire(FOREVER), [record(sequence=1000)])
 
-    @settings(max_examples=100, deadline=None, derandomize=True, database=None)
+    @settings(max_examples=100)
     @given(st.lists(st.tuples(st.sampled_from("ppedxg"), st.integers(0, 3), st.integers(1, 4), st.integers(0, 30))))
     def test_like_the_obvious_one(self, events: list[tuple[str, int, int, int]]) -> None:
         """Any series of puts, extensions, goodbyes and sweeps leaves what a plain dictionary of slots would hold."""
@@ -300,7 +300,7 @@ class MemoryStoreTest(StoreContract, SynchronousTestCase):
             self.assertEqual(len(store), len(plain))
             self.assertEqual(store.usage.bytes, sum(weight(held) for held, _ in plain.values()))
 
-    @settings(max_examples=60, deadline=None, derandomize=True, database=None)
+    @settings(max_examples=60)
     @given(
         st.lists(
             st.tuples(st.integers(0, 9), st.integers(1, 5), st.none() | st.integers(0, 300), st.integers(0, 99)),

@@ -34,7 +34,7 @@ class FieldTests(SynchronousTestCase):
         self.assertEqual(text("x" * 500, limit=10), "x" * 10)
         self.assertEqual(text("\x07", "nothing"), "nothing")
 
-    @settings(max_examples=150, deadline=None, database=None, derandomize=True)
+    @settings(max_examples=150)
     @given(
         st.recursive(
             st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8) | st.binary(max_size=8),

@@ -29,7 +29,7 @@ class AverageTests(SynchronousTestCase):
         found = Average().find([Report("a", 2.0, value=(1.0,)), Report("b", 1.0, value=(4.0,), weight=2.0)])
         self.assertEqual((found.value, found.assigned_agent), ((3.0,), "b"))
 
-    @settings(max_examples=100, deadline=None, derandomize=True, database=None)
+    @settings(max_examples=100)
     @given(places, st.randoms(use_true_random=False))
     def test_identical_for_all(self, points: list[tuple[float, float]], dice: random.Random) -> None:
         """In any order every strategy gives the identical numbers, to the last bit, within the box of the points."""

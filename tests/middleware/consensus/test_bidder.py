@@ -65,7 +65,7 @@ def line(names: list[str], dice: random.Random) -> list[tuple[str, str]]:
 
 
 class BidderTests(SynchronousTestCase):
-    @settings(max_examples=150, deadline=None, derandomize=True, database=None)
+    @settings(max_examples=150)
     @given(st.integers(1, 8), st.integers(1, 8), st.integers(1, 3), st.integers(0, 10**6))
     def test_equals_greedy(self, agents: int, tasks: int, capacity: int, seed: int) -> None:
         """In any order of delivery, with repetitions, on any connected graph, all end at the greedy assignment."""

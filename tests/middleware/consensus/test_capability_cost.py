@@ -29,7 +29,7 @@ class CapabilityCostTests(SynchronousTestCase):
             self.assertEqual(self.strategy.find([unable]).assigned_agent, None)
             self.assertFalse(self.strategy.improves(Report("dog2", 9e8), unable, 0.0))
 
-    @settings(max_examples=100, deadline=None, derandomize=True, database=None)
+    @settings(max_examples=100)
     @given(seconds, shares, st.integers(0, 9), seconds, shares, st.integers(1, 9))
     def test_monotone(self, way: float, battery: float, load: int, more: float, less: float, tasks: int) -> None:
         """A longer way, a lower battery or more tasks never make a report weigh less."""

@@ -29,7 +29,7 @@ class NearestTests(SynchronousTestCase):
         self.assertEqual(self.nearest.find([Report("b", 1.0), Report("a", 1.0)]).assigned_agent, "a")
         self.assertEqual(self.nearest.find([Report("b", -0.0), Report("a", 0.0)]).assigned_agent, "a")
 
-    @settings(max_examples=100, deadline=None, derandomize=True, database=None)
+    @settings(max_examples=100)
     @given(reports, st.randoms(use_true_random=False))
     def test_order_and_repetition_do_not_matter(self, contacts: list[Report], rng: object) -> None:
         """The same reports in any order, some of them twice, give the same consensus point, digest included."""

@@ -101,7 +101,7 @@ class DeviceTests(SynchronousTestCase):
         for value in (None, b"", b"\xc1", [1], 5, {}, {"name": "dog"}, b"\x91" * 600):
             self.assertIsNone(device_of(record(value)), value)
 
-    @settings(max_examples=200, deadline=None, derandomize=True, database=None)
+    @settings(max_examples=200)
     @given(
         st.binary(max_size=60)
         | st.recursive(

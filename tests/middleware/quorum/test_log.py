@@ -99,7 +99,7 @@ class LogTests(SynchronousTestCase):
         granted(self.log, "t", 1, 0.0).configuration = FIRST + 1
         self.assertIsNone(entered(self.log, "u", 1e9))
 
-    @settings(max_examples=200, deadline=None, derandomize=True, database=None)
+    @settings(max_examples=200)
     @given(ANYTHING)
     def test_rows_are_total(self, row: object) -> None:
         """Whatever stands in a row is an entry or none, and never an accident."""

@@ -24,7 +24,7 @@ class WordsTests(SynchronousTestCase):
         ]:
             self.assertEqual(words(name), wanted)
 
-    @settings(max_examples=200, deadline=None, derandomize=True, database=None)
+    @settings(max_examples=200)
     @given(text=st.text(max_size=30))
     def test_stable(self, text: str) -> None:
         """Any text has words, and the words of its words are the same."""

@@ -194,7 +194,7 @@ class SeatTests(SynchronousTestCase):
         assert reply is not None
         self.assertEqual((reply.accepted, reply.value), (Ballot(1, b"a"), b"a"))
 
-    @settings(max_examples=300, deadline=None, derandomize=True, database=None)
+    @settings(max_examples=300)
     @given(foreign=FOREIGN, noise=st.binary(max_size=60))
     def test_notes_are_decoded_totally(self, foreign: Any, noise: bytes) -> None:
         """A rotten note gives None, and never an exception."""
@@ -245,7 +245,7 @@ class PostingTests(SynchronousTestCase):
         self.assertIsNone(posting(record("t", None)))
         self.assertIsNone(place_unpacked(KEY, [ME.public, "", b"m" * 8]))
 
-    @settings(max_examples=300, deadline=None, derandomize=True, database=None)
+    @settings(max_examples=300)
     @given(foreign=FOREIGN, noise=st.binary(max_size=60))
     def test_total(self, foreign: Any, noise: bytes) -> None:
         """Any record gives a posting or None, and never an exception."""

@@ -30,7 +30,7 @@ FOREIGN: Any = st.recursive(
 
 
 class WireTests(SynchronousTestCase):
-    @settings(max_examples=100, deadline=None, derandomize=True, database=None)
+    @settings(max_examples=100)
     @given(reply=REPLIES, accepted=st.none() | st.integers(1, 2**48 - 1), name=st.binary(min_size=1, max_size=40))
     def test_round_trip(self, reply: Reply, accepted: int | None, name: bytes) -> None:
         """Every reply comes back as it was, to every question."""
@@ -46,7 +46,7 @@ class WireTests(SynchronousTestCase):
         self.assertEqual(pack_reply(Reply(Kind.SEALED), Event.PREPARE)[0], 0)
         self.assertIsNone(unpack_reply(pack_reply(Reply(Kind.GRANTED), Event.PREPARE), Event.ACCEPT))
 
-    @settings(max_examples=300, deadline=None, derandomize=True, database=None)
+    @settings(max_examples=300)
     @given(foreign=FOREIGN, accepted=FOREIGN)
     def test_total(self, foreign: Any, accepted: Any) -> None:
         """Anything else is None, and never an exception."""

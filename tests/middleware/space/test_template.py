@@ -87,7 +87,7 @@ class TemplateTests(SynchronousTestCase):
         self.assertRaises(TooLarge, tuple_of, ["x" * 700])
         self.assertRaises(TooLarge, template_of, [b"x" * 700])
 
-    @settings(max_examples=150, deadline=None, derandomize=True, database=None)
+    @settings(max_examples=150)
     @given(fields=st.lists(VALUES, min_size=1, max_size=8))
     def test_tuple_round_trip(self, fields: list[Any]) -> None:
         """Every tuple comes back from a message as it was, and matches itself."""
@@ -95,7 +95,7 @@ class TemplateTests(SynchronousTestCase):
         self.assertEqual(repr(back), repr(tuple(fields)))
         self.assertTrue(template_of(fields).matches(back))
 
-    @settings(max_examples=300, deadline=None, derandomize=True, database=None)
+    @settings(max_examples=300)
     @given(operator=st.sampled_from([*OPERATORS, "=", "like"]), foreign=FOREIGN | st.lists(FOREIGN, max_size=4))
     def test_total(self, operator: str, foreign: Any) -> None:
         """Anything is a tuple or ``Malformed``, and an operand or ``BadTuple``, and nothing else."""

@@ -186,7 +186,7 @@ class DecoderTests(SynchronousTestCase):
         for value in (None, b"", {}, {"outcome": COMPLETED}, DEPTH):
             self.assertIsNone(result_of(record(RESULT, value)), value)
 
-    @settings(max_examples=250, deadline=None, derandomize=True, database=None)
+    @settings(max_examples=250)
     @given(st.binary(max_size=60) | st.dictionaries(st.sampled_from(NAMES), anything, max_size=4) | anything)
     def test_total(self, value: object) -> None:
         """Whatever stands in a record, reading it gives something lawful or nothing, and never raises."""

@@ -99,7 +99,7 @@ class CharterTests(RoomCase):
         other = pin(self.room.operator, T, tuple(self.room.contacts[:3]))
         self.assertIsNone(ending_of(Ending(self.chartered([0, 4, 6]), tuple(votes)).packed, other))
 
-    @settings(max_examples=100, deadline=None, derandomize=True, database=None)
+    @settings(max_examples=100)
     @given(st.recursive(st.none() | st.integers() | st.binary(max_size=70) | st.text(), st.lists, max_leaves=20))
     def test_anything_from_the_wire(self, content: object) -> None:
         """Whatever arrives is a charter or none, and raises nothing."""

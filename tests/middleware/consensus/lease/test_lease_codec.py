@@ -76,7 +76,7 @@ class ReplyTests(SynchronousTestCase):
         for bad in (packed, [packed[0], packed[0]], [[b"k", "h", 1]], [1], None, b"x"):
             self.assertIsNone(members_of(bad))
 
-    @settings(max_examples=300, deadline=None, derandomize=True, database=None)
+    @settings(max_examples=300)
     @given(ANYTHING)
     def test_total(self, answer: object) -> None:
         """Whatever a peer answers is read as a reply or as none, and never an accident."""
