@@ -16,6 +16,7 @@ from twisted.logger import ILogObserver, LogEvent, globalLogPublisher
 from twisted.trial.unittest import SynchronousTestCase
 from zope.interface import implementer
 
+from middleware.entangled.data import writer
 from middleware.entangled.data.schema import MAX_ROTTEN, SCHEMA_VERSION
 from middleware.entangled.data.sqlite import SqliteStore, read_records
 from middleware.entangled.data.store import MAX_BYTES, Durable, Store, weight
@@ -214,6 +215,8 @@ class ReopenTest(SynchronousTestCase):
 
 class FullDiskTest(SynchronousTestCase):
     def setUp(self) -> None:
+        # Only a flush commits, so that no commit fails between two changes.
+        self.patch(writer, "COMMIT_AFTER", 60.0)
         self.store = SqliteStore.open(self.mktemp(), 0.0)
         self.addCleanup(self.store.close)
         self.store.put(record("a"), FOREVER)
@@ -222,7 +225,15 @@ class FullDiskTest(SynchronousTestCase):
         self.limit(1)
         for number in range(40):
             self.store.put(record(str(number), value=bytes(900)), FOREVER)
-        self.assertRaises(BadStore, self.store.flush, 0.2)
+        self.fail_to_flush()
+
+    def fail_to_flush(self) -> None:
+        """Flush until a commit has failed."""
+        for _ in range(100):
+            self.assertRaises(BadStore, self.store.flush, 0.1)
+            if self.store.trouble:
+                return
+        self.fail("no commit failed")
 
     def limit(self, pages: int) -> None:
         self.store._connection.execute(f"PRAGMA max_page_count = {pages}").fetchone()
@@ -245,7 +256,7 @@ class FullDiskTest(SynchronousTestCase):
         for number in range(20):
             self.store.put(record(f"x{number}", value=bytes(900)), FOREVER)
         waiting = self.store.written()
-        self.assertRaises(BadStore, self.store.flush, 0.2)
+        self.fail_to_flush()
         self.assertIn("full", str(self.failureResultOf(waiting, Unwritable).value))
         self.assertIn("full", self.store.trouble)
         self.limit(10_000)
@@ -260,7 +271,7 @@ class FullDiskTest(SynchronousTestCase):
         self.store.flush()
         self.store._connection.execute("PRAGMA query_only = 1")
         self.store.put(record("x"), FOREVER)
-        self.assertRaises(BadStore, self.store.flush, 0.2)
+        self.fail_to_flush()
         self.assertIn("readonly", str(self.assertRaises(Unwritable, self.store.put, record("y"), FOREVER)))
         self.store._connection.execute("PRAGMA query_only = 0")
         self.store.flush()
