@@ -145,7 +145,7 @@ class AskTests(EndpointCase):
         self.assertIn("no such method", self.failed(ask(self.to_b, "nothing"), Refused))
         self.assertIn("takes 1 arguments", self.failed(ask(self.to_b, "echo"), Refused))
         self.assertIn("takes 1 to 2 arguments", self.failed(ask(self.to_b, "whole"), Refused))
-        self.assertIn("argument 1 must be int, is str", self.failed(ask(self.to_b, "whole", "x"), Refused))
+        self.assertIn("argument 1 must be int, not str", self.failed(ask(self.to_b, "whole", "x"), Refused))
         self.assertIn("argument 2 must be str or None", self.failed(ask(self.to_b, "whole", 1, b"x"), Refused))
         self.assertIn("ask for less", self.failed(ask(self.to_b, "fill", MAX_MESSAGE), Refused))
         self.assertEqual(self.got(ask(self.to_b, "whole", 1, None)), [1, None])
@@ -446,7 +446,7 @@ class AttackTests(EndpointCase):
         self.clock.advance(1)
         self.assertEqual([self.successResultOf(one) for one in asked[:3]], [0, 1, 2])
         for one in asked[3:]:
-            self.assertIn("ask again later", str(self.failureResultOf(one, Refused).value))
+            self.assertIn("try again later", str(self.failureResultOf(one, Refused).value))
         self.assertEqual(self.runs, [0, 1, 2])
         self.clock.advance(40)
         self.assertEqual(self.got(self.a.ask(self.to_b, "add", 9, changes=True)), 9)
