@@ -147,7 +147,7 @@ class AskTests(EndpointCase):
         self.assertIn("takes 1 to 2 arguments", self.failed(ask(self.to_b, "whole"), Refused))
         self.assertIn("argument 1 must be int, not str", self.failed(ask(self.to_b, "whole", "x"), Refused))
         self.assertIn("argument 2 must be str or None", self.failed(ask(self.to_b, "whole", 1, b"x"), Refused))
-        self.assertIn("ask for less", self.failed(ask(self.to_b, "fill", MAX_MESSAGE), Refused))
+        self.assertIn("request less", self.failed(ask(self.to_b, "fill", MAX_MESSAGE), Refused))
         self.assertEqual(self.got(ask(self.to_b, "whole", 1, None)), [1, None])
 
     def test_foreign_exceptions_stay_inside(self) -> None:
@@ -189,7 +189,7 @@ class AskTests(EndpointCase):
         self.board.kill(self.to_b.address)
         self.failed(self.a.ask(self.to_b, "echo", 1), NoAnswer, 1.0)
         self.failed(self.a.ask(self.to_b, "echo", 1, timeout=0.1), NoAnswer, 0.11)
-        self.assertIn("no key", self.failed(self.a.ask(Contact(b"\xff" * 32, self.to_b.address), "echo", 1), NoAnswer))
+        self.assertIn("key of this contact is invalid", self.failed(self.a.ask(Contact(b"\xff" * 32, self.to_b.address), "echo", 1), NoAnswer))
         self.a.stop()
         self.b.stop()
         self.assertEqual(self.clock.getDelayedCalls(), [])
