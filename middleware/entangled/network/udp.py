@@ -224,7 +224,7 @@ class UdpNetwork:
 def _port_in_use(host: str, port: int, trouble: Any) -> PortInUse:
     why = getattr(trouble, "strerror", None) or trouble
     is_foreign = getattr(trouble, "errno", None) == errno.EADDRNOTAVAIL
-    remedy = "set host to an address of this machine" if is_foreign else "choose another port, or 0 for any"
+    remedy = "give host an address of this machine" if is_foreign else "choose another port, or 0 for any"
     return PortInUse(f"UDP {host}:{port}: {why}; {remedy}")
 
 
