@@ -264,5 +264,5 @@ def _ways(node: EntangledNode) -> list[tuple[str, int, int]]:
         *((f"ways ({name})", len(getattr(reach, name)), MAX_KNOWN) for name in tables),
         ("holes in its router", len(reach.ways._holes), MAX_KNOWN),
         ("where it is seen", len(reach.outside._seen), MAX_KNOWN),
-        ("who was told where it is seen", len(reach.outside._told_at), MAX_KNOWN),
+        ("who was told where it is seen", len(reach.outside._notified_at), MAX_KNOWN),
     ]

@@ -70,7 +70,7 @@ class Membership:
         self._clock = clock
         self._rng = rng
         self._chores = chores
-        self._former: dict[Address, None] = {}
+        self._former_addresses: dict[Address, None] = {}
         self._tried_at: dict[bytes, float] = {}
         self._listed_at: dict[bytes, float] = {}
         self._returning = False
@@ -97,7 +97,7 @@ class Membership:
         for contact in remembered:
             self._overlay.roster.remembered(contact, self._clock.seconds())
         addresses = [contact.address for contact in remembered if not contact.address.is_virtual]
-        self._former |= dict.fromkeys([*known, *addresses])
+        self._former_addresses |= dict.fromkeys([*known, *addresses])
         while others or addresses:
             if await self._contact_any(others, addresses) or self._is_entered:
                 return
@@ -147,11 +147,11 @@ class Membership:
         self.sounding.lost()
         if contact.address.is_virtual:
             return
-        keep(self._former, contact.address, None, MAX_FORMER)
+        keep(self._former_addresses, contact.address, None, MAX_FORMER)
 
     def forget(self, contact: Contact) -> None:
         """Do not try the address of ``contact`` again."""
-        self._former.pop(contact.address, None)
+        self._former_addresses.pop(contact.address, None)
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
@@ -194,9 +194,11 @@ class Membership:
         if len(self._listed_at) > 4 * MAX_MEMBERS:
             self._listed_at.clear()
         self._listed_at[contact.node_id] = now
-        self._chores.fork(self._list(contact) if self._overlay.is_whole else self._first_list(contact))
+        self._chores.fork(
+            self._fetch_members(contact) if self._overlay.is_whole else self._fetch_first_members(contact)
+        )
 
-    async def _first_list(self, contact: Contact) -> None:
+    async def _fetch_first_members(self, contact: Contact) -> None:
         """Contact the members of the network that was just joined, after a delay for the first reads of other nodes.
 
         A newcomer has no vote before that, so a request that gets no answer is repeated, to another member if there is
@@ -207,7 +209,7 @@ class Membership:
             while not self._chores.is_stopped:
                 await self._chores.sleep(self._draw_pause())
                 try:
-                    return await self._list(contact)
+                    return await self._fetch_members(contact)
                 except NoAnswer:
                     there = self._overlay.roster.live()
                     if not there:
@@ -219,7 +221,7 @@ class Membership:
     def _draw_pause(self) -> float:
         return BREATH * (1 + self._rng.random())
 
-    async def _list(self, contact: Contact) -> None:
+    async def _fetch_members(self, contact: Contact) -> None:
         """Ping every member that ``contact`` knows and this node does not."""
         after, strangers = b"", []
         for _ in range(1 + MAX_MEMBERS // PAGE):
@@ -262,14 +264,14 @@ class Membership:
         there = self._overlay.roster.live()[:AT_ONCE]
         asked = [Deferred.fromCoroutine(self._overlay.ask(contact, "known")) for contact in there]
         answers = await DeferredList(asked, consumeErrors=True)
-        told: dict[bytes, dict[Contact, int]] = {}
+        answers_by_id: dict[bytes, dict[Contact, int]] = {}
         for contact, (ok, answer) in zip(there, answers, strict=True):
             if ok or not answer.check(NoAnswer):  # a node that refuses has no opinion
-                told[contact.node_id] = _known_of(answer)
-        if there and not told:
+                answers_by_id[contact.node_id] = _decode_known(answer)
+        if there and not answers_by_id:
             raise NoAnswer("no member answered with the members that it knows")
-        settled = [opinion for own, opinion in told.items() if any(named.node_id == own for named in opinion)]
-        opinions = settled or list(told.values())
+        settled = [opinion for own, opinion in answers_by_id.items() if any(named.node_id == own for named in opinion)]
+        opinions = settled or list(answers_by_id.values())
         for contact in dict.fromkeys(contact for opinion in opinions for contact in opinion):
             named = [opinion[contact] for opinion in opinions if contact in opinion]
             if 2 * len(named) > len(opinions) and contact.node_id != self._overlay.own_id:
@@ -286,16 +288,16 @@ class Membership:
         self._tried_at[contact.node_id] = now
         return True
 
-    async def _return(self) -> None:
+    async def _rejoin(self) -> None:
         """Try the remembered addresses: a radio failure costs a node all its contacts."""
         self._returning = True
         try:
-            if await self._contact_any([], list(self._former)) or await self.detour.taken():
+            if await self._contact_any([], list(self._former_addresses)) or await self.detour.taken():
                 await self._overlay.lookup(self._overlay.own_id)
         finally:
             self._returning = False
 
-    async def _seek(self, contact: Contact) -> None:
+    async def _check_absent(self, contact: Contact) -> None:
         """Check whether an absent member answers at its address; a discovery request costs a sixth of a handshake."""
         found = await self._endpoint.greet(contact.address)
         if found.node_id != self._overlay.own_id:
@@ -307,8 +309,8 @@ class Membership:
             return
         overlay.roster.strike(now)
         contacts = overlay.contacts()
-        if not contacts and (self._former or self.detour.is_possible) and not self._returning:
-            self._chores.fork(self._return())
+        if not contacts and (self._former_addresses or self.detour.is_possible) and not self._returning:
+            self._chores.fork(self._rejoin())
         # Each pair of n members needs one ping per interval, so the interval grows with n and the total stays constant.
         patience = min(MAX_SILENCE, SILENCE * max(1.0, len(contacts) / SMALL))
         for contact in contacts:
@@ -318,7 +320,7 @@ class Membership:
         if absent:
             contact = absent[self._rng.randrange(len(absent))]
             self._tried_at[contact.node_id] = now
-            self._chores.fork(self._seek(contact))
+            self._chores.fork(self._check_absent(contact))
         self._refresh(now)
 
     def _refresh(self, now: float) -> None:
@@ -343,7 +345,7 @@ class Membership:
         elif now > self._large_until + LARGE_FOR:
             overlay.shrank()
         elif now > self._large_until and (contacts := overlay.contacts()):
-            self._chores.fork(self._list(contacts[self._rng.randrange(len(contacts))]))
+            self._chores.fork(self._fetch_members(contacts[self._rng.randrange(len(contacts))]))
 
     def _answer_ping(self, peer: Contact, digest: bytes = b"") -> bytes:
         self._overlay.heard(peer)
@@ -369,7 +371,7 @@ class Membership:
         return [c.packed() for c in later[:PAGE]]
 
 
-def _known_of(answer: object) -> dict[Contact, int]:
+def _decode_known(answer: object) -> dict[Contact, int]:
     """Decode an answer to KNOWN: the members, and the seconds of their absence; invalid items are skipped."""
     found: dict[Contact, int] = {}
     for fields in answer[:MAX_MEMBERS] if isinstance(answer, list) else ():

@@ -82,7 +82,7 @@ class Sounding:
         self._rng = rng
         self._chores = chores
         self._upkeep = upkeep
-        self._sounding: set[bytes] = set()
+        self._probing: set[bytes] = set()
         self._next_far = self._next_upkeep = float("-inf")
         self._fragile: list[Contact] = []
 
@@ -149,7 +149,7 @@ class Sounding:
             if silence <= wait:
                 return now + min(wait - silence, UPKEEP)
             contact = overlay.contact(node_id)
-            if contact is None or node_id in self._sounding or node_id in near:
+            if contact is None or node_id in self._probing or node_id in near:
                 continue
             if left <= 0:
                 return now + PROBE
@@ -158,8 +158,8 @@ class Sounding:
         return now + UPKEEP
 
     def _probe(self, contact: Contact, is_near: bool) -> None:
-        if contact.node_id not in self._sounding:
-            self._sounding.add(contact.node_id)
+        if contact.node_id not in self._probing:
+            self._probing.add(contact.node_id)
             self._chores.fork(self._probe_contact(contact, is_near))
 
     async def _probe_contact(self, contact: Contact, is_near: bool) -> None:
@@ -178,7 +178,7 @@ class Sounding:
                 overlay.missed(contact, is_over=True)
             raise
         finally:
-            self._sounding.discard(contact.node_id)
+            self._probing.discard(contact.node_id)
 
     async def _rediscover(self, contact: Contact, is_near: bool) -> None:
         """Check whether ``contact`` listens at its address; a neighbour also proves its key."""

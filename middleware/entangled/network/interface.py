@@ -29,25 +29,25 @@ class Interface:
 def interfaces() -> list[Interface]:
     """Return the interfaces that are up; an empty list if the system does not report them."""
     found: list[Interface] = []
-    sixes = _read_ipv6_addresses()
+    ipv6_addresses = _read_ipv6_addresses()
     try:
         names = socket.if_nameindex()
-        asked = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        probe = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     except OSError:
         return found
-    with asked:
+    with probe:
         for index, name in names:
             request = struct.pack("40s", name.encode()[:15])
             try:
-                flags = struct.unpack_from("H", fcntl.ioctl(asked, _FLAGS, request), 16)[0]
+                flags = struct.unpack_from("H", fcntl.ioctl(probe, _FLAGS, request), 16)[0]
             except OSError:
                 continue
             try:
-                fours = [socket.inet_ntoa(fcntl.ioctl(asked, _ADDRESS, request)[20:24])]
+                ipv4_addresses = [socket.inet_ntoa(fcntl.ioctl(probe, _ADDRESS, request)[20:24])]
             except OSError:
-                fours = []
+                ipv4_addresses = []
             if flags & _UP:
-                addresses = (*fours, *sixes.get(name, []))
+                addresses = (*ipv4_addresses, *ipv6_addresses.get(name, []))
                 found.append(
                     Interface(
                         index,

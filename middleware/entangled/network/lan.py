@@ -132,16 +132,16 @@ class _Family:
         self._receiving_port = self._sending_port = None
 
     def _open_port(self, reactor: Any, protocol: DatagramProtocol, at: Address) -> Any:
-        with socket.socket(self.family, socket.SOCK_DGRAM) as made:
-            made.setblocking(False)
+        with socket.socket(self.family, socket.SOCK_DGRAM) as sock:
+            sock.setblocking(False)
             if at.port:
                 # Every node of this machine receives the datagrams of the group.
-                made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            self._prepare(made)
-            made.bind(at)
-            return reactor.adoptDatagramPort(made.fileno(), self.family, protocol, MAX_DATAGRAM + 1)
+                sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            self._prepare(sock)
+            sock.bind(at)
+            return reactor.adoptDatagramPort(sock.fileno(), self.family, protocol, MAX_DATAGRAM + 1)
 
-    def _prepare(self, made: socket.socket) -> None:
+    def _prepare(self, sock: socket.socket) -> None:
         raise NotImplementedError
 
     def _join(self, ear: socket.socket, index: int) -> None:
@@ -156,9 +156,9 @@ class _Ipv4(_Family):
     group = GROUP
     bound = GROUP
 
-    def _prepare(self, made: socket.socket) -> None:
-        made.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 1)
-        made.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)
+    def _prepare(self, sock: socket.socket) -> None:
+        sock.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 1)
+        sock.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)
 
     def _join(self, ear: socket.socket, index: int) -> None:
         request = struct.pack("4s4si", socket.inet_aton(self.group.host), bytes(4), index)
@@ -173,10 +173,10 @@ class _Ipv6(_Family):
     group = GROUP6
     bound = Address("::", GROUP6.port)
 
-    def _prepare(self, made: socket.socket) -> None:
-        made.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
-        made.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_MULTICAST_HOPS, 1)
-        made.setsockopt(socket.IPPROTO_IPV6, _IPV6_MULTICAST_ALL, 0)
+    def _prepare(self, sock: socket.socket) -> None:
+        sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
+        sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_MULTICAST_HOPS, 1)
+        sock.setsockopt(socket.IPPROTO_IPV6, _IPV6_MULTICAST_ALL, 0)
 
     def _join(self, ear: socket.socket, index: int) -> None:
         request = struct.pack("16si", socket.inet_pton(socket.AF_INET6, self.group.host), index)

@@ -55,11 +55,11 @@ class TcpCarrier:
         try:
             port = self._listen_on_families(accept)
         except CannotListenError as error:
-            why = getattr(error.socketError, "strerror", None) or error.socketError
+            reason = getattr(error.socketError, "strerror", None) or error.socketError
             remedy = "choose another port"
             if getattr(error.socketError, "errno", None) == errno.EACCES:
                 remedy = "permit it (AmbientCapabilities=CAP_NET_BIND_SERVICE), or use a port above 1023 behind a proxy"
-            raise TunnelPortInUse(f"TCP {self._host}:{self._wanted}: {why}; {remedy}") from error
+            raise TunnelPortInUse(f"TCP {self._host}:{self._wanted}: {reason}; {remedy}") from error
         # Accepted connections inherit the options.
         _tune(port.socket)
         self._port = port

@@ -181,17 +181,17 @@ class TunnelNetwork:
         if self._receiver is not None:
             self._ending.add(link)
         self.counters["lost" if link.socket.is_open else "refused"] += 1
-        way = self._targets.get(link.address)
-        if way is None or (bundle is not None and bundle.links):
+        target = self._targets.get(link.address)
+        if target is None or (bundle is not None and bundle.links):
             return
         if link.socket.is_open and now - link.begun_at > LAST_HOLD_S:
-            way.hold_s = FIRST_HOLD_S
+            target.hold_s = FIRST_HOLD_S
         # Measured from the attempt: an attempt that took long to fail has waited already.
-        way.hold_until = link.begun_at + way.hold_s * (0.75 + self._rng.random() / 2)
-        way.hold_s = min(2 * way.hold_s, LAST_HOLD_S)
-        if link.socket.is_open or way.last_failure != why:
-            way.last_failure = why
-            self._log.info("tunnel to {url} is not available: {why}", url=str(way.url), why=why)
+        target.hold_until = link.begun_at + target.hold_s * (0.75 + self._rng.random() / 2)
+        target.hold_s = min(2 * target.hold_s, LAST_HOLD_S)
+        if link.socket.is_open or target.last_failure != why:
+            target.last_failure = why
+            self._log.info("tunnel to {url} is not available: {why}", url=str(target.url), why=why)
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
@@ -209,24 +209,24 @@ class TunnelNetwork:
 
     def _begin(self, to: Address) -> Bundle | None:
         """Open a tunnel to a URL with one connection; return None if it may not be dialled now."""
-        way, now = self._targets.get(to), self._clock.seconds()
-        if way is None or self._receiver is None or now < way.hold_until:
+        target, now = self._targets.get(to), self._clock.seconds()
+        if target is None or self._receiver is None or now < target.hold_until:
             return None
         bundle = Bundle(to, self._carrier.strain, now)
         bundle.token = self._rng.randbytes(16)
-        self._dial(way, bundle)
+        self._dial(target, bundle)
         return self._bundles.get(to)
 
     def _adjust_links(self, bundle: Bundle, now: float) -> None:
         """Adjust the number of connections of a dialled tunnel to its loss."""
-        way = self._targets.get(bundle.address)
-        if way is None or len(bundle.links) == bundle.wanted(now) == 1:
+        target = self._targets.get(bundle.address)
+        if target is None or len(bundle.links) == bundle.wanted(now) == 1:
             return
         for link in bundle.dead(now):
             is_still = link.is_open and bundle.wanted(now) > 1
             link.end("the connection stalled" if is_still else "one connection is enough", is_rude=is_still)
         while bundle.links and len(bundle.links) < bundle.wanted(now) and now >= bundle.hold_until:
-            self._dial(way, bundle)
+            self._dial(target, bundle)
 
     def _join(self, link: Link, bundle: Bundle, now: float) -> None:
         """Add an accepted connection to the tunnel that it names; if there are too many, close the most stalled."""
@@ -243,8 +243,8 @@ class TunnelNetwork:
         if len(whole.links) > MOST:
             whole.stillest(now).end("replaced by a newer connection of the same tunnel", is_rude=True)
 
-    def _dial(self, way: _Target, bundle: Bundle) -> None:
-        url, proxy = way.url, self._proxy_for(way.url)
+    def _dial(self, target: _Target, bundle: Bundle) -> None:
+        url, proxy = target.url, self._proxy_for(target.url)
         layers: list[Layer] = []
         where = Address(url.host, url.port)
         if proxy is not None:

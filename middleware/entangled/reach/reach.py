@@ -208,7 +208,7 @@ class Reach:
         found = await self._request_introduction(attempt, helper, own, order)
         if wait:
             await self._chores.sleep(wait)
-        self._lead(attempt.peer, found, port)
+        self._assign_port(attempt.peer, found, port)
         self._punch_at(attempt, found)
 
     def _punch_at(self, attempt: _Attempt, found: list[Address]) -> None:
@@ -250,7 +250,7 @@ class Reach:
         except ValueError:
             return False
         if port:
-            self._lead(peer, candidates, port)
+            self._assign_port(peer, candidates, port)
         if peer.opening is None and not self._peers.open(peer, candidates[0], is_wanted=False):
             return False
         self.ways.introduced(public)
@@ -260,7 +260,7 @@ class Reach:
             self._peers.knock_at(opening, candidates)
         return True
 
-    def _lead(self, peer: Peer, addresses: Iterable[Address], port: int) -> None:
+    def _assign_port(self, peer: Peer, addresses: Iterable[Address], port: int) -> None:
         """Assign a local port to these addresses of a peer, except one with a working session."""
         session, before = peer.session, self._clock.seconds() - WELL_S
         used = session.contact.address if session is not None and session.heard_at > before else None
@@ -317,9 +317,9 @@ class Reach:
                 self._upgrades.add(public, self._own_id > session.contact.node_id, now)
         else:
             self._upgrades.drop(public)
-        self._wake()
+        self._schedule_tick()
 
-    def _wake(self) -> None:
+    def _schedule_tick(self) -> None:
         """Schedule the next maintenance, if there is something to maintain."""
         if not self._is_ticking and (self._upgrades or self.ways.has_holes or self._ports):
             self._is_ticking = True
@@ -332,7 +332,7 @@ class Reach:
             self._chores.fork(self._upgrade(peer, step))
         self.outside.show(now)
         self._is_ticking = False
-        self._wake()
+        self._schedule_tick()
 
     # -- helpers ----------------------------------------------------------------------------------------------------
 
@@ -351,5 +351,5 @@ class Reach:
     def _open_port(self) -> int:
         """Open an additional local port and return it; 0 if there are too many."""
         port = self._ports.open()
-        self._wake()
+        self._schedule_tick()
         return port

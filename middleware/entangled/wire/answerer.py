@@ -128,7 +128,7 @@ class Answerer:
             self._counters["late"] += 1
             return
         if not self._take_token(public):
-            self._reply(session, question.id, self._busy(question.id, _RATE_LIMITED), is_bulky)
+            self._reply(session, question.id, self._fail_busy(question.id, _RATE_LIMITED), is_bulky)
             return
         answer = self._run(question, session.contact, session, is_bulky)
         if answer is not None:
@@ -198,7 +198,7 @@ class Answerer:
         if method.is_once:
             entry = self._ledger.begin(public, question.id, session, now, is_bulky)
             if entry is None:
-                return self._busy(question.id)
+                return self._fail_busy(question.id)
         deadline = math.inf if question.left_ms == NO_LIMIT_MS else now + question.left_ms / 1000
         result = self._call_method(method, peer, question.arguments, deadline)
         if isinstance(result, Deferred):
@@ -218,7 +218,7 @@ class Answerer:
                     entry = self._ledger.begin(public, question.id, session, now, is_bulky)
                 if entry is None:
                     result.cancel()
-                    return self._busy(question.id)
+                    return self._fail_busy(question.id)
                 entry.work = result
                 if deadline < math.inf:
                     entry.timer = self._clock.callLater(deadline - now, self._expire, entry)
@@ -260,7 +260,7 @@ class Answerer:
         self._counters["refused"] += 1
         self._refused(peer, method)
 
-    def _busy(self, number: int, text: str = _BUSY) -> bytes:
+    def _fail_busy(self, number: int, text: str = _BUSY) -> bytes:
         self._counters["busy"] += 1
         return encoded(Failure(number, BUSY, text))
 

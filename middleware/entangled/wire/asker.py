@@ -194,7 +194,7 @@ class Asker:
         """Fail every request to a peer, because one of the two nodes rejects the other."""
         self._counters["untold"] += len(peer.tells)
         peer.tells = ()
-        self._fail_all(self._of(peer), error)
+        self._fail_all(self._inquiries_of(peer), error)
 
     def is_asked(self, number: int, public: bytes) -> bool:
         """Return whether the request ``number`` waits for an answer from the peer with that key."""
@@ -234,7 +234,7 @@ class Asker:
             sent += 1
         peer.tells = ()
         if is_owed:  # the peer may have lost the session in which these requests were sent
-            for inquiry in self._of(peer):
+            for inquiry in self._inquiries_of(peer):
                 if inquiry.tries:
                     self._try(inquiry)
                     sent += 1
@@ -292,8 +292,8 @@ class Asker:
                 self._open(inquiry)
             self._set_timer(inquiry, LONGEST)
         elif inquiry.tries >= self._peers.tries:
-            is_knocking = peer.opening is not None and not peer.opening.is_resting
-            if inquiry.is_patient or not is_silent or is_knocking or not peer.round_trip.is_measured:
+            is_opening = peer.opening is not None and not peer.opening.is_resting
+            if inquiry.is_patient or not is_silent or is_opening or not peer.round_trip.is_measured:
                 self._set_timer(inquiry, left)
             else:
                 self._fail(inquiry, f"no answer to {inquiry.tries} tries")
@@ -319,11 +319,11 @@ class Asker:
             inquiry.peer.taken_up(inquiry.number)
             self._queued -= 1
 
-    def _of(self, peer: Peer) -> list[Inquiry]:
+    def _inquiries_of(self, peer: Peer) -> list[Inquiry]:
         return [self._inquiries[number] for number in peer.inquiries]
 
     def _open(self, inquiry: Inquiry) -> bool:
-        """Open a session for a request, which rides in the INIT if allowed; return False if too many are being opened."""
+        """Open a session for a request, which the INIT carries if allowed; return False for too many handshakes."""
         left = inquiry.deadline - self._clock.seconds()
         rider = b"" if inquiry.changes else aged(inquiry.message, left)
         return self._peers.open(inquiry.peer, inquiry.address, rider, within=min(left, OPENING_S))
@@ -334,13 +334,13 @@ class Asker:
         self._counters["untold"] += len(peer.tells)
         peer.tells = ()
         if peer.sessions:
-            for inquiry in self._of(peer):
+            for inquiry in self._inquiries_of(peer):
                 if inquiry.tries >= self._peers.tries:  # it waited for this handshake only
                     self._on_timer(inquiry)
             return  # the others have their own timers
-        for inquiry in self._of(peer):
-            had_its_chance = inquiry.asked_at <= opening.started_at and inquiry.address == opening.address
-            if inquiry.is_patient or not had_its_chance:
+        for inquiry in self._inquiries_of(peer):
+            was_tried = inquiry.asked_at <= opening.started_at and inquiry.address == opening.address
+            if inquiry.is_patient or not was_tried:
                 if not self._open(inquiry):
                     self._fail(inquiry, _CROWDED)
             else:

@@ -122,10 +122,10 @@ class Courier:
         self._bytes_out: Counter[bytes] = Counter()
         self._assemblies: dict[tuple[bytes, Key], Assembly] = {}
         self._bytes_in: Counter[bytes] = Counter()
-        self._ended: dict[tuple[bytes, Key], None] = {}
+        self._completed: dict[tuple[bytes, Key], None] = {}
         self._sweeper: IDelayedCall | None = None
         self._cleared_at = -CLEARING_S
-        self._tardy: dict[bytes, float] = {}
+        self._penalized_at: dict[bytes, float] = {}
 
     def stop(self) -> None:
         """Forget everything and cancel every timer."""
@@ -135,8 +135,8 @@ class Courier:
         self._flows.clear()
         self._assemblies.clear()
         self._bytes_in.clear()
-        self._ended.clear()
-        self._tardy.clear()
+        self._completed.clear()
+        self._penalized_at.clear()
         self._bytes_out.clear()
 
     def reserve(self, public: bytes, size: int) -> bool:
@@ -227,7 +227,7 @@ class Courier:
         where = (public, key)
         assembly = self._assemblies.get(where)
         if assembly is None:
-            is_over = not self._is_awaited(key.id, public) if key.is_answer else where in self._ended
+            is_over = not self._is_awaited(key.id, public) if key.is_answer else where in self._completed
             if is_over:
                 self._counters["unasked" if key.is_answer else "repeated"] += 1
                 if part.is_wanted:
@@ -249,7 +249,7 @@ class Courier:
         if assembly.is_whole:
             self.forget(public, key)
             if not key.is_answer:
-                keep(self._ended, where, None, MAX_ENDED)
+                keep(self._completed, where, None, MAX_ENDED)
             self._send(public, packed_receipt(key, True, 0, part.number, assembly.here))
             self._deliver(session, key, assembly.message())
             return
@@ -263,7 +263,7 @@ class Courier:
         """Return whether another message of a peer can be buffered; slow ones are dropped to make room."""
         if self._bytes_in[public] + size > MAX_IN_OF_PEER:
             return False
-        most = MAX_IN - KEPT_FREE if now - self._tardy.get(public, -TARDY_S) < TARDY_S else MAX_IN
+        most = MAX_IN - KEPT_FREE if now - self._penalized_at.get(public, -TARDY_S) < TARDY_S else MAX_IN
         if self._bytes_in.total() + size > MAX_IN and now - self._cleared_at >= CLEARING_S:
             self._cleared_at = now
             for where in [where for where, assembly in self._assemblies.items() if assembly.is_slow(now)]:
@@ -273,7 +273,7 @@ class Courier:
     def _drop_incoming(self, where: tuple[bytes, Key], now: float) -> None:
         self._counters["abandoned"] += 1
         self.forget(*where)
-        keep(self._tardy, where[0], now, MAX_TARDY)
+        keep(self._penalized_at, where[0], now, MAX_TARDY)
 
     def _new_flow(self, public: bytes) -> Flow:
         if len(self._flows) >= MAX_FLOWS:

@@ -125,11 +125,11 @@ class Endpoint:
         self._clock = clock
         self._rng = rng
         self._identity = identity
-        self._own = Credentials.of(identity, team_key)
+        self._credentials = Credentials.of(identity, team_key)
         self._lives = Lives()
         self._stamps = Stamps()
         self._noted = Noted()
-        self._peers = Peers([self._own], clock, rng, network, self.counters, door)
+        self._peers = Peers([self._credentials], clock, rng, network, self.counters, door)
         self._courier = Courier(
             clock,
             self._send_to,
@@ -142,7 +142,7 @@ class Endpoint:
         self._answerer = Answerer(clock, self._send, self._courier, self.counters, door.may, self._refuse_call)
         self._asker = Asker(clock, rng, self._peers, self._courier, self._send, self.counters)
         self.greeter = Greeter(identity.public, self._peers, network, clock, rng, self.counters)
-        self._cookies = Cookies(self._own.cookie_key, rng)
+        self._cookies = Cookies(self._credentials.cookie_key, rng)
         self.echoer = Echoer(self.post, clock, lambda: door.fingerprint)
         self.hailer = Hailer(self.post, clock, rng)
         self._sessions = self._peers.sessions
@@ -194,7 +194,7 @@ class Endpoint:
         """
         secrets = checked_secrets([newest, *older])
         self._peers.rekey([Credentials.of(self._identity, secret) for secret in secrets])
-        self._own = self._peers.ring[0]
+        self._credentials = self._peers.ring[0]
 
     def evict(self, public: bytes, code: str = REVOKED) -> None:
         """Close the sessions with a peer: send it ``code``, and fail the requests to it with ``NotAdmitted``.
@@ -412,9 +412,9 @@ class Endpoint:
         elif data[0] == RECEIPT:
             self._courier.on_receipt(session, data)
         else:
-            self._read(data, session)
+            self._on_message(data, session)
 
-    def _read(self, data: bytes, session: Session) -> None:
+    def _on_message(self, data: bytes, session: Session) -> None:
         try:
             message = decoded(data)
         except Malformed:

@@ -48,7 +48,7 @@ class Parcel:
         "repeated",
         "_sent",
         "_next",
-        "_again",
+        "_lost_parts",
         "_head",
     )
 
@@ -63,7 +63,7 @@ class Parcel:
         self.repeated = 0  # bit n: fragment n was sent more than once, so its receipt is no measurement (Karn)
         self._sent = 0
         self._next = 0
-        self._again: deque[int] = deque()
+        self._lost_parts: deque[int] = deque()
         self._head = key.id.to_bytes(8, "little") + len(data).to_bytes(4, "little")
 
     @property
@@ -74,17 +74,17 @@ class Parcel:
     def due(self, limit: int | None = None) -> int | None:
         """Return the next fragment to send, lost ones first; None if all are under way or the receiver has no room."""
         here, most = self.here, self.room if limit is None else limit
-        while self._again and here >> self._again[0] & 1:
-            self._again.popleft()
+        while self._lost_parts and here >> self._lost_parts[0] & 1:
+            self._lost_parts.popleft()
         while self._next < self.count and here >> self._next & 1:
             self._next += 1
-        number = self._again[0] if self._again else self._next
+        number = self._lost_parts[0] if self._lost_parts else self._next
         return number if number < min(self.count, most) else None
 
     def sent(self, number: int, order: int) -> None:
         """Record that a due fragment was sent."""
-        if self._again and self._again[0] == number:
-            self._again.popleft()
+        if self._lost_parts and self._lost_parts[0] == number:
+            self._lost_parts.popleft()
         else:
             self._next = number + 1
         self.orders[number] = order
@@ -93,13 +93,13 @@ class Parcel:
         """Schedule a lost fragment for retransmission."""
         self.orders.pop(number, None)
         self.repeated |= 1 << number
-        self._again.append(number)
+        self._lost_parts.append(number)
 
     def restart(self) -> None:
         """Restart, because the receiver may have lost its fragments; if it has not, its first receipt shows them."""
         self.repeated |= (1 << self._next) - 1
         self.here, self._next, self.room = 0, 0, MAX_PARTS
-        self._again.clear()
+        self._lost_parts.clear()
         self.orders.clear()
 
     def is_turn(self) -> bool:
@@ -229,18 +229,18 @@ class Flow:
         picked: list[tuple[Parcel, int]] = []
         free = int(self._window.size) - len(self._under_way)
         while len(picked) < free:
-            parcel, number = self._pick()
+            parcel, number = self._next_in_turn()
             if parcel is None:
                 break
-            self._enter(parcel, number, now)
+            self._mark_sent(parcel, number, now)
             picked.append((parcel, number))
         # Each message requests its own receipts: for its last fragment in the burst, and for some in between.
         last = {parcel.key: place for place, (parcel, _) in enumerate(picked)}
         for place, (parcel, number) in enumerate(picked):
             self._send(parcel.part(number, parcel.is_turn() or place == last[parcel.key]))
-        self._arm(now)
+        self._set_timer(now)
 
-    def _pick(self) -> tuple[Parcel | None, int]:
+    def _next_in_turn(self) -> tuple[Parcel | None, int]:
         """Return the next message in turn and its fragment to send."""
         turns = self._turns
         self._fill_turns()
@@ -258,7 +258,7 @@ class Flow:
             others = (one for one in self.parcels.values() if one not in turns)
             turns.extend(islice(others, TURNS - len(turns)))
 
-    def _enter(self, parcel: Parcel, number: int, now: float) -> None:
+    def _mark_sent(self, parcel: Parcel, number: int, now: float) -> None:
         parcel.sent(number, self._order)
         self._under_way[self._order] = (parcel, number, now)
         self._order += 1
@@ -277,7 +277,7 @@ class Flow:
         wait = self._round_trip.wait
         return min(LONGEST, max(wait, min(LONGEST_PROBE, wait * BACK_OFF ** min(self._silences, 8))))
 
-    def _arm(self, now: float) -> None:
+    def _set_timer(self, now: float) -> None:
         if not self.parcels:
             cancel(self._timer)
             return
@@ -286,9 +286,9 @@ class Flow:
             if self._timer.getTime() <= at:
                 return  # the timer sees that it is early; resetting it at every receipt would cost more
             self._timer.cancel()
-        self._timer = self._clock.callLater(at - now, self._wake)
+        self._timer = self._clock.callLater(at - now, self._on_timer)
 
-    def _wake(self) -> None:
+    def _on_timer(self) -> None:
         now = self._clock.seconds()
         for parcel in list(self.parcels.values()):
             if now - parcel.progress_at >= IDLE_S:
@@ -315,7 +315,7 @@ class Flow:
             number = parcel.due(parcel.count)
             if number is None:
                 break
-            self._enter(parcel, number, now)
+            self._mark_sent(parcel, number, now)
             self._send(parcel.part(number, True))
 
     def _end(self, parcel: Parcel) -> None:

@@ -91,8 +91,8 @@ class Cookies:
         self._key = key
         self._rng = rng
         self._secret = rng.randbytes(32)
-        self._quiet = TokenBucket(QUIET_RATE)
-        self._most = TokenBucket(MOST_RATE)
+        self._limit = TokenBucket(QUIET_RATE)
+        self._cookie_limit = TokenBucket(MOST_RATE)
 
     def is_lawful(self, init: bytes, source: Address, now: float) -> bool:
         """Return whether the last field of an INIT is valid: zero, or made with a cookie of this node."""
@@ -101,8 +101,8 @@ class Cookies:
     def admits(self, init: bytes, source: Address, now: float) -> bool:
         """Return whether the rate limit allows a key exchange for this INIT; call it once per INIT."""
         if self._has_valid_cookie(init, source, now):
-            return self._most.take(now)
-        return self._quiet.take(now)
+            return self._cookie_limit.take(now)
+        return self._limit.take(now)
 
     def reply(self, init: bytes, source: Address, now: float, key: bytes = b"") -> bytes:
         """Return the COOKIE datagram for the sender of this INIT, sealed under ``key`` if given.

@@ -37,7 +37,7 @@ MAX_ACCOUNTS = 4096
 _PLAIN = (int, float, bool, str, bytes, list, dict, type(None))
 _BY_NAME: dict[str, tuple[type, ...]] = {kind.__name__: (kind,) for kind in _PLAIN}
 _BY_NAME |= {"None": (type(None),), "float": (float, int)}
-_INSIDE = re.compile(r"\[[^\[\]]*\]")
+_TYPE_ARGUMENTS = re.compile(r"\[[^\[\]]*\]")
 
 
 class BadArguments(Refused):
@@ -76,7 +76,7 @@ class Method:
     changes: bool = False
     is_idempotent: bool = False
     is_early: bool = False
-    _known: _Form | None = field(default=None, init=False, repr=False, compare=False)
+    _cached_form: _Form | None = field(default=None, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if self.is_early and self.changes:
@@ -85,7 +85,7 @@ class Method:
     @property
     def _form(self) -> _Form:
         """The parameters, inspected at the first call: inspecting all methods takes half the time to create a node."""
-        form = self._known
+        form = self._cached_form
         if form is None:
             answer = inspect.unwrap(self.answer)
             function = answer.__func__ if isinstance(answer, types.MethodType) else None
@@ -94,7 +94,7 @@ class Method:
                 form = self._inspect()
                 if function is not None:
                     _FORMS[function] = form
-            object.__setattr__(self, "_known", form)
+            object.__setattr__(self, "_cached_form", form)
         return form
 
     def _inspect(self) -> _Form:
@@ -146,7 +146,7 @@ def _types_in_annotation(annotation: object) -> tuple[type, ...]:
     """Return the plain types named in an annotation; none if it is not a string or names any other type."""
     if not isinstance(annotation, str):
         return ()
-    while (bare := _INSIDE.sub("", annotation)) != annotation:
+    while (bare := _TYPE_ARGUMENTS.sub("", annotation)) != annotation:
         annotation = bare
     kinds = [_BY_NAME.get(name.strip(), ()) for name in annotation.split("|")]
     return sum(kinds, ()) if all(kinds) else ()

@@ -45,11 +45,11 @@ MAC = 16
 ANSWER_ROOM = 512
 _LIFE = 8 + NONCE
 STAMP = 8
-_ASKED = INDEX_BYTES + KEY + _LIFE  # before the pass of an INIT
-_GIVEN = INDEX_BYTES + _LIFE + ADDRESS  # before the pass of a RESP
-_PAYLOAD = _ASKED + 2 + 2 + STAMP
+_INIT_PASS_AT = INDEX_BYTES + KEY + _LIFE  # before the pass of an INIT
+_RESP_PASS_AT = INDEX_BYTES + _LIFE + ADDRESS  # before the pass of a RESP
+_PAYLOAD = _INIT_PASS_AT + 2 + 2 + STAMP
 _INIT_BARE = 1 + FIRST_OVERHEAD + _PAYLOAD + 2 * MAC
-_RESP_BARE = 1 + INDEX_BYTES + SECOND_OVERHEAD + _GIVEN + 2
+_RESP_BARE = 1 + INDEX_BYTES + SECOND_OVERHEAD + _RESP_PASS_AT + 2
 RESP_LEAST = _RESP_BARE
 INIT_LEAST = _RESP_BARE + ANSWER_ROOM
 MAX_RIDER = MAX_DATAGRAM - _INIT_BARE
@@ -62,7 +62,7 @@ MAX_UNCONFIRMED = 512
 UNCONFIRMED_S = 10.0
 MAX_RESPONSES = 512
 RESPONSES_S = 30.0
-_NO_LIFE = bytes(_LIFE)
+_PACKED_UNCOUNTED = bytes(_LIFE)
 _WINDOW_MASK = (1 << WINDOW) - 1
 _pack = struct.Struct("<BIQ").pack
 """The header of a DATA datagram: its kind, the receiver's index, the counter."""
@@ -157,11 +157,11 @@ class Invitation:
         payload = payload.ljust(_PAYLOAD + hello.init_least - _INIT_BARE, b"\0")
         bare = bytes([INIT]) + self._noise.write(payload)
         self.mac = _keyed_hash(own.mac_key, bare)
-        self._proven = bare + self.mac
+        self._init_without_cookie = bare + self.mac
 
     def datagram(self, cookie: bytes = b"") -> bytes:
         """Return the INIT, which may be resent unchanged, or with a ``cookie`` that the responder requested."""
-        return self._proven + (_keyed_hash(cookie, self._proven) if cookie else bytes(MAC))
+        return self._init_without_cookie + (_keyed_hash(cookie, self._init_without_cookie) if cookie else bytes(MAC))
 
     def accepted(self, datagram: bytes) -> Reply:
         """Read a RESP and return it with the keys of the session; raise ``Forged``.
@@ -171,8 +171,8 @@ class Invitation:
         payload, keys = self._noise.copy().read(datagram[1 + INDEX_BYTES :])
         index = int.from_bytes(payload[:INDEX_BYTES], "little")
         life = _unpack_life(payload[INDEX_BYTES : INDEX_BYTES + _LIFE])
-        seen = address_of(payload[INDEX_BYTES + _LIFE : _GIVEN])
-        shown, message = _split_counted(payload, _GIVEN)
+        seen = address_of(payload[INDEX_BYTES + _LIFE : _RESP_PASS_AT])
+        shown, message = _split_counted(payload, _RESP_PASS_AT)
         if index:
             return Reply(index, life, seen, shown, message, "", keys)
         refusal = message.decode("ascii", errors="replace")
@@ -193,14 +193,14 @@ class Acceptance:
         payload, static = self._noise.read(datagram[1 : -2 * MAC])
         self.remote_index = int.from_bytes(payload[:INDEX_BYTES], "little")
         self.public = payload[INDEX_BYTES : INDEX_BYTES + KEY]
-        self.life = _unpack_life(payload[INDEX_BYTES + KEY : _ASKED])
+        self.life = _unpack_life(payload[INDEX_BYTES + KEY : _INIT_PASS_AT])
         try:
             proved = exchange_key(self.public) == static
         except (ValueError, RuntimeError, TypeError):
             proved = False
         if not proved:
             raise Forged("the key in the INIT does not match its static key")
-        self.shown, rest = _split_counted(payload, _ASKED)
+        self.shown, rest = _split_counted(payload, _INIT_PASS_AT)
         self.rider, rest = _split_counted(rest, 0)
         self.stamp = int.from_bytes(rest[:STAMP], "little")
         self._room = len(datagram) - _RESP_BARE
@@ -252,7 +252,7 @@ def _pack_life(life: Life) -> bytes:
 
 
 def _unpack_life(packed: bytes) -> Life:
-    if packed == _NO_LIFE:
+    if packed == _PACKED_UNCOUNTED:
         return UNCOUNTED
     return Life(int.from_bytes(packed[:8], "little"), packed[8:])
 
