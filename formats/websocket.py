@@ -74,7 +74,8 @@ class End(ABC):
             for event in self._socket.events():
                 if not self._process_event(event):
                     break
-        except (RemoteProtocolError, LocalProtocolError, ValueError) as error:  # ValueError: a head in no known charset
+        # ValueError: the head has an unknown charset
+        except (RemoteProtocolError, LocalProtocolError, ValueError) as error:
             self._refuse(error)
         if not (self.is_open or self.fault) and self._handshake_bytes >= MAX_HEAD:
             self.fault = f"the handshake has no end within {MAX_HEAD} bytes; the other end is not a WebSocket"
@@ -108,7 +109,7 @@ class End(ABC):
     def _fault_of(self, answer: AcceptConnection | RejectConnection | Exception) -> str:
         """Return the fault in a server's response, or an empty text if frames may follow."""
 
-    # -- inside -----------------------------------------------------------------------------------------------------
+    # -- private ----------------------------------------------------------------------------------------------------
 
     def _send(self, event: Event) -> bytes:
         try:

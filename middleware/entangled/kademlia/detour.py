@@ -89,7 +89,7 @@ class Detour:
         """Return whether a node of the team answers through any tunnel; the first answer is enough."""
         return bool(await first(1, [self._enter_by(way) for way in self._tunnels]))
 
-    # -- inside -----------------------------------------------------------------------------------------------------
+    # -- private ----------------------------------------------------------------------------------------------------
 
     async def _try_repeatedly(self, wait: float, others: Sequence[Deferred[None]]) -> None:
         """Try all tunnels repeatedly, until one leads into the network or another path did."""

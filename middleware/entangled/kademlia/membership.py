@@ -153,7 +153,7 @@ class Membership:
         """Do not try the address of ``contact`` again."""
         self._former_addresses.pop(contact.address, None)
 
-    # -- inside -----------------------------------------------------------------------------------------------------
+    # -- private ----------------------------------------------------------------------------------------------------
 
     async def _contact_any(self, known: list[Address], remembered: Sequence[Address]) -> bool:
         """Return whether any of the addresses answers; delete from ``known`` the addresses of this node itself."""
@@ -359,7 +359,7 @@ class Membership:
         return [[contact.packed(), int(away)] for contact, away in known + roster.known(self._clock.seconds())]
 
     def _answer_members(self, peer: Contact, after: bytes) -> list[object] | int | None:
-        """MEMBERS: the next page; None if the network is large, or the seconds for which others say so."""
+        """MEMBERS: the next page; None if the network is large, or the seconds for which reports of that are valid."""
         if len(after) not in (0, len(peer.node_id)):
             raise Refused("members: the argument must be empty or a node id of 20 bytes")
         overlay = self._overlay

@@ -492,7 +492,7 @@ class Overlay:
             if at > before or node_id in kept or table.get(node_id) is not None
         }
 
-    # -- inside -----------------------------------------------------------------------------------------------------
+    # -- private ----------------------------------------------------------------------------------------------------
 
     async def _wait(self, is_over: Callable[[], bool], steps: int, step: float) -> None:
         """Wait until ``is_over``, checking every ``step`` seconds, at most ``steps`` times."""

@@ -31,7 +31,7 @@ SESSION_S = 120.0
 """The silence in seconds after which a session is deleted in a large network: there are too many peers to keep all."""
 
 LEAST, FIRST, MOST = 15.0, 60.0, 300.0
-"""The silence in seconds after which a distant contact is probed: least, initial and most."""
+"""The silence in seconds after which a distant contact is probed: minimum, initial and maximum."""
 GONE = 0.05
 LONGER = 2.0 ** (GONE / (1 - GONE))
 """The factor by which the silence grows with each answer."""
@@ -123,7 +123,7 @@ class Sounding:
         self.pace.lost()
         self._next_far = float("-inf")
 
-    # -- inside -----------------------------------------------------------------------------------------------------
+    # -- private ----------------------------------------------------------------------------------------------------
 
     def _maintain(self, now: float) -> None:
         """Run the infrequent maintenance."""

@@ -127,7 +127,7 @@ class Bundle:
             return []
         return [link for link in links if self._stalled_s(self._paces[link], now) > DEAD_S]
 
-    # -- inside -----------------------------------------------------------------------------------------------------
+    # -- private ----------------------------------------------------------------------------------------------------
 
     def _measure_progress(self, link: Link, now: float) -> None:
         pace = self._paces.setdefault(link, _Pace(now))

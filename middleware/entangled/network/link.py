@@ -204,7 +204,7 @@ class Link(StreamProtocol):
     def stopProducing(self) -> None:
         """Do nothing; ``connectionLost`` follows."""
 
-    # -- inside -----------------------------------------------------------------------------------------------------
+    # -- private ----------------------------------------------------------------------------------------------------
 
     def _begin(self, number: int) -> None:
         """Send the first bytes of a layer, or of the WebSocket inside all layers."""

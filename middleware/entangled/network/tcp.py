@@ -31,7 +31,7 @@ LONGEST_WAIT_MS = 1000
 """The maximum retransmission timeout in milliseconds (Linux 6.15 and later)."""
 _INFO_BYTES = 148
 UNSENT = 16 * 1024
-"""The bytes of a stream that the system may buffer (Linux): it drops none of them, so all of them are delayed."""
+"""The bytes of a stream that the system may buffer (Linux): buffered bytes cannot be dropped, so they arrive late."""
 
 
 class TcpCarrier:

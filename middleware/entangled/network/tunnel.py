@@ -193,7 +193,7 @@ class TunnelNetwork:
             target.last_failure = why
             self._log.info("tunnel to {url} is not available: {why}", url=str(target.url), why=why)
 
-    # -- inside -----------------------------------------------------------------------------------------------------
+    # -- private ----------------------------------------------------------------------------------------------------
 
     @cached_property
     def _client_context(self) -> ssl.SSLContext:

@@ -148,7 +148,7 @@ class UdpNetwork:
         families = {is_six for _, is_six in self._ports}
         return [host for host in self._hosts if (":" in host) in families]
 
-    # -- inside -----------------------------------------------------------------------------------------------------
+    # -- private ----------------------------------------------------------------------------------------------------
 
     def _open(self, number: int | None, host: str, wanted: int) -> int:
         """Open a port under the key ``number``, or under its port number if None; return its port number."""

@@ -296,7 +296,7 @@ class Reach:
             self._chores.later(wait, self._start_punching, public, found, port, HELD_S)
         return [packed(own), bool(port)]
 
-    # -- upkeep -----------------------------------------------------------------------------------------------------
+    # -- maintenance ------------------------------------------------------------------------------------------------
 
     def _open_again(self, teller: Contact) -> None:
         """Reopen the sessions through NAT mappings, and soon retry direct paths."""

@@ -59,7 +59,7 @@ class Upgrades:
             upgrade.due, upgrade.step = now, 0
 
     def due(self, now: float) -> Iterator[tuple[Peer, int]]:
-        """Yield the peers that are due with their previous attempts; silent ones are given up."""
+        """Yield each peer that is due and the number of its earlier attempts; silent peers are given up."""
         for public, upgrade in list(self._upgrades.items()):
             peer = self._peers.known(public)
             if peer is None or peer.session is None or now - peer.session.heard_at > GIVEN_UP_S:

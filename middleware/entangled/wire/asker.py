@@ -329,7 +329,7 @@ class Asker:
         return self._peers.open(inquiry.peer, inquiry.address, rider, within=min(left, OPENING_S))
 
     def _fail_unanswered(self, opening: Opening) -> None:
-        """Fail the requests that waited for a handshake without an answer."""
+        """Fail the requests that waited for a handshake that got no answer."""
         peer = opening.peer
         self._counters["untold"] += len(peer.tells)
         peer.tells = ()

@@ -148,7 +148,7 @@ class Courier:
         return True
 
     def release(self, public: bytes, size: int) -> None:
-        """Return the room of a message that is no longer buffered."""
+        """Free the room of a message that is no longer buffered."""
         self._bytes_out[public] -= size
         if self._bytes_out[public] <= 0:
             del self._bytes_out[public]

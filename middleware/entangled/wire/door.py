@@ -27,7 +27,7 @@ MAX_ROOM = 640
 """The maximum length of a pass in bytes, which leaves room for a request in the handshake."""
 MAX_LIFE = 2**63 - 1
 MAX_LIVES = 4096
-"""The number of identities with a remembered incarnation; the entry with the oldest contact is deleted first."""
+"""The number of identities with a remembered incarnation; the least recently met one is deleted first."""
 MAX_NOTED = 1024
 LINES = 20.0
 

@@ -198,7 +198,7 @@ class Entry:
 
 @dataclass(slots=True)
 class _Account:
-    """The requests of one peer; ``settled`` has, for each of its restarts, the id below which none is open."""
+    """The requests of one peer; ``settled`` has, for each incarnation of the peer, the id below which none is open."""
 
     running: dict[int, Entry] = field(default_factory=dict)
     ended: dict[int, Entry] = field(default_factory=dict)
