@@ -2,8 +2,8 @@
 
 A TCP stream stalls while lost segments are retransmitted, often for seconds at 30 % loss in each direction, and
 everything behind them is delayed.  Parallel streams seldom stall at the same time.  Therefore a tunnel has three
-connections after a recent stall, and sends each datagram over the two that make progress; the receiver drops duplicates
-by their counters.
+connections after a recent stall, and sends each datagram over the two that make progress; the receiving endpoint drops
+duplicates.
 """
 
 from __future__ import annotations

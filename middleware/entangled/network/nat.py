@@ -2,14 +2,14 @@
 
 The kinds differ in their mapping and filtering, in the terms of RFC 4787; two further kinds are common too:
 
-| kind    | mapping                           | accepts from                    |
-|---------|-----------------------------------|---------------------------------|
-| `full`  | one port per inner address        | every address                   |
-| `addr`  | the same                          | hosts that received a datagram  |
-| `port`  | the same                          | addresses that received one     |
-| `leaky` | the same, until a port is burnt   | the same                        |
-| `sym`   | one port per inner and target     | the same                        |
-| `noudp` | none                              | no address                      |
+| kind    | mapping                                | accepts from                   |
+|---------|----------------------------------------|--------------------------------|
+| `full`  | one port per inner address             | every address                  |
+| `addr`  | the same                               | hosts that received a datagram |
+| `port`  | the same                               | addresses that received one    |
+| `leaky` | the same, unless the port is occupied  | the same                       |
+| `sym`   | one port per inner address and target  | the same                       |
+| `noudp` | none                                   | no address                     |
 
 A *leaky* router takes an unsolicited datagram for its own and remembers the sender: an inner node that then sends to
 that sender gets another port, because the usual one is occupied (a Linux router with MASQUERADE and without firewall).
@@ -45,7 +45,7 @@ class Nat:
         self.lifetime = lifetime
         self._rng = rng
         self._mappings: dict[int, _Mapping] = {}
-        self._burnt: dict[tuple[int, Address], float] = {}
+        self._occupied: dict[tuple[int, Address], float] = {}
         self._port_offset = 0
 
     def out(self, inner: Address, to: Address, now: float) -> Address | None:
@@ -66,7 +66,7 @@ class Nat:
         mapping = self._mappings.get(port)
         if mapping is None or not self._accepts(mapping, source):
             if self.kind == "leaky":
-                self._burnt[port, source] = now
+                self._occupied[port, source] = now
             return None
         mapping.heard[source] = now
         return mapping.inner
@@ -74,7 +74,7 @@ class Nat:
     def rebind(self) -> None:
         """Forget every mapping, as after a restart; new ones get other ports."""
         self._mappings.clear()
-        self._burnt.clear()
+        self._occupied.clear()
         self._port_offset = self._rng.randrange(1, 10_000)
 
     def _find_mapping(self, inner: Address, to: Address) -> _Mapping | None:
@@ -83,14 +83,14 @@ class Nat:
             return next((mapping for mapping in mine if to in mapping.heard), None)
         if self.kind == "leaky":
             at = next((mapping for mapping in mine if to in mapping.heard), None)
-            return at or next((mapping for mapping in mine if (mapping.port, to) not in self._burnt), None)
+            return at or next((mapping for mapping in mine if (mapping.port, to) not in self._occupied), None)
         return next(iter(mine), None)
 
     def _free_port(self, inner: Address, to: Address) -> int:
         port = inner.port + self._port_offset
         while (
             port in self._mappings
-            or (port, to) in self._burnt
+            or (port, to) in self._occupied
             or (self.kind == "sym" and port == inner.port + self._port_offset)
             or port > 65535
         ):
@@ -111,5 +111,5 @@ class Nat:
                 del mapping.heard[to]
             if not mapping.heard:
                 del self._mappings[port]
-        for burnt in [burnt for burnt, at in self._burnt.items() if at < old]:
-            del self._burnt[burnt]
+        for burnt in [burnt for burnt, at in self._occupied.items() if at < old]:
+            del self._occupied[burnt]

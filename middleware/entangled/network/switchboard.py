@@ -32,7 +32,7 @@ class Weather:
     """The conditions of a link.
 
     Each datagram takes ``delay_s``, plus or minus up to ``jitter_s`` (uniform), at least 0.  ``loss``, ``duplicate``
-    and ``reorder`` are probabilities from 0 to 1; a reordered datagram takes ``delay_s`` and a millisecond more.
+    and ``reorder`` are probabilities from 0 to 1; a reordered datagram is delayed by a further ``delay_s`` plus 1 ms.
     """
 
     delay_s: float = 0.0

@@ -51,8 +51,8 @@ WE_WAIT = {3: 0.15, 5: 0.7}
 THEY_WAIT = {2: 0.15, 4: 0.7}
 ORDERS = (2, 3, 4, 5, AT_ONCE)
 """The order in which the two peers send INITs: from their usual ports; or from additional ones, at the same time or
-with a delay.  An INIT that arrives too early spoils the port of some routers and is harmless to others, which is
-unknown here.
+with a delay.  An INIT that arrives too early spoils the port of some routers.  The kind of the router is not known, so
+all orders are tried.
 """
 UPGRADING_S = 1.2
 TICK = 1.0

@@ -167,10 +167,10 @@ class Window:
 
 
 class Loss:
-    """The recent rate of datagrams to this node that were lost, as ``share``.
+    """Measures the recent loss rate (``share``) of the datagrams to this node.
 
     Each session numbers the datagrams that it sends, so a gap in the received numbers is a loss, as in the reports of
-    RTP (RFC 3550, section 6.4.1). Unlike a count of retransmissions, it does not mistake a slow answer for a lost one.
+    RTP (RFC 3550, section 6.4.1).  Unlike a count of retransmissions, it does not mistake a slow answer for a lost one.
     """
 
     __slots__ = ("share", "_gain")

@@ -132,7 +132,7 @@ class Door(Protocol):
         return Authority()
 
     def roles_of(self, public: bytes) -> frozenset[str] | None:
-        """Return the present roles of the holder of a key; none for a stranger or a revoked or expired member.
+        """Return the present roles of the holder of a key; empty for a stranger or a revoked or expired member.
 
         None means that the team is open and restricts no node.
         """

@@ -188,9 +188,9 @@ class Endpoint:
     def rekey(self, newest: bytes, *older: bytes) -> None:
         """Replace the secret of the team (32 bytes); existing sessions continue.
 
-        This node opens handshakes under the ``newest`` secret.  It accepts handshakes under the ``older`` ones too
-        while not all members have the newest, and retries a peer that does not answer under the next secret.  Raises
-        ``ValueError`` for an invalid secret.
+        This node opens handshakes under the ``newest`` secret.  While not all members have it, handshakes under the
+        ``older`` ones are accepted too, and a peer that does not answer under one secret is retried under the next.
+        Raises ``ValueError`` for an invalid secret.
         """
         secrets = checked_secrets([newest, *older])
         self._peers.rekey([Credentials.of(self._identity, secret) for secret in secrets])
@@ -272,7 +272,7 @@ class Endpoint:
         changes: bool = False,
         is_light: bool = False,
     ) -> Deferred[Any]:
-        """Send a request to a peer, with up to four tries within ``timeout`` seconds.
+        """Send a request to a peer, with four tries (more at a high loss rate) within ``timeout`` seconds.
 
         Request and answer may have ``MAX_MESSAGE`` bytes; if larger than a datagram they are sent in fragments.  Of
         many requests to one peer the later ones wait in a queue.  The default timeout is 1.5 s, counted from the moment

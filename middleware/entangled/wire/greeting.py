@@ -124,7 +124,7 @@ class Cookies:
 
 
 class Greeter(Probes[Contact]):
-    """Discovers the node at an address, answers discovery requests, and answers cookies.
+    """Discovers the node at an address, answers discovery requests, and resends INITs with requested cookies.
 
     It tries each secret in the ring of ``peers`` in turn, the newest first.
     """

@@ -301,7 +301,7 @@ class Ledger:
     def _account(self, public: bytes, now: float) -> _Account | None:
         """Return the account of a peer without its expired requests; None if there is no room for another one.
 
-        The peer that was silent for longest is deleted, if that is long enough.
+        The account that was unused for longest is deleted if it has no requests and is older than ``KEPT_S``.
         """
         account = self._accounts.pop(public, None)
         if account is None:

@@ -41,8 +41,8 @@ KNOCK_S, KNOCKS = 0.1, 16
 """The seconds between INITs during hole punching, and the number of them after which the interval grows."""
 LIVELY_S = 3.0
 IN_TOUCH = 105.0
-"""Seconds of silence up to which the other side of a session still has it, in a wide network.  It is less than the time
-after which a session is forgotten, by more than the difference between the last datagrams of both sides.
+"""Seconds of silence up to which the other side of a session still has it, in a wide network.  It is shorter than the
+time after which a session is forgotten; the margin covers the difference between the last datagrams of both sides.
 """
 SESSION_LIFE_S = 120.0
 """The age in seconds at which a session is replaced when something is sent in it."""
@@ -76,10 +76,11 @@ def _remove_number(numbers: Mapping[int, None], number: int) -> Mapping[int, Non
 class Opening:
     """A handshake of this node that waits for its RESP.
 
-    It was begun at ``address``; ``doors`` maps every address to which the INIT is sent to the cookie that was requested
-    there; it should succeed ``within`` that many seconds.  Until ``held_until`` other nodes help with hole punching,
-    and the handshake continues regardless of its tries.  ``is_wanted``: a request waits for it; otherwise it was begun
-    to admit the peer or to find a better path.  While it ``is_resting`` it sends nothing and waits for a late RESP.
+    It was begun at ``address``.  ``doors`` maps every address to which the INIT is sent to the cookie that was
+    requested there.  The session is needed ``within`` that many seconds.  Until ``held_until`` other nodes help with
+    hole punching, and the handshake continues regardless of its tries.  ``is_wanted``: a request waits for it;
+    otherwise it was begun to admit the peer or to find a better path.  While it ``is_resting`` it sends nothing and
+    waits for a late RESP.
     """
 
     invitation: Invitation
@@ -255,11 +256,12 @@ class Peers:
         return max(MAX_TRIES, self.loss.tries)
 
     def spacing(self, round_trip: RoundTrip, tries: int, within: float) -> float:
-        """Return the seconds between the try number ``tries`` and the next one, to succeed ``within`` some seconds.
+        """Return the seconds between the try number ``tries`` and the next one.
 
-        Each interval is longer than the one before, up to the usual number of tries.  At a high loss rate the tries are
-        as close together as necessary to fit the required number, but none is sent before most answers would have
-        arrived.  The estimate for an unknown peer, which may be near or far, is the mean over all peers.
+        ``within`` is the time in seconds in which the request should succeed.  Each interval is longer than the one
+        before, up to the usual number of tries.  At a high loss rate the tries are as close together as necessary to
+        fit the required number, but none is sent before most answers would have arrived.  The estimate for an unknown
+        peer, which may be near or far, is the mean over all peers.
         """
         wait = round_trip.wait * BACK_OFF ** (min(tries, MAX_TRIES) - 1)
         likely = round_trip.likely if round_trip.is_measured else self.usual.mean
