@@ -21,19 +21,19 @@ def size_of(data: bytes) -> tuple[int, int] | None:
     """Return width and height in pixels of a complete JPEG; None if it is invalid, truncated or beyond the limits."""
     if not data.startswith(b"\xff\xd8") or not data.endswith(b"\xff\xd9"):
         return None
-    place = 2
-    while place + 9 <= len(data) and data[place] == 0xFF:
-        kind = data[place + 1]
+    offset = 2
+    while offset + 9 <= len(data) and data[offset] == 0xFF:
+        kind = data[offset + 1]
         if kind == 0xFF or kind in _BARE:
-            place += 1 if kind == 0xFF else 2
+            offset += 1 if kind == 0xFF else 2
             continue
         if kind in _START_OF_FRAME:
-            height, width = int.from_bytes(data[place + 5 : place + 7]), int.from_bytes(data[place + 7 : place + 9])
-            return (width, height) if _is_within_limits(width, height, data, place) else None
-        length = int.from_bytes(data[place + 2 : place + 4])
+            height, width = int.from_bytes(data[offset + 5 : offset + 7]), int.from_bytes(data[offset + 7 : offset + 9])
+            return (width, height) if _is_within_limits(width, height, data, offset) else None
+        length = int.from_bytes(data[offset + 2 : offset + 4])
         if length < 2 or kind in _OTHER_FRAMES or kind in (0xD8, 0xD9, 0xDA):
             return None
-        place += 2 + length
+        offset += 2 + length
     return None
 
 

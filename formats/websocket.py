@@ -156,8 +156,8 @@ class End(ABC):
             self._messages.append(bytes(self._part))
             self._part = bytearray()
 
-    def _fail(self, why: str, code: int = BAD) -> None:
-        self.fault = why
+    def _fail(self, reason: str, code: int = BAD) -> None:
+        self.fault = reason
         self._reply.append(self.closing(code))
 
     def _refuse(self, error: Exception) -> None:

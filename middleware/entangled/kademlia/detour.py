@@ -102,18 +102,18 @@ class Detour:
             wait = pause * (0.75 + self._rng.random() / 2)
             pause = min(pause * 2, BACKOFF[1])
 
-    async def _enter_by(self, way: Address) -> bool:
-        contact = await self._endpoint.greet(way, GREET_S)
+    async def _enter_by(self, address: Address) -> bool:
+        contact = await self._endpoint.greet(address, GREET_S)
         if contact.node_id == self._overlay.own_id:
-            raise NoAnswer(f"{way} is the address of this node itself")
+            raise NoAnswer(f"{address} is the address of this node itself")
         await self._enter(contact)
         return True
 
     def _try_direct(self) -> None:
         """Check at growing intervals whether the nodes behind tunnels answer over UDP."""
-        there = {contact.node_id for contact in self._overlay.contacts() if contact.address in self._tunnels}
+        tunnelled = {contact.node_id for contact in self._overlay.contacts() if contact.address in self._tunnels}
         now = self._clock.seconds()
-        if not there:
+        if not tunnelled:
             self._tries, self._next_at = 0, float("inf")
         elif self._next_at == float("inf"):
             self._next_at = now + AGAIN_S[0]
@@ -121,10 +121,10 @@ class Detour:
             self._tries += 1
             self._next_at = now + AGAIN_S[min(self._tries, len(AGAIN_S) - 1)]
             for address in self._known:
-                self._chores.fork(self._reopen_direct(address, there))
+                self._chores.fork(self._reopen_direct(address, tunnelled))
 
-    async def _reopen_direct(self, address: Address, there: set[bytes]) -> None:
+    async def _reopen_direct(self, address: Address, tunnelled: set[bytes]) -> None:
         found = await self._endpoint.greet(address, DIRECT_S)
-        if found.node_id in there:
+        if found.node_id in tunnelled:
             self._log.info("{address} is reachable over UDP again", address=address)
             self._endpoint.reopen(found)

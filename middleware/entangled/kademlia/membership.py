@@ -211,10 +211,10 @@ class Membership:
                 try:
                     return await self._fetch_members(contact)
                 except NoAnswer:
-                    there = self._overlay.roster.live()
-                    if not there:
+                    live = self._overlay.roster.live()
+                    if not live:
                         return  # the next contact will be asked
-                    contact = there[self._rng.randrange(len(there))]
+                    contact = live[self._rng.randrange(len(live))]
         finally:
             self._joining = False
 

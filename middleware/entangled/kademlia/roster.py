@@ -123,8 +123,8 @@ class Roster:
 
     def known(self, now: float) -> list[tuple[Contact, float]]:
         """Return the settled members, and the seconds of their absence."""
-        there = [(m.contact, 0.0) for m in self._live if m.is_settled]
-        return there + [(m.contact, now - m.lost_at) for m in self._absent if m.lost_at is not None and m.is_settled]
+        present = [(m.contact, 0.0) for m in self._live if m.is_settled]
+        return present + [(m.contact, now - m.lost_at) for m in self._absent if m.lost_at is not None and m.is_settled]
 
     def closest(self, key: bytes, count: int, me: Contact) -> list[Contact]:
         """Return the ``count`` live members closest to ``key``, including this node (``me``), closest first."""
@@ -152,10 +152,10 @@ class Roster:
             self._sort()
         return [member.contact for member in struck]
 
-    def _is_majority(self, there: list[_Member]) -> bool:
+    def _is_majority(self, present: list[_Member]) -> bool:
         """Return whether these and this node are a majority of the settled members; True if none is settled."""
-        everybody = self.is_settled + sum(member.is_settled for member in self._members.values())
-        return not everybody or 2 * (self.is_settled + sum(member.is_settled for member in there)) > everybody
+        total = self.is_settled + sum(member.is_settled for member in self._members.values())
+        return not total or 2 * (self.is_settled + sum(member.is_settled for member in present)) > total
 
     def _make_room(self) -> bool:
         if not self._absent:

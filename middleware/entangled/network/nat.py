@@ -78,13 +78,13 @@ class Nat:
         self._port_offset = self._rng.randrange(1, 10_000)
 
     def _find_mapping(self, inner: Address, to: Address) -> _Mapping | None:
-        mine = [mapping for mapping in self._mappings.values() if mapping.inner == inner]
+        own = [mapping for mapping in self._mappings.values() if mapping.inner == inner]
         if self.kind == "sym":
-            return next((mapping for mapping in mine if to in mapping.heard), None)
+            return next((mapping for mapping in own if to in mapping.heard), None)
         if self.kind == "leaky":
-            at = next((mapping for mapping in mine if to in mapping.heard), None)
-            return at or next((mapping for mapping in mine if (mapping.port, to) not in self._occupied), None)
-        return next(iter(mine), None)
+            at = next((mapping for mapping in own if to in mapping.heard), None)
+            return at or next((mapping for mapping in own if (mapping.port, to) not in self._occupied), None)
+        return next(iter(own), None)
 
     def _free_port(self, inner: Address, to: Address) -> int:
         port = inner.port + self._port_offset

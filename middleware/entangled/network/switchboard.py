@@ -292,16 +292,16 @@ class Switchboard:
         own = self._links.get((source, to)) if self._links else None
         weather = own or self.weather
         routers = (home, self._routers.get(to.host)) if self._routers else ()
-        further = [self.router_weather[router] for router in routers if router is not None] if routers else []
+        router_conditions = [self.router_weather[router] for router in routers if router is not None] if routers else []
         delays: Sequence[float]
         if self.link is not None and own is None:
             delays = self.link.delays(source, to, len(datagram), self._clock.seconds(), self._rng)
-        elif weather is CALM and not further:
+        elif weather is CALM and not router_conditions:
             self._clock.callLater(0.0, self._deliver, source, to, datagram)
             return
         else:
             delays = weather.delays(self._rng)
-        for each in further:
+        for each in router_conditions:
             delays = [delay + more for delay in delays for more in each.delays(self._rng)]
         if len(delays) != 1:
             self.counters["duplicated" if delays else "lost"] += 1
@@ -330,9 +330,9 @@ class Switchboard:
             return
         self.counters["delivered"] += 1
         names = self._names
-        here = names.get(source) or self._add_name(source)
-        there = names.get(to) or self._add_name(to)
-        route = f"{here}>{there} {len(datagram)}:".encode()
+        source_name = names.get(source) or self._add_name(source)
+        target_name = names.get(to) or self._add_name(to)
+        route = f"{source_name}>{target_name} {len(datagram)}:".encode()
         self._untraced += (struct.pack("<d", self._clock.seconds()), route, datagram)
         if len(self._untraced) > 3 * _BATCH:
             self._hash()

@@ -166,12 +166,12 @@ class UdpNetwork:
     def _open_ipv6(self, wanted: int) -> None:
         """Open the IPv6 port next to the IPv4 one; Twisted would open one that receives both."""
         try:
-            with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as six:
-                six.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
-                six.setblocking(False)
-                six.bind(("::", wanted))
+            with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as sock:
+                sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
+                sock.setblocking(False)
+                sock.bind(("::", wanted))
                 port = self._reactor.adoptDatagramPort(
-                    six.fileno(), socket.AF_INET6, _Protocol(self, 0), MAX_CARRIED + 1
+                    sock.fileno(), socket.AF_INET6, _Protocol(self, 0), MAX_CARRIED + 1
                 )
         except OSError as error:
             if error.errno == errno.EADDRINUSE:
@@ -221,11 +221,11 @@ class UdpNetwork:
             self._receiver(datagram, source)
 
 
-def _port_in_use(host: str, port: int, trouble: Any) -> PortInUse:
-    why = getattr(trouble, "strerror", None) or trouble
-    is_foreign = getattr(trouble, "errno", None) == errno.EADDRNOTAVAIL
+def _port_in_use(host: str, port: int, error: Any) -> PortInUse:
+    reason = getattr(error, "strerror", None) or error
+    is_foreign = getattr(error, "errno", None) == errno.EADDRNOTAVAIL
     remedy = "give host an address of this machine" if is_foreign else "choose another port, or 0 for any"
-    return PortInUse(f"UDP {host}:{port}: {why}; {remedy}")
+    return PortInUse(f"UDP {host}:{port}: {reason}; {remedy}")
 
 
 def _own_hosts() -> list[str]:

@@ -275,20 +275,20 @@ class Reach:
         if not self._allowance.may_meet(peer.public):
             raise Refused("too many introductions to nodes that do not answer")
         found = [address for address in unpacked(candidates) if self._is_usable(address)]
-        stranger = node_id(public)
-        if stranger == self._own_id:
+        wanted_id = node_id(public)
+        if wanted_id == self._own_id:
             raise Refused("the peer to meet is this node itself")
         self._known.note(public)
         self._allowance.introduced(public, peer.public)
         if not is_relayed(peer.address):
-            self._carriers.note(stranger, peer.public)
+            self._carriers.note(wanted_id, peer.public)
         self._upgrades.put_off(public, self._clock.seconds())
         port, own = 0, self._own_candidates(peer)
         session = self._peers.direct_session(peer.public)
-        if order != USUAL and session is not None and (further := self._open_port()):
-            seen = await self.mirror.look(session, further)
+        if order != USUAL and session is not None and (additional := self._open_port()):
+            seen = await self.mirror.look(session, additional)
             if seen is not None:
-                port, own = further, [seen, self._paths.local(peer.address, further)]
+                port, own = additional, [seen, self._paths.local(peer.address, additional)]
         if found:
             # The other peer gets our addresses later, through the introducer: both must send at the same time, because
             # an INIT that arrives too early may spoil the port of a router.

@@ -205,7 +205,7 @@ class Flow:
         if receipt.is_done or parcel.is_done:
             self._end(parcel)
         elif not receipt.room:
-            self._mark_lost([order for order, (whose, _, _) in self._under_way.items() if whose is parcel])
+            self._mark_lost([order for order, (owner, _, _) in self._under_way.items() if owner is parcel])
         self._detect_losses(now)
         self._pump(now)
 
