@@ -31,8 +31,7 @@ NORMAL, BAD = 1000, 1002
 """Close codes."""
 MAX_FRAMES = 2048
 """The maximum number of frames in one read of at most 64 KiB; more are nearly empty frames, which cost more to receive
-than to send.
-"""
+than to send."""
 
 
 class End(ABC):
@@ -47,8 +46,7 @@ class End(ABC):
         self.fault = ""
         self.frames = 0
         """The number of complete frames received.  If bytes arrive and it does not grow, the length of a frame may be
-        corrupt.
-        """
+        corrupt."""
         self._request = request
         self._longest = longest
         self._takes_text = takes_text

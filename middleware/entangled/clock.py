@@ -22,10 +22,9 @@ _COMPACT_FROM = 64
 
 
 def boot_time() -> Callable[[], float]:
-    """Return a clock of the seconds since the machine started, including those in which it was suspended.
+    """Return a clock of the seconds since the machine started, including suspension, independent of the wall clock.
 
-    It is not affected by changes of the wall clock.  On systems without CLOCK_BOOTTIME it is ``time.monotonic``, which
-    may stop during suspension.
+    On systems without CLOCK_BOOTTIME it is ``time.monotonic``, which may stop during suspension.
     """
     if hasattr(time, "CLOCK_BOOTTIME"):
         return partial(time.clock_gettime, time.CLOCK_BOOTTIME)

@@ -111,8 +111,7 @@ class Streams:
     def look(self, publisher: Contact, channel: str, on_frame: OnFrame) -> Callable[[], None]:
         """Call ``on_frame(sequence, frame, age)`` for each complete new frame; return a function that stops it.
 
-        ``age`` is the time in seconds since the frame was taken: its age at the publisher plus half a measured round
-        trip.
+        ``age`` is the seconds since the frame was taken: its age at the publisher and half a measured round trip.
         """
         place = (publisher.node_id, channel)
         look = self._views.get(place)

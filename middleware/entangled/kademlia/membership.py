@@ -42,12 +42,10 @@ AGAIN = 4.0
 """The seconds before an absent member, or one that was only named, is tried again."""
 LARGE_FOR = 60.0
 """The seconds for which one notification that the network is large is valid.  A node that gets no further one for as
-long again starts to learn all members again.
-"""
+long again starts to learn all members again."""
 BREATH = 0.02
 """The seconds that a newcomer waits before it contacts the next few unknown members, so that first reads are not
-delayed; up to as much again is added at random.
-"""
+delayed; up to as much again is added at random."""
 AT_ONCE = 8
 """The number of unknown members that are contacted at the same time: a handshake takes 0.3 ms of a core on each side.
 """

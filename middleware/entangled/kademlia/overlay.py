@@ -39,12 +39,10 @@ FRESH = 0.1
 """The seconds within which further datagrams of a contact are not recorded."""
 FIRST_HEDGE, MOST_HEDGE = 0.01, 0.15
 """The delay of a hedged request in seconds: before the first measurement, and at most.  Otherwise it is the time within
-which nearly all answers arrive.
-"""
+which nearly all answers arrive."""
 LEAST_PATIENCE, MOST_PATIENCE, TRIES = 0.4, 2.5, 2.6
 """The minimum and maximum timeout in seconds of a lookup's request in a large network, and the number of initial
-timeouts that it lasts: enough for two tries; at a high loss rate it lasts longer.
-"""
+timeouts that it lasts: enough for two tries; at a high loss rate it lasts longer."""
 MAX_FOUND = 512
 """The number of keys for which the result of the last lookup is cached."""
 MAX_HEARD = 4096

@@ -122,10 +122,7 @@ class Proxied:
 
 
 def client_context() -> ssl.SSLContext:
-    """Return the TLS context of a client.
-
-    It verifies no certificate: the Noise handshake inside authenticates the peer.
-    """
+    """Return a client's TLS context; it verifies no certificate, because Noise authenticates the peer."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname = False
     context.verify_mode = ssl.CERT_NONE

@@ -23,8 +23,7 @@ from middleware.entangled.network.websocket import WebSocket
 
 SHORT = 300
 """The length limit of short datagrams: heartbeats, receipts, discovery and most requests; full fragments have 1400
-bytes.
-"""
+bytes."""
 MAX_WAITING, MAX_LONG = 40 * 1024, 32 * 1024
 """The bytes that may wait in the transport, which cannot reorder them; with the queues less than 64 KiB."""
 MAX_SENDING = 16 * 1024

@@ -17,10 +17,7 @@ GROUP6 = Address("ff02::8357", 8483)
 
 
 class Multicast(Protocol):
-    """One node's membership of the group.
-
-    All nodes on the LAN receive its datagrams, and reply to their source address.
-    """
+    """One node's membership of the group; all nodes on the LAN receive its datagrams and reply to their source."""
 
     def listen(self, receiver: Receiver, moved: Callable[[], None]) -> None:
         """Pass each datagram from the group, and each reply, to ``receiver``; never raises.

@@ -84,10 +84,9 @@ class Traffic:
 
 
 class SwitchboardNetwork:
-    """One node's port on a ``Switchboard``; a ``Network`` and ``Ports``.
+    """One node's port on a ``Switchboard``, behind the router ``home``; a ``Network`` and ``Ports``.
 
-    ``home`` is the router of its private network.  ``traffic`` counts its datagrams; it may be passed on to the port of
-    a restarted node.
+    ``traffic`` counts its datagrams; it may be passed on to the port of a restarted node.
     """
 
     def __init__(

@@ -24,8 +24,7 @@ CONNECT_S = 3.0
 _NOTSENT_LOWAT = 25
 _THIN_LINEAR_TIMEOUTS = 16
 """Retransmit a stream with little data in flight, as here, six times without exponential backoff (Linux, tcp(7)):
-otherwise a stream would stall for seconds at 30 % loss.
-"""
+otherwise a stream would stall for seconds at 30 % loss."""
 _RTO_MAX_MS = 44
 LONGEST_WAIT_MS = 1000
 """The maximum retransmission timeout in milliseconds (Linux 6.15 and later)."""

@@ -44,8 +44,7 @@ MAX_BEGUN = 64
 """The maximum number of connections that are not open yet; beyond it the oldest is closed."""
 MAX_OF_HOST = 32
 """The maximum number of connections of one address to which the node has sent nothing.  Because a team behind one NAT
-shares an address, all its connections together may be as many as this number of tunnels has.
-"""
+shares an address, all its connections together may be as many as this number of tunnels has."""
 FIRST_HOLD_S, LAST_HOLD_S = 0.5, 10.0
 """The delay in seconds before a URL that failed is dialled again: first and longest."""
 

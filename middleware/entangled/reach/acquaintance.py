@@ -62,7 +62,7 @@ class Acquaintances:
     def helpers(self, wanted: bytes, hinted: Collection[Contact], asked: Collection[bytes]) -> list[Contact]:
         """Return the peers to ask about the node with that id, without the ones in ``asked``.
 
-        They are the peers in ``hinted``, the peers that named the node or relay to it, then bootstrap nodes, then any
+        First are the peers in ``hinted``, then the ones that named the node or relay to it, bootstrap nodes, and
         others.
         """
         now = self._clock.seconds()

@@ -1,7 +1,6 @@
 """Encode, decode and filter candidates: addresses at which a peer may be reachable.
 
-A peer that names an address causes this node to send there, so addresses that no peer can have are dropped: multicast,
-broadcast and unspecified ones.
+A named address causes this node to send there, so multicast, broadcast and unspecified ones are dropped.
 """
 
 from __future__ import annotations
@@ -25,8 +24,7 @@ _OF_A_SITE: tuple[tuple[IPv4Network | IPv6Network, int], ...] = (
     (IPv6Network("fe80::/10"), 10),
 )
 """The ranges that RFC 1918, 3927, 4193 and 4291 reserve for one site or link, and the prefix length that two neighbours
-share at least.
-"""
+share at least."""
 
 
 def packed(addresses: Iterable[Address]) -> list[object]:

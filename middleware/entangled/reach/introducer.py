@@ -28,8 +28,7 @@ INTRODUCTIONS = 20.0
 MEETS, MEETS_AT_ONCE = 1.0, 60.0
 """The attempts per second, and in one burst, that one peer may cause this node to make to nodes that do not answer.
 Successful ones do not count.  So a member that names addresses of strangers causes 0.2 MB/s there from this node, and a
-team that starts behind routers still connects quickly.
-"""
+team that starts behind routers still connects quickly."""
 
 
 class Allowance:

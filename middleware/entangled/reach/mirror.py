@@ -29,8 +29,7 @@ RATE, BURST = 50.0, 100.0
 class Mirror:
     """Asks peers for this node's external address, and answers such requests.
 
-    ``send`` seals a message for a session and sends it to an address; ``rng`` returns the random generator when it is
-    needed.
+    ``send`` seals a message and sends it to an address; ``rng`` returns the random generator when needed.
     """
 
     def __init__(

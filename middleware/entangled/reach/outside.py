@@ -23,12 +23,10 @@ SEEN_S = 600.0
 """The seconds for which a reported address is used next to a newer one."""
 SEEN_AFTER, SEEN_GAP = 0.1, 1.0
 """The delay in seconds of a notification that a peer's address changed, sent if it has not changed back (a replay
-changes an address only briefly), and the minimum interval between two.
-"""
+changes an address only briefly), and the minimum interval between two."""
 ANCHOR_S = 2.5
 """The silence in seconds of all possible introducers after which this node sends one of them a datagram, which keeps
-its NAT mapping open and shows its current address.
-"""
+its NAT mapping open and shows its current address."""
 
 
 class Outside:

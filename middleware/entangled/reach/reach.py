@@ -42,8 +42,7 @@ FRESH_AT = 0.5
 """The age in seconds from which a handshake is also tried from an additional local port."""
 CARRIED_AT = 0.9
 """The age in seconds from which a handshake is also sent through relays: most direct paths are found by then, and a
-request with the default timeout of 1.5 s can still be answered.
-"""
+request with the default timeout of 1.5 s can still be answered."""
 WELL_S = 3.0
 """The seconds since the latest datagram of a peer within which its path is not changed."""
 AT_ONCE = 1
@@ -52,8 +51,7 @@ THEY_WAIT = {2: 0.15, 4: 0.7}
 ORDERS = (2, 3, 4, 5, AT_ONCE)
 """The order in which the two peers send INITs: from their usual ports; or from additional ones, at the same time or
 with a delay.  An INIT that arrives too early spoils the port of some routers.  The kind of the router is not known, so
-all orders are tried.
-"""
+all orders are tried."""
 UPGRADING_S = 1.2
 TICK = 1.0
 OPENED_GAP = 2.0

@@ -23,8 +23,7 @@ CARRIED = 0x05
 HEAD = 1 + ID_BYTES
 PAIR_RATE, PAIR_BURST = 8_000.0, 65_536.0
 """The bytes that one pair may send per second (64 kbit/s), and in one burst: enough for requests and orders, not for
-video.
-"""
+video."""
 ALL_RATE, ALL_BURST = 128_000.0, 524_288.0
 MAX_PAIRS = 256
 ONE_SIDED_S = 120.0

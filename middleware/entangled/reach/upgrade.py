@@ -12,8 +12,7 @@ from middleware.entangled.wire.peer import Peer, Peers
 PAUSES = (1.0, 2.0, 5.0, 5.0, 15.0, 60.0)
 """The seconds between attempts of a relayed pair to connect directly; the last one is repeated.
 
-There are as many short ones as orders of sending with additional ports, because only one order may succeed.
-"""
+There are as many short ones as orders of sending with additional ports, because only one order may succeed."""
 TURN = 0.5
 """The seconds by which one of the two peers is delayed, so that only the other one tries."""
 GIVEN_UP_S = 60.0

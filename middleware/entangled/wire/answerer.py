@@ -1,7 +1,6 @@
-"""Run exposed methods for peers and send their answers.
+"""Run exposed methods for peers, methods with side effects at most once per request, and send their answers.
 
-A method with side effects runs at most once per request. The answerer has no access to keys or sockets: its caller
-passes decoded requests, and callables that send a message in a session.
+It has no access to keys or sockets: it receives decoded requests, and callables that send a message in a session.
 """
 
 from __future__ import annotations
@@ -54,8 +53,7 @@ _GONE = "the call ran, but its answer was too large to keep; read the state that
 class Answerer:
     """Dispatches requests of peers to exposed methods; ``send`` is called with a session and the bytes of a message.
 
-    ``may`` returns whether the peer with a public key may call a method; ``refused`` is called for each call that is
-    rejected.
+    ``may`` returns whether a peer (its public key) may call a method; ``refused`` is called for each rejected call.
     """
 
     _log = Logger()
@@ -99,9 +97,8 @@ class Answerer:
     def answer(self, question: Question, session: Session, is_bulky: bool = False) -> None:
         """Answer a request of an established session, immediately or when its method is done.
 
-        ``is_bulky``: the request arrived in fragments. Its answer is then sent in fragments too, however short, because
-        the responder retransmits fragments itself and the requester need not send the whole request again for a lost
-        answer.
+        ``is_bulky``: the request arrived in fragments.  Its answer is then sent in fragments too, however short: they
+        are retransmitted by the responder, and the requester need not send the whole request again for a lost answer.
         """
         public = session.contact.public
         if (public, question.id) in self._cancelled:
@@ -173,10 +170,7 @@ class Answerer:
             self._log_notification_error(method, result)
 
     def cancel(self, message: Cancel, public: bytes) -> None:
-        """Cancel the work on a request that its peer gave up.
-
-        A request that arrives after its cancellation does not run.
-        """
+        """Cancel the work on a request that its peer gave up; if it arrives later it does not run."""
         self._courier.drop(public, Key(True, message.id))
         self._courier.forget(public, Key(False, message.id))
         entry = self._ledger.entry(public, message.id)

@@ -1,7 +1,6 @@
 """Keep the requests of this node until they are answered, and send notifications.
 
-The asker decides when to retransmit a request and when to give it up. It reads no datagrams: the endpoint calls it with
-each answer.
+It decides when to retransmit a request and when to give it up.  The endpoint calls it with each received answer.
 """
 
 from __future__ import annotations
@@ -41,8 +40,7 @@ MAX_TELLS = 32
 SILENCE_S = 5.0
 MAX_IN_FLIGHT = 32
 """Requests that may be under way to one peer; further ones wait in a queue. They take a quarter of the usual receive
-buffer of 208 KiB, because other nodes send requests to the same peer.
-"""
+buffer of 208 KiB, because other nodes send requests to the same peer."""
 MAX_QUEUED = 8192
 LONGEST_QUEUED = 10.0
 _QUEUED = "timed out in the queue; send fewer requests at the same time"
@@ -224,10 +222,7 @@ class Asker:
             inquiry.deferred.errback(error_of(message))
 
     def established(self, peer: Peer, session: Session, is_owed: bool) -> None:
-        """Send the messages that waited for a session.
-
-        ``is_owed``: the peer waits for a datagram that confirms the session.
-        """
+        """Send the messages that waited for a session; ``is_owed``: the peer waits for a datagram in it."""
         sent = 0
         for message in peer.tells:
             self._send(session, message)

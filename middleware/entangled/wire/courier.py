@@ -1,8 +1,7 @@
 """Transfer messages that are larger than a datagram, in fragments.
 
-Outgoing messages go to the ``Flow`` of their peer; incoming fragments are reassembled here. Buffers are bounded per
-peer and per node: an outgoing message without room is rejected at once, an incoming one without room waits at its
-sender.
+Outgoing messages go to the ``Flow`` of their peer; incoming fragments are reassembled here, within limits per peer and
+node: an outgoing message without room is rejected at once, an incoming one without room waits at its sender.
 """
 
 from __future__ import annotations

@@ -52,10 +52,7 @@ _REFUSALS = {
 
 
 class Life(NamedTuple):
-    """One incarnation of an identity.
-
-    ``number`` grows from start to start (0: incarnations are not counted), ``nonce`` is random.
-    """
+    """One incarnation of an identity: ``number`` grows from start to start (0: not counted), ``nonce`` is random."""
 
     number: int = 0
     nonce: bytes = bytes(NONCE)
@@ -177,8 +174,7 @@ def is_refusal(code: str) -> bool:
 def next_life(last: int, wall: float) -> int:
     """Return the number of the incarnation after ``last`` (0: unknown) that starts at ``wall`` seconds of Unix time.
 
-    The start time is used if it is higher, so that a node that lost its store does not appear as an older copy of
-    itself.
+    It is ``wall`` if that is higher, so that a node that lost its store does not appear as an older copy of itself.
     """
     return min(max(last + 1, int(wall)), MAX_LIFE)
 

@@ -248,8 +248,7 @@ class Endpoint:
     def route_inside(self, kind: int, receiver: Inside) -> None:
         """Pass messages in confirmed sessions with this first byte to ``receiver``.
 
-        Such a datagram does not change the address of its peer, because it may arrive by a path other than the usual
-        one.
+        They do not change the address of their peer, because they may arrive by a path other than the usual one.
         """
         self._inside[kind] = receiver
 
@@ -290,10 +289,9 @@ class Endpoint:
         return self._asker.ask(contact, method, arguments, timeout, changes, is_light)
 
     def tell(self, contact: Contact, method: str, *arguments: object) -> None:
-        """Send a notification: call a peer's method without an answer and without retransmission.
+        """Send a notification: call a peer's method once, without an answer or retransmission.
 
-        It must fit into one datagram.  A session is opened first if there is none.  Raises ``TooLarge`` and
-        ``NotRunning``.
+        It must fit into one datagram.  Opens a session if there is none.  Raises ``TooLarge`` and ``NotRunning``.
         """
         if not self.is_running:
             raise NotRunning("the endpoint is not running; start it first")

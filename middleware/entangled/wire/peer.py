@@ -42,8 +42,7 @@ KNOCK_S, KNOCKS = 0.1, 16
 LIVELY_S = 3.0
 IN_TOUCH = 105.0
 """Seconds of silence up to which the other side of a session still has it, in a wide network.  It is shorter than the
-time after which a session is forgotten; the margin covers the difference between the last datagrams of both sides.
-"""
+time after which a session is forgotten; the margin covers the difference between the last datagrams of both sides."""
 SESSION_LIFE_S = 120.0
 """The age in seconds at which a session is replaced when something is sent in it."""
 SECOND_S = 30.0
@@ -268,10 +267,9 @@ class Peers:
         return wait if likely is None else min(wait, max(likely, within / self.loss.tries))
 
     def usable(self, peer: Peer) -> Session | None:
-        """Return the session to send in.
+        """Return the session to send in, after dropping the peer's sessions at their datagram limit.
 
-        A session that reached its datagram limit is dropped, and one that the other side may have forgotten, unless a
-        request waits for it.
+        The sessions with an idle peer that may have forgotten them are dropped too.
         """
         session = peer.session
         if session is None:
@@ -338,8 +336,7 @@ class Peers:
     def confirmed(self, session: Session) -> None:
         """Measure the round trip of a peer that confirmed its session: one round trip after the RESP.
 
-        Otherwise the first request to it would be retransmitted too soon, and a long path be taken for a restart of the
-        peer.
+        Otherwise the first request to it would be retransmitted too soon, and a long path be mistaken for a restart.
         """
         peer = self.peer(session.contact)
         if not peer.round_trip.is_measured:

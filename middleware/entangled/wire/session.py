@@ -335,10 +335,7 @@ class Session:
         return self._sent
 
     def is_replay(self, datagram: bytes) -> bool:
-        """Return whether the counter of a DATA datagram was received before or is below the window.
-
-        No decryption is needed.
-        """
+        """Return, without decryption, whether a DATA datagram's counter was received before or is below the window."""
         behind = self._highest - int.from_bytes(datagram[5:_HEADER], "little")
         return behind >= 0 and (behind >= WINDOW or bool(self._seen >> behind & 1))
 
