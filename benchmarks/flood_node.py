@@ -184,7 +184,7 @@ class Node(Protocol):
                 "unconfirmed": len(half._unconfirmed),
                 "peers": len(endpoint._peers._peers),
                 "assemblies": len(endpoint._courier._assemblies),
-                "led": len(self.network._led),
+                "led": len(self.network._port_by_target),
                 "seen": len(reach.outside._seen),
             },
         }

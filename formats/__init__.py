@@ -1,6 +1,6 @@
-"""Formats that several packages read: bytes and tables in, checked values and bytes out.
+"""Formats that several packages use: conversion between bytes or tables and validated values.
 
-``convert`` makes dataclasses of settings, options and scenarios by the constraints in their annotations, ``head`` is
-the head of HTTP, ``websocket`` one end of a WebSocket with limits, ``jpeg`` the size of a picture.  ``drivers`` and
-``middleware`` both use this package, and do not import each other; it imports nothing of the project.
+``convert`` converts settings, options and scenarios to dataclasses under the constraints in their annotations, ``head``
+parses HTTP headers, ``websocket`` is one end of a WebSocket with limits, ``jpeg`` reads the size of an image.
+``drivers`` and ``middleware`` both use this package without importing each other; it imports nothing of the project.
 """

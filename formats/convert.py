@@ -1,8 +1,8 @@
-"""Convert: values of TOML or a command line, to the type that the field of a dataclass declares.
+"""Convert values of TOML or a command line to the types of dataclass fields.
 
-``msgspec`` checks types and constraints (``Annotated[int, Meta(ge=0, le=65535)]``); this module turns its errors into
-``Invalid``, with the key, the problem and the remedy.  Dataclasses and not ``msgspec.Struct``, because a dataclass can
-leave a secret out of its ``repr``.
+``msgspec`` checks types and constraints (``Annotated[int, Meta(ge=0, le=65535)]``); this module converts its errors to
+``Invalid``, with the key, the problem and the remedy.  It uses dataclasses instead of ``msgspec.Struct`` because a
+dataclass can omit a secret from its ``repr``.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from msgspec import Meta, MsgspecError, convert
 T = TypeVar("T")
 MAX_SHOWN = 60
 FINITE = Meta(ge=-1.7e308, le=1.7e308)
-"""Any number but NaN and the infinities."""
+"""Any number except NaN and the infinities."""
 
 
 class Invalid(Exception):
-    """A value that its field does not allow."""
+    """A value that is invalid for its field."""
 
     def __init__(self, key: str, problem: str, remedy: str) -> None:
         super().__init__(key, problem, remedy)
@@ -35,7 +35,7 @@ class Invalid(Exception):
 class Then:
     """A step after the conversion: return the value to use, or raise ``ValueError``.
 
-    ``raw`` is the type of the value before this step, where the field has another one.
+    ``raw`` is the type of the value before this step, if it differs from the field's.
     """
 
     apply: Callable[[Any], Any]
@@ -51,11 +51,11 @@ class Unit:
 
 @dataclass(frozen=True)
 class Secret:
-    """Marks a value that no error shows."""
+    """Marks a value that errors must not show."""
 
 
 def check_printable(value: Any) -> Any:
-    """Return ``value`` if it is no text, or all its characters are printable."""
+    """Return ``value`` if it is not a string, or all its characters are printable; else raise ``ValueError``."""
     if isinstance(value, str) and not value.isprintable():
         raise ValueError("has a line break or another character that cannot be printed")
     return value
@@ -70,18 +70,18 @@ def one_of(words: Sequence[str]) -> Then:
 
 
 def some_of(words: Sequence[str]) -> Then:
-    """Allow a list of some of ``words``, at least one; they are put into the order of ``words``."""
+    """Allow a list of at least one of ``words``, sorted in the order of ``words``."""
     word: Any = Literal[tuple(words)]
     raw = Annotated[tuple[word, ...], Meta(min_length=1)]
     return Then(lambda given: tuple(word for word in words if word in given), raw)
 
 
 UNIQUE = Then(lambda items: tuple(dict.fromkeys(items)))
-"""Leaves repeated entries of a list out."""
+"""Removes duplicates from a list."""
 
 
 def convert_table(table: object, cls: type[T]) -> T:
-    """Convert a table to the dataclass ``cls``; raises ``Invalid``, with an empty key where it is no table."""
+    """Convert a table to the dataclass ``cls``; raise ``Invalid``, with an empty key if it is not a table."""
     if not isinstance(table, Mapping):
         raise Invalid("", f"must be a table, is {show_value(table)}", "write { key = value }")
     known = {field.name: field for field in fields(cls)}  # type: ignore[arg-type]
@@ -99,15 +99,15 @@ def convert_table(table: object, cls: type[T]) -> T:
 
 
 def convert_field(value: object, cls: type[Any], key: str, is_text: bool = False) -> Any:
-    """Convert ``value`` to the type of one field of the dataclass ``cls``; as ``convert_value``."""
+    """Convert ``value`` to the type of one field of the dataclass ``cls``, like ``convert_value``."""
     default = next(field.default for field in fields(cls) if field.name == key)
     return convert_value(value, get_type_hints(cls, include_extras=True)[key], key, default, is_text)
 
 
 def convert_value(value: object, hint: Any, key: str = "", default: object = None, is_text: bool = False) -> Any:
-    """Convert ``value`` to the type ``hint``; raises ``Invalid``, with ``key``, and ``default`` as the example.
+    """Convert ``value`` to the type ``hint``; raise ``Invalid`` with ``key``, and ``default`` as the example.
 
-    ``is_text``: it is a word of a command line, where lists are separated by commas.
+    ``is_text``: the value is a command-line argument, in which commas separate the entries of a list.
     """
     extra = getattr(hint, "__metadata__", ())
     raw = raw_of(hint)
@@ -132,20 +132,20 @@ def convert_value(value: object, hint: Any, key: str = "", default: object = Non
 
 
 def raw_of(hint: Any) -> Any:
-    """The type of a value before its last steps."""
+    """Return the type of a value before its steps."""
     steps = [each for each in getattr(hint, "__metadata__", ()) if isinstance(each, Then)]
     return next((step.raw for step in steps if step.raw is not None), hint)
 
 
 def show_value(value: object) -> str:
-    """``value`` as an error shows it: on one line, and not too long."""
+    """Return ``value`` as JSON for an error, truncated to ``MAX_SHOWN`` characters."""
     text = json.dumps(value, default=str, ensure_ascii=False)
     return text if len(text) <= MAX_SHOWN else text[: MAX_SHOWN - 3] + "..."
 
 
 def nearest_of(word: str, known: Iterable[str]) -> str:
-    """The known word that is most like ``word``."""
-    from difflib import get_close_matches  # only a mistake needs it
+    """Return the known word that is most similar to ``word``."""
+    from difflib import get_close_matches  # imported only for an error
 
     return get_close_matches(word[:64], list(known), n=1, cutoff=0.0)[0]
 
@@ -155,7 +155,7 @@ def _base_of(hint: Any) -> Any:
 
 
 def _innermost(value: object, error: Exception) -> tuple[str, object]:
-    """The place and value of the entry that ``msgspec`` complains of, by a path such as ``$[1].kind``."""
+    """Return the place and value of the entry in an error of ``msgspec``, from a path such as ``$[1].kind``."""
     path = re.search(r" - at `(?:key in `)?\$([^`]*)`", str(error))
     place = ""
     for name, number in re.findall(r"\.(\w+)|\[(\d+)\]", path[1] if path else ""):
@@ -204,13 +204,13 @@ def _remedy_for(hint: Any, default: object = None, wrong: object = None) -> str:
     for meta in getattr(hint, "__metadata__", ()):
         if isinstance(meta, Meta) and meta.examples:
             default = meta.examples[0]
-    # TOML writes texts, numbers and lists as JSON does.
+    # TOML writes strings, numbers and lists like JSON.
     has_example = isinstance(default, int | float | str | list | tuple) and default not in (True, False, "", ())
     return f"write {_expected_by(hint)}{f', such as {json.dumps(default)}' if has_example else ''}"
 
 
 def _words_of(hint: Any) -> list[str]:
-    """The words that a type allows by itself, or as entries of its list."""
+    """Return the words that a type allows, directly or as entries of a list."""
     base = _base_of(raw_of(hint))
     if get_origin(base) is tuple:
         base = _base_of(get_args(base)[0])

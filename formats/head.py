@@ -1,4 +1,4 @@
-"""Head: of an HTTP/1.1 request or answer (RFC 9112), as far as it is needed to begin a stream of something else."""
+"""Read and write the head of an HTTP/1.1 request or response (RFC 9112) before the connection changes its protocol."""
 
 from __future__ import annotations
 
@@ -6,29 +6,29 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 MAX_HEAD = 8192
-"""Bytes of one; where there are more without an end nobody speaks HTTP."""
+"""The maximum number of bytes of a head."""
 _END = b"\r\n\r\n"
 
 
 class Head(NamedTuple):
-    """``first`` is the line with the request or the status, ``fields`` has the others by their names in lower case."""
+    """``first`` is the request or status line, ``fields`` the header fields by their lower-case names."""
 
     first: bytes
     fields: Mapping[bytes, bytes]
 
     @property
     def said(self) -> str:
-        """The beginning of the first line, for people."""
+        """The start of the first line, for error messages."""
         return self.first[:60].decode("ascii", "replace")
 
 
 def head(*lines: str) -> bytes:
-    """One to send."""
+    """Encode a head."""
     return "\r\n".join(lines).encode() + _END
 
 
 def taken(buffer: bytearray) -> Head | None:
-    """The one with which ``buffer`` begins, taken out of it; None while its end is not there."""
+    """Remove the head from ``buffer`` and return it; None while it is incomplete."""
     end = buffer.find(_END, 0, MAX_HEAD)
     if end < 0:
         return None

@@ -1,45 +1,45 @@
-"""Jpeg: the headers of a JPEG (ITU-T T.81), read before anything is decoded.
+"""Read the headers of a JPEG (ITU-T T.81) before it is decoded.
 
-A few hundred bytes may claim a picture of four thousand megapixels, or of thousands of scans that each go over all of
-it.  ``size_of`` refuses what would take much memory or time, so call it before every decoder.
+A few hundred bytes may declare an image of four thousand megapixels, or thousands of scans over the whole image.
+``size_of`` rejects images that would take much memory or time to decode, so call it before every decoder.
 """
 
 from __future__ import annotations
 
 MAX_SIDE = 4096
-"""Pixels across or up."""
+"""The maximum width and height in pixels."""
 MAX_DECODED = 2**25
-"""Pixels that may be decoded in all scans together: 16 megapixels in two, 1920 x 1080 in sixteen."""
+"""The maximum number of pixels in all scans together: 16 megapixels in two, 1920 x 1080 in sixteen."""
 _START_OF_FRAME = frozenset((0xC0, 0xC1, 0xC2))
-"""Baseline, extended, progressive: with Huffman coding.  Cameras send no others, and other decoders are slower."""
+"""Baseline, extended and progressive with Huffman coding.  Cameras send no others, and their decoders are slower."""
 _OTHER_FRAMES = frozenset(range(0xC3, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _START_OF_SCAN = b"\xff\xda"
 _BARE = frozenset((0x01, *range(0xD0, 0xD8)))
 
 
 def size_of(data: bytes) -> tuple[int, int] | None:
-    """Width and height in pixels of a whole JPEG; None for anything else, such as one cut off or beyond the limits."""
+    """Return width and height in pixels of a complete JPEG; None if it is invalid, truncated or beyond the limits."""
     if not data.startswith(b"\xff\xd8") or not data.endswith(b"\xff\xd9"):
         return None
-    place = 2
-    while place + 9 <= len(data) and data[place] == 0xFF:
-        kind = data[place + 1]
+    offset = 2
+    while offset + 9 <= len(data) and data[offset] == 0xFF:
+        kind = data[offset + 1]
         if kind == 0xFF or kind in _BARE:
-            place += 1 if kind == 0xFF else 2
+            offset += 1 if kind == 0xFF else 2
             continue
         if kind in _START_OF_FRAME:
-            height, width = int.from_bytes(data[place + 5 : place + 7]), int.from_bytes(data[place + 7 : place + 9])
-            return (width, height) if _is_within_limits(width, height, data, place) else None
-        length = int.from_bytes(data[place + 2 : place + 4])
+            height, width = int.from_bytes(data[offset + 5 : offset + 7]), int.from_bytes(data[offset + 7 : offset + 9])
+            return (width, height) if _is_within_limits(width, height, data, offset) else None
+        length = int.from_bytes(data[offset + 2 : offset + 4])
         if length < 2 or kind in _OTHER_FRAMES or kind in (0xD8, 0xD9, 0xDA):
             return None
-        place += 2 + length
+        offset += 2 + length
     return None
 
 
 def _is_within_limits(width: int, height: int, data: bytes, start: int) -> bool:
     if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
         return False
-    # Coded data has no such bytes.  Bytes of other segments that look so count as well, which refuses too much at most.
+    # Coded data does not contain these bytes. Bytes of other segments may, so the count is never too low.
     scans = data.count(_START_OF_SCAN, start)
     return width * height * max(1, scans) <= MAX_DECODED

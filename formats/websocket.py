@@ -1,7 +1,7 @@
-"""Websocket: one end of a WebSocket (RFC 6455), by ``wsproto``: bytes in, messages and bytes out.
+"""Implement one end of a WebSocket (RFC 6455) without I/O, based on ``wsproto``.
 
-This adds what ``wsproto`` leaves to its caller: limits of the greeting, of a message and of the frames in one read, and
-an answer to whatever is no WebSocket.  No extension is offered or taken, so nothing arrives compressed.
+It adds the parts that ``wsproto`` leaves to its caller: limits of the handshake, of a message and of the frames in one
+read, and an HTTP response to other requests.  Extensions are disabled, so messages are not compressed.
 """
 
 from __future__ import annotations
@@ -28,28 +28,30 @@ from wsproto.utilities import LocalProtocolError, RemoteProtocolError
 from formats.head import MAX_HEAD
 
 NORMAL, BAD = 1000, 1002
-"""Reasons to close."""
+"""Close codes."""
 MAX_FRAMES = 2048
-"""Frames in one read of at most 64 KiB; more are a flood of nearly empty ones, which cost more to take than to send."""
+"""The maximum number of frames in one read of at most 64 KiB; more are nearly empty frames, which cost more to receive
+than to send."""
 
 
 class End(ABC):
-    """One end of a connection: the client's where ``request`` is given.
+    """One end of a connection: the client if ``request`` is given.
 
-    After ``fault`` nothing more is received: close the stream, and open another.  A subclass judges the greeting of the
-    other end.  ``longest`` is the most bytes of a message.
+    After a ``fault`` nothing more is received: close the stream.  A subclass checks the handshake of the other end.
+    ``longest`` is the maximum length of a message in bytes.
     """
 
     def __init__(self, longest: int, request: Request | None = None, takes_text: bool = True) -> None:
         self.is_open = False
         self.fault = ""
         self.frames = 0
-        """Whole ones received; while bytes come and this does not grow, a spoilt length may be waited for."""
+        """The number of complete frames received.  If bytes arrive and it does not grow, the length of a frame may be
+        corrupt."""
         self._request = request
         self._longest = longest
         self._takes_text = takes_text
         self._socket = WSConnection(ConnectionType.SERVER if request is None else ConnectionType.CLIENT)
-        self._greeting = 0
+        self._handshake_bytes = 0
         self._left = MAX_FRAMES
         self._part = bytearray()
         self._messages: list[bytes] = []
@@ -60,51 +62,52 @@ class End(ABC):
         return b"" if self._request is None else self._send(self._request)
 
     def received(self, data: bytes) -> tuple[list[bytes], bytes]:
-        """Take bytes as they come, cut anyhow; the messages that they complete, and what to send back at once."""
+        """Process received bytes; return the messages that they complete, and the bytes to send back at once."""
         if self.fault or not data:
             return [], b""
         self._left = MAX_FRAMES
-        self._greeting += 0 if self.is_open else len(data)
+        self._handshake_bytes += 0 if self.is_open else len(data)
         try:
             self._socket.receive_data(data)
             for event in self._socket.events():
-                if not self._is_taken(event):
+                if not self._process_event(event):
                     break
-        except (RemoteProtocolError, LocalProtocolError, ValueError) as error:  # ValueError: a head in no known charset
+        # ValueError: the head has an unknown charset
+        except (RemoteProtocolError, LocalProtocolError, ValueError) as error:
             self._refuse(error)
-        if not (self.is_open or self.fault) and self._greeting >= MAX_HEAD:
-            self.fault = f"no end of the greeting in {MAX_HEAD} bytes; no WebSocket speaks there"
+        if not (self.is_open or self.fault) and self._handshake_bytes >= MAX_HEAD:
+            self.fault = f"the handshake has no end within {MAX_HEAD} bytes; the other end is not a WebSocket"
         messages, self._messages = self._messages, []
         reply, self._reply = b"".join(self._reply), []
         return messages, reply
 
     def framed(self, payload: bytes) -> bytes:
-        """Return a binary message as one frame, or nothing once the connection closes."""
+        """Return a binary message as one frame, or nothing if the connection is closing."""
         return self._send(BytesMessage(payload))
 
     def text(self, payload: bytes) -> bytes:
-        """Return a text in UTF-8 as one frame, or nothing once the connection closes."""
+        """Return a UTF-8 text message as one frame, or nothing if the connection is closing."""
         return self._send(TextMessage(payload.decode()))
 
     def ping(self) -> bytes:
-        """A frame that the other end answers by itself."""
+        """Return a ping frame."""
         return self._send(Ping())
 
     def closing(self, code: int = NORMAL) -> bytes:
-        """Return the frame that closes the connection, or nothing if it was sent already."""
+        """Return the frame that closes the connection, or nothing if it was sent before."""
         return self._send(CloseConnection(code))
 
     # -- for subclasses ---------------------------------------------------------------------------------------------
 
     @abstractmethod
     def _answer(self, request: Request) -> AcceptConnection | RejectConnection:
-        """Return the server's answer to a request."""
+        """Return the server's response to a request."""
 
     @abstractmethod
     def _fault_of(self, answer: AcceptConnection | RejectConnection | Exception) -> str:
-        """Return the fault of a server's answer, or an empty text if frames may follow."""
+        """Return the fault in a server's response, or an empty text if frames may follow."""
 
-    # -- inside -----------------------------------------------------------------------------------------------------
+    # -- private ----------------------------------------------------------------------------------------------------
 
     def _send(self, event: Event) -> bytes:
         try:
@@ -112,8 +115,8 @@ class End(ABC):
         except LocalProtocolError:
             return b""  # it is not open yet, or is closing
 
-    def _is_taken(self, event: Event) -> bool:
-        """Take an event; return False if it ends the connection."""
+    def _process_event(self, event: Event) -> bool:
+        """Process an event; return False if it ends the connection."""
         self._left -= 1
         if self._left < 0:
             self._fail(f"more than {MAX_FRAMES} frames at once")
@@ -125,16 +128,16 @@ class End(ABC):
                 self._reply.append(self._send(event.response()))
         elif isinstance(event, CloseConnection):
             if self._socket.state is ConnectionState.OPEN:
-                self._fail(event.reason or "a frame that is none", event.code)
+                self._fail(event.reason or "an invalid frame", event.code)
             else:
                 self.frames += 1
-                self.fault = "the other end said goodbye"
+                self.fault = "the other end closed the connection"
                 self._reply.append(self._send(event.response()))
         elif isinstance(event, Request):
             answer = self._answer(event)
             self._reply.append(self._send(answer))
             self.is_open = isinstance(answer, AcceptConnection)
-            self.fault = "" if self.is_open else "a request for something else"
+            self.fault = "" if self.is_open else "the request was rejected"
         elif isinstance(event, AcceptConnection | RejectConnection):
             self.fault = self._fault_of(event)
             self.is_open = not self.fault
@@ -144,24 +147,24 @@ class End(ABC):
         self.frames += event.frame_finished
         self._part += event.data.encode() if isinstance(event.data, str) else event.data
         if isinstance(event, TextMessage) and not self._takes_text:
-            self._fail("a text where only bytes belong")
+            self._fail("a text message, but only binary ones are allowed")
         elif len(self._part) > self._longest:
             self._fail(f"a message of more than {self._longest} bytes")
         elif event.message_finished:
             self._messages.append(bytes(self._part))
             self._part = bytearray()
 
-    def _fail(self, why: str, code: int = BAD) -> None:
-        self.fault = why
+    def _fail(self, reason: str, code: int = BAD) -> None:
+        self.fault = reason
         self._reply.append(self.closing(code))
 
     def _refuse(self, error: Exception) -> None:
-        """End a connection that is no WebSocket; a server answers in HTTP."""
+        """Close a connection that is not a WebSocket; a server sends an HTTP response."""
         if self.is_open:
             self._fail(str(error))
         elif self._request is not None:
             self.fault = self._fault_of(error)
         else:
-            self.fault = f"no WebSocket greeting: {error}"
+            self.fault = f"not a WebSocket handshake: {error}"
             hint = getattr(error, "event_hint", None) or RejectConnection()
             self._reply.append(self._send(hint))

@@ -1,4 +1,4 @@
-"""Background: the work of a node that nobody waits for, on one clock, and gone without a trace when the node stops."""
+"""Run the background timers and coroutines of a node on one clock, and cancel them when the node stops."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from middleware.entangled.errors import EntangledError
 
 
 def cancel(timer: IDelayedCall | None) -> None:
-    """Cancel a timer that may be none, or over."""
+    """Cancel a timer if it is set and pending."""
     if timer is not None and timer.active():
         timer.cancel()
 
 
 class Background:
-    """Timers and coroutines of one node; after ``stop`` none of them runs."""
+    """Timers and coroutines of one node; none of them runs after ``stop``."""
 
     _log = Logger()
 
@@ -30,7 +30,7 @@ class Background:
         self.is_stopped = False
 
     def later(self, delay: float, work: Callable[..., object], *arguments: object) -> Callable[[], None]:
-        """Call ``work`` after ``delay`` seconds; call what is returned to prevent it."""
+        """Call ``work`` after ``delay`` seconds; return a function that cancels the call."""
         if self.is_stopped:
             return lambda: None
 
@@ -48,7 +48,7 @@ class Background:
         return cancel
 
     def every(self, period: float, work: Callable[[], object]) -> None:
-        """Call ``work`` again and again, ``period`` seconds apart."""
+        """Call ``work`` repeatedly, ``period`` seconds apart."""
 
         def again() -> None:
             self.later(period, again)
@@ -57,17 +57,17 @@ class Background:
         self.later(period, again)
 
     def sleep(self, seconds: float) -> Deferred[None]:
-        """Fire after ``seconds``; never where the node stops before."""
+        """Return a Deferred that fires after ``seconds``; it never fires if the node stops before."""
         woken: Deferred[None] = Deferred()
         self.later(seconds, woken.callback, None)
         return woken
 
     def fork(self, work: Coroutine[Any, Any, Any]) -> None:
-        """Let ``work`` run by itself; the weather, a refusal and a stopped node end it quietly."""
+        """Run ``work`` in the background; an ``EntangledError`` ends it silently, other errors are logged."""
 
         def ended(failure: Any) -> None:
             if failure.check(EntangledError) is None:
-                self._log.failure("in the background of a node", failure)
+                self._log.failure("a background task of the node failed", failure)
 
         Deferred.fromCoroutine(work).addErrback(ended)
 
@@ -81,9 +81,9 @@ class Background:
 
 
 async def until(enough: Callable[[list[Any]], bool], work: Iterable[Coroutine[Any, Any, Any]]) -> list[Any]:
-    """The results of ``work`` as soon as they are ``enough``, or when all of it has ended; the rest goes on.
+    """Return the results of ``work`` as soon as they are ``enough``, or all of it has ended; the rest continues.
 
-    What ends in an ``EntangledError`` gives no result.
+    Work that ends with an ``EntangledError`` gives no result.
     """
     results: list[Any] = []
     begun = list(work)
@@ -114,9 +114,9 @@ async def until(enough: Callable[[list[Any]], bool], work: Iterable[Coroutine[An
 
 
 async def paced(width: int, work: Iterable[Coroutine[Any, Any, Any]]) -> None:
-    """Run all of ``work``, at most ``width`` at a time; what ends in an ``EntangledError`` is let be.
+    """Run all of ``work``, at most ``width`` at a time, ignoring each ``EntangledError``.
 
-    ``work`` is best a generator, so that what is not begun yet costs nothing.
+    ``work`` should be a generator, so that a coroutine is created only when it starts.
     """
     turns = iter(work)
 
@@ -129,5 +129,5 @@ async def paced(width: int, work: Iterable[Coroutine[Any, Any, Any]]) -> None:
 
 
 async def first(needed: int, work: Iterable[Coroutine[Any, Any, Any]]) -> list[Any]:
-    """The results of the first ``needed`` of ``work`` that succeed, fewer when all have ended; the others go on."""
+    """Return the first ``needed`` results of ``work``, or fewer if all has ended; the rest continues."""
     return await until(lambda results: len(results) >= needed, work)

@@ -1,4 +1,4 @@
-"""Bounded: tables of what is known of others, who may be any number."""
+"""Limit the size of tables of state about other nodes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ Value = TypeVar("Value")
 
 
 def keep(table: dict[Key, Value], key: Key, value: Value, most: int) -> None:
-    """Put ``value`` at the end of a table, and drop its first entry where it has more than ``most``."""
+    """Put ``value`` at the end of a table, and delete its first entry if it has more than ``most``."""
     table.pop(key, None)
     table[key] = value
     if len(table) > most:

@@ -1,8 +1,8 @@
-"""Clock: simulated time on a heap, and Twisted's real time made monotonic.
+"""Provide simulated time on a heap, and make Twisted's real time monotonic.
 
-Logic is handed something with ``seconds()`` and ``callLater()`` and never asks what drives it.  A simulation of ten
-thousand nodes has tens of thousands of timers; Twisted's own test clock sorts its whole list at every call, this one
-keeps a heap.
+Protocol code receives an object with ``seconds()`` and ``callLater()`` and does not depend on its kind.  A simulation
+of ten thousand nodes has tens of thousands of timers; Twisted's test clock sorts its whole list at every call, this one
+uses a heap.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ _COMPACT_FROM = 64
 
 
 def boot_time() -> Callable[[], float]:
-    """The clock that no one sets: seconds since the machine started, those in which it was suspended included.
+    """Return a clock of the seconds since the machine started, including suspension, independent of the wall clock.
 
-    Where the system has no such clock (CLOCK_BOOTTIME) it is ``time.monotonic``, which may stand still meanwhile.
+    On systems without CLOCK_BOOTTIME it is ``time.monotonic``, which may stop during suspension.
     """
     if hasattr(time, "CLOCK_BOOTTIME"):
         return partial(time.clock_gettime, time.CLOCK_BOOTTIME)
@@ -32,22 +32,22 @@ def boot_time() -> Callable[[], float]:
 
 
 def use_monotonic_time() -> None:
-    """Make every Twisted reactor of this process keep its timers on ``boot_time``.
+    """Make every Twisted reactor of this process use ``boot_time`` for its timers.
 
-    Twisted measures with ``time.time``: when the wall clock is set back a minute (NTP, a robot that gets GPS time),
-    every timer stands still for that minute; when it is set forward, every pending time-out is due at once and a whole
-    team suspects everybody.  ``time.monotonic`` stands still while the machine is suspended: who wakes up would take
-    a lease for its own that has long gone to another.  On this clock whatever came due meanwhile is due at once, as
-    after any long pause; a timer that is late says that there was one.
+    Twisted uses ``time.time``: if the wall clock is set back a minute (NTP, a robot that gets GPS time), every timer
+    stops for that minute; if it is set forward, every pending timeout expires at once and all nodes suspect each other.
+    ``time.monotonic`` stops while the machine is suspended: a node that resumes would consider a lease valid that
+    another node holds by now.  With this clock timers that expired meanwhile fire at once, as after any long pause, and
+    a late timer indicates a pause.
 
-    Call this before timers are made; calling it again changes nothing.
+    Call this before timers are created; repeated calls have no effect.
     """
     ReactorBase.seconds = staticmethod(boot_time())
 
 
 @implementer(IDelayedCall)
 class _HeapCall:
-    """A call that a ``HeapClock`` will make; ``order`` is its place among those of one moment, 0 when it is over."""
+    """A pending call of a ``HeapClock``; ``order`` is its position among calls at the same time, 0 when it is over."""
 
     __slots__ = ("time", "order", "_clock", "_function", "_arguments", "_keywords", "_is_cancelled")
 
@@ -69,34 +69,34 @@ class _HeapCall:
         self._is_cancelled = False
 
     def getTime(self) -> float:
-        """The moment at which the call is due, in seconds of its clock."""
+        """Return the time at which the call is due, in seconds of its clock."""
         return self.time
 
     def cancel(self) -> None:
-        """Unschedule the call; raises ``AlreadyCalled`` or ``AlreadyCancelled``."""
+        """Cancel the call; raises ``AlreadyCalled`` or ``AlreadyCancelled``."""
         self._check()
         self.order = 0
         self._is_cancelled = True
-        # The entry stays in the heap for a while; what it was for shall not.
-        self._function, self._arguments, self._keywords = _nothing, (), {}
-        self._clock._dropped()
+        # The entry stays in the heap for a while; release the objects that it refers to.
+        self._function, self._arguments, self._keywords = _do_nothing, (), {}
+        self._clock._count_dead_entry()
 
     def delay(self, seconds: float) -> None:
-        """Move the call ``seconds`` after the moment for which it stands."""
+        """Postpone the call by ``seconds``."""
         self._check()
         self._clock._move(self, self.time + seconds)
 
     def reset(self, seconds: float) -> None:
-        """Move the call to ``seconds`` after now."""
+        """Move the call to ``seconds`` from now."""
         self._check()
         self._clock._move(self, self._clock.seconds() + seconds)
 
     def active(self) -> bool:
-        """Whether the call still waits."""
+        """Return whether the call is pending."""
         return self.order > 0
 
     def run(self) -> None:
-        """Make the call; only its clock does this."""
+        """Make the call; only the clock calls this."""
         self.order = 0
         self._function(*self._arguments, **self._keywords)
 
@@ -107,15 +107,15 @@ class _HeapCall:
             raise AlreadyCalled
 
 
-def _nothing() -> None:
+def _do_nothing() -> None:
     pass
 
 
 @implementer(IReactorTime)
 class HeapClock:
-    """Time that moves only when it is told to; scheduling and running a call cost O(log n).
+    """A clock that advances only on request; scheduling and running a call cost O(log n).
 
-    Calls that are due at the same moment are made in the order in which they were scheduled.
+    Calls that are due at the same time run in the order in which they were scheduled.
     """
 
     def __init__(self, now: float = 0.0) -> None:
@@ -125,26 +125,26 @@ class HeapClock:
         self._dead = 0
 
     def seconds(self) -> float:
-        """The simulated moment, in seconds."""
+        """Return the simulated time in seconds."""
         return self._now
 
     def callLater(self, delay: float, callable: Callable[..., object], *args: object, **kw: object) -> _HeapCall:  # noqa: A002
-        """Schedule ``callable(*args, **kw)`` for ``delay`` seconds from now; ``delay`` may not be negative."""
+        """Schedule ``callable(*args, **kw)`` for ``delay`` seconds from now; ``delay`` must not be negative."""
         if delay < 0:
-            raise ValueError(f"a call cannot be made {-delay} s ago")
+            raise ValueError(f"the delay must not be negative, is {delay} s")
         moment, order = self._now + delay, next(self._orders)
         call = _HeapCall(self, moment, order, callable, args, kw)
         heapq.heappush(self._heap, (moment, order, call))
         return call
 
     def getDelayedCalls(self) -> Sequence[IDelayedCall]:
-        """The calls that wait, soonest first."""
+        """Return the pending calls, earliest first."""
         return [call for _, order, call in sorted(self._heap) if call.order == order]
 
     def run_until(self, moment: float) -> None:
-        """Make every call that is due up to and with ``moment``, also those scheduled on the way, and stand there.
+        """Run all calls that are due up to ``moment``, including new ones, and set the time to ``moment``.
 
-        An exception of a call passes through; the clock then stands at that call's moment.
+        An exception of a call propagates; the clock then stays at that call's time.
         """
         heap, pop = self._heap, heapq.heappop
         while heap and heap[0][0] <= moment:
@@ -159,25 +159,25 @@ class HeapClock:
         self._now = max(self._now, moment)
 
     def advance(self, seconds: float) -> None:
-        """Move time on by ``seconds``."""
+        """Advance the time by ``seconds``."""
         self.run_until(self._now + seconds)
 
     def leap(self, seconds: float) -> None:
-        """Be suspended for ``seconds``: time passes and nothing is done; what came due is done late."""
+        """Simulate a suspension of ``seconds``: the time advances without running calls, which are late then."""
         self._now += seconds
 
     def pump(self, steps: Iterable[float]) -> None:
-        """Move time on by each of ``steps`` seconds in turn."""
+        """Advance the time by each of ``steps`` seconds in turn."""
         for step in steps:
             self.advance(step)
 
     def _move(self, call: _HeapCall, moment: float) -> None:
         call.time, call.order = moment, next(self._orders)
-        heapq.heappush(self._heap, (moment, call.order, call))  # the older entry is known by its order, and skipped
-        self._dropped()
+        heapq.heappush(self._heap, (moment, call.order, call))  # the older entry has another order, and is skipped
+        self._count_dead_entry()
 
-    def _dropped(self) -> None:
-        # Time-outs are mostly cancelled; without this, dead entries would make up nearly all of the heap.
+    def _count_dead_entry(self) -> None:
+        # Timeouts are mostly cancelled; without this, dead entries would make up nearly all of the heap.
         self._dead += 1
         if self._dead > _COMPACT_FROM and self._dead * 2 > len(self._heap):
             self._heap = [entry for entry in self._heap if entry[2].order == entry[1]]

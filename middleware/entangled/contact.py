@@ -1,4 +1,4 @@
-"""Contact: a node as others know it."""
+"""Define the contact of a node."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from middleware.entangled.network.network import Address, relayed
 
 @dataclass(frozen=True, slots=True)
 class Contact:
-    """A node's public key (32 bytes) and address; the id follows from the key."""
+    """A node's public key (32 bytes) and address; the node id is derived from the key."""
 
     public: bytes
     address: Address
@@ -20,13 +20,13 @@ class Contact:
         object.__setattr__(self, "node_id", node_id(self.public))
 
     def packed(self) -> list[object]:
-        """The contact as it stands in a message: a way that is this node's own (a tunnel) is of no use to others."""
+        """Encode the contact for a message; a virtual address of this node (a tunnel) becomes a relayed one."""
         host, port = relayed(self.node_id) if self.address.is_virtual else self.address
         return [self.public, host, port]
 
 
 def unpacked(fields: object) -> Contact | None:
-    """The contact that ``packed`` made, or None where the fields cannot be one."""
+    """Decode a contact, or return None if the fields are invalid."""
     if not isinstance(fields, list) or len(fields) != 3:
         return None
     public, host, port = fields
@@ -37,5 +37,5 @@ def unpacked(fields: object) -> Contact | None:
     if not (type(port) is int and 0 < port < 65536):
         return None
     contact = Contact(public, Address(host, port))
-    # Nobody can name a way of ours: whatever stands there, it only says that others have to carry what is sent.
+    # A peer cannot name a virtual address of this node: any such host only means that the contact needs a relay.
     return Contact(public, relayed(contact.node_id)) if host[0] == "~" else contact

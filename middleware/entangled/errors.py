@@ -1,50 +1,50 @@
-"""Every exception of the peer-to-peer library; the class says who is to blame, and so what to do.
+"""Exceptions of the peer-to-peer library; the class tells the cause, and so how to react.
 
 ::
 
     EntangledError
-      RemoteError     the peer's fault: count it, drop it, live on
+      RemoteError     the peer violated the protocol: count and drop
         Malformed
         Forged
-      WeatherError    nobody's fault: try again, with back-off
+      WeatherError    the network or a peer is unavailable: retry with backoff
         NoAnswer
           NotAcknowledged
         Crowded
         Unavailable
-      LocalError      our caller's fault: let it fly
+      LocalError      the caller made an error: propagate
         NotRunning
         TooLarge
         PortInUse
           TunnelPortInUse
         BadStore
-      Refused         a lawful no: an answer, and no accident
+      Refused         the peer answered, and rejected the request
         Full
         Unwritable
         Conflict
         NotAdmitted
 """
 
-_WAIT = "try again when members are back, or in two minutes, when the absent count no more"
+_WAIT = "try again when members are back, or in two minutes, when absent members no longer count"
 
 
 class EntangledError(Exception):
-    """The root of what the library raises."""
+    """The base class of all exceptions of the library."""
 
 
 class RemoteError(EntangledError):
-    """A peer sent what it should not have sent."""
+    """A peer sent invalid data."""
 
 
 class Malformed(RemoteError):
-    """Bytes that are not a message."""
+    """The bytes are not a valid message."""
 
 
 class Forged(RemoteError):
-    """Bytes or a record that do not come from where they claim."""
+    """The bytes or the record are not authentic."""
 
 
 class WeatherError(EntangledError):
-    """The network did not carry it this time."""
+    """The network did not deliver in time; a retry may succeed."""
 
 
 class NoAnswer(WeatherError):
@@ -52,61 +52,61 @@ class NoAnswer(WeatherError):
 
 
 class NotAcknowledged(NoAnswer):
-    """A write did not get as many replicas as its concern wants; those that have it keep it, and it may still spread.
+    """Fewer replicas stored a write than its consistency level requires; the write may still spread from them.
 
-    ``acknowledged`` replicas said that they have it, ``needed`` were wanted.
+    ``acknowledged`` replicas confirmed that they have it, ``needed`` were required.
     """
 
     def __init__(self, acknowledged: int, needed: int) -> None:
         super().__init__(
-            f"{acknowledged} replicas acknowledge the record, {needed} are needed; {_WAIT}, or write with 'one'"
+            f"{acknowledged} replicas acknowledged the record, {needed} are needed; {_WAIT}, or write with 'one'"
         )
         self.acknowledged = acknowledged
         self.needed = needed
 
 
 class Unavailable(WeatherError):
-    """Too few replicas answered to say what a key holds; it may hold something.
+    """Too few replicas answered a read, so the content of the key is unknown.
 
-    ``answered`` replicas gave an answer that counts, ``needed`` were wanted.
+    ``answered`` replicas gave a valid answer, ``needed`` were required.
     """
 
     def __init__(self, answered: int, needed: int) -> None:
-        super().__init__(f"{answered} replicas of the key answer, {needed} are needed; {_WAIT}, or read 'fast'")
+        super().__init__(f"{answered} replicas of the key answered, {needed} are needed; {_WAIT}, or read 'fast'")
         self.answered = answered
         self.needed = needed
 
 
 class Crowded(WeatherError):
-    """This node has as much on its way as it may; nothing was sent, and nothing is said about the peer."""
+    """This node has reached a limit of pending messages; nothing was sent, and the state of the peer is unknown."""
 
 
 class LocalError(EntangledError):
-    """The caller asked for something that cannot be."""
+    """The caller made an error."""
 
 
 class NotRunning(LocalError):
-    """The node was asked before it started or after it stopped."""
+    """The node has not started, or has stopped."""
 
 
 class TooLarge(LocalError):
-    """A name, value or message is larger than what the network carries; split it, or shorten it."""
+    """A name, value or message exceeds the limit of the network; split or shorten it."""
 
 
 class PortInUse(LocalError):
-    """Another program holds the port, or the address is not one of this machine; the message says what to change."""
+    """Another program uses the port, or the address is not one of this machine; the message has the remedy."""
 
 
 class TunnelPortInUse(PortInUse):
-    """The same of the TCP port for tunnels, or the node may not open one below 1024."""
+    """The same for the TCP port of tunnels; also if the node may not open a port below 1024."""
 
 
 class BadStore(LocalError):
-    """The data store cannot be used as it is; the message says why and what to do."""
+    """The data store is unusable; the message has the reason and the remedy."""
 
 
 class Refused(EntangledError):
-    """The peer understood and said no; ``str()`` is its reason, ``code`` names the kind of it for programs."""
+    """The peer rejected the request; ``str()`` is the reason for people, ``code`` the one for programs."""
 
     code = "refused"
 
@@ -117,31 +117,31 @@ class Refused(EntangledError):
 
 
 OWNER_FULL = "owner-full"
-"""The code of ``Full`` where the store has room, though not for more of this owner."""
+"""The code of ``Full`` if the store has room, but not for more records of this owner."""
 
 
 class Full(Refused):
-    """The store has no room and nothing that it may let go of; remove some, or allow it more rows or bytes.
+    """The store is full and has nothing that it may delete; remove records, or allow more rows or bytes.
 
-    With the code ``OWNER_FULL`` it is the owner of the record that has all that one owner may have.
+    With the code ``OWNER_FULL`` the owner of the record has reached the limit per owner.
     """
 
 
 class Unwritable(Refused):
-    """The store's file cannot be written now (full disk, read-only, broken); reads go on, writes do when it can."""
+    """The store's file cannot be written (full disk, read-only, corrupt); reads continue, writes resume when it can."""
 
 
 class Conflict(Refused):
-    """A compare-and-set came too late: the slot holds ``sequence`` already."""
+    """A compare-and-set failed: the slot has the number ``sequence`` already."""
 
     def __init__(self, expected: int, sequence: int) -> None:
-        super().__init__(f"the slot holds number {sequence}, expected was {expected}; read it and decide again")
+        super().__init__(f"the slot has number {sequence}, expected was {expected}; read it again and retry")
         self.expected = expected
         self.sequence = sequence
 
 
 class NotAdmitted(Refused):
-    """One of two nodes does not let the other in: ``code`` names why, the text says who refuses whom and what to do."""
+    """One of two nodes rejects the other: ``code`` is the reason, the text names both sides and the remedy."""
 
     def __init__(self, text: str, code: str) -> None:
         super().__init__(text, code)

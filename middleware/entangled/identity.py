@@ -1,7 +1,7 @@
-"""Identity: the lasting key pair of a node, and the node id that follows from it.
+"""Derive a node's key pairs and its node id from a seed.
 
-One 32-byte seed gives the Ed25519 pair that signs records and the X25519 pair that opens sessions.  The node id is the
-hash of the public key, so an id cannot be chosen or borrowed.
+One 32-byte seed determines the Ed25519 key pair that signs records and the X25519 key pair that opens sessions.  The
+node id is the hash of the public key, so a node can neither choose an id nor use another node's.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ ID_BYTES = 20
 
 @dataclass(frozen=True)
 class Identity:
-    """A node's key pair, made from a secret ``seed`` of 32 bytes."""
+    """A node's key pairs, derived from a secret ``seed`` of 32 bytes."""
 
     seed: bytes = field(repr=False)
     public: bytes = field(init=False)
@@ -34,18 +34,18 @@ class Identity:
         object.__setattr__(self, "exchange_secret", bindings.crypto_sign_ed25519_sk_to_curve25519(signing))
 
     def sign(self, message: bytes) -> bytes:
-        """The 64-byte Ed25519 signature of ``message``."""
+        """Return the 64-byte Ed25519 signature of ``message``."""
         return bindings.crypto_sign(message, self._signing)[: bindings.crypto_sign_BYTES]
 
 
 def node_id(public: bytes) -> bytes:
-    """The 160-bit id of the node that holds ``public``."""
+    """Return the 160-bit id of the node with the key ``public``."""
     return hashlib.blake2s(public, digest_size=ID_BYTES).digest()
 
 
-@lru_cache(maxsize=128)  # a handshake needs it twice, and it takes as long as a key exchange
+@lru_cache(maxsize=128)  # a handshake calls it twice, and it costs as much as a key exchange
 def exchange_key(public: bytes) -> bytes:
-    """The X25519 key that belongs to the Ed25519 key ``public``; raises ``ValueError`` where it is no key."""
+    """Convert an Ed25519 public key to its X25519 key; raise ``ValueError`` if it is invalid."""
     try:
         return bindings.crypto_sign_ed25519_pk_to_curve25519(public)
     except CryptoError as error:
@@ -53,7 +53,7 @@ def exchange_key(public: bytes) -> bytes:
 
 
 def verified(public: bytes, message: bytes, signature: bytes) -> bool:
-    """Whether ``signature`` over ``message`` was made by the holder of ``public``."""
+    """Return whether ``signature`` over ``message`` was made with the key of ``public``."""
     try:
         bindings.crypto_sign_open(signature + message, public)
     except (CryptoError, ValueError):

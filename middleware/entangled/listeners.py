@@ -1,4 +1,4 @@
-"""Listeners: the functions that an object calls at one kind of event."""
+"""Register and call the listeners of an event."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ P = ParamSpec("P")
 
 
 class Listeners(Generic[P]):
-    """The listeners of one kind of event, called in the order in which they were added.
+    """The listeners of one event, called in the order in which they were added.
 
-    Only the owner of the event calls it.  ``add`` and ``remove`` replace the tuple, so that a notification that is
-    under way reaches those who listened when it began.  What a listener raises goes to the owner.
+    Only the owner of the event calls it.  A listener that is added during a notification is not called in it.  An
+    exception of a listener propagates to the owner.
     """
 
     __slots__ = ("_all",)
@@ -21,10 +21,10 @@ class Listeners(Generic[P]):
         self._all: tuple[Callable[P, object], ...] = ()
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> None:
-        """Notify everybody."""
+        """Call all listeners."""
         for listener in self._all:
             listener(*args, **kwargs)
 
     def add(self, listener: Callable[P, object]) -> None:
-        """Notify ``listener`` of each event from now on."""
+        """Call ``listener`` at each event from now on."""
         self._all = (*self._all, listener)

@@ -1,9 +1,8 @@
-"""Streams: newest-frame-wins channels for cameras, over the node's own sealed port.
+"""Stream camera frames in the node's encrypted sessions, always the newest one.
 
-A viewer opens a channel at a publisher and keeps it open by asking again; the publisher sends each frame in a few
-datagrams that nobody acknowledges.  A frame that misses a part is dropped, and a late one too: there is never a
-backlog.  Nothing is sent while nobody looks.  A frame carries its age, so that a viewer knows how old it is without
-knowing the publisher's clock.
+A viewer subscribes to a channel of a publisher and renews the subscription; the publisher sends each frame in a few
+datagrams without acknowledgement.  Incomplete and late frames are dropped, so there is never a backlog.  Nothing is
+sent without viewers.  A frame carries its age, so that a viewer need not know the publisher's clock.
 """
 
 from __future__ import annotations
@@ -24,17 +23,17 @@ MAX_VIEWERS = 64
 OPEN_TTL = 3.0
 RENEW = 1.0
 PATIENCE = 1.0
-"""Seconds without a newer frame after which an older number is believed: the publisher began anew."""
+"""The seconds without a newer frame after which a lower number is accepted, because the publisher restarted."""
 MAX_CHANNEL = 32
 
 MAX_AGE = 600.0
 OnFrame = Callable[[int, bytes, float], None]
-"""Called with number, frame and age in seconds."""
+"""Called with the number, the frame, and its age in seconds."""
 
 
 @dataclass
 class _Assembly:
-    """The parts of the newest frame of one channel; ``at`` is when its first part came, ``age`` how old it was then."""
+    """The parts of the newest frame of one channel; ``at`` is the arrival of its first part, ``age`` its age then."""
 
     sequence: int = -1
     count: int = 0
@@ -44,7 +43,7 @@ class _Assembly:
     is_done: bool = False
 
     def add(self, sequence: int, number: int, count: int, part: bytes, age: float, now: float) -> bytes | None:
-        """Take in one part; the whole frame where it was the last one missing."""
+        """Add one part; return the frame if it is complete."""
         if sequence < self.sequence and now - self.at <= PATIENCE:
             return None
         if sequence != self.sequence or count != self.count:
@@ -58,20 +57,20 @@ class _Assembly:
 
 
 class Streams:
-    """Both sides of all channels of one node."""
+    """The published and viewed channels of one node."""
 
     def __init__(self, endpoint: Endpoint, clock: IReactorTime) -> None:
         self._endpoint = endpoint
         self._clock = clock
         self._viewers: dict[str, dict[bytes, tuple[Contact, float]]] = {}
-        self._looks: dict[tuple[bytes, str], _Look] = {}
+        self._views: dict[tuple[bytes, str], _View] = {}
         endpoint.expose("stream.open", self._answer_open, changes=True, idempotent=True)
         endpoint.expose("stream.part", self._answer_part)
 
     # -- publisher --------------------------------------------------------------------------------------------------
 
     def is_wanted(self, channel: str) -> bool:
-        """Whether anybody looks at ``channel`` now."""
+        """Return whether ``channel`` has viewers now."""
         now = self._clock.seconds()
         viewers = self._viewers.get(channel, {})
         for node_id in [n for n, (_, until) in viewers.items() if until < now]:
@@ -81,9 +80,9 @@ class Streams:
         return bool(viewers)
 
     def offer(self, channel: str, sequence: int, frame: bytes, age: float = 0.0) -> None:
-        """Send ``frame``, taken ``age`` seconds ago, to whoever looks at ``channel``.
+        """Send ``frame``, taken ``age`` seconds ago, to the viewers of ``channel``.
 
-        Frames of over ``MAX_PARTS`` parts are not sent.
+        Frames of more than ``MAX_PARTS`` parts are not sent.
         """
         if not self.is_wanted(channel):
             return
@@ -97,9 +96,9 @@ class Streams:
 
     def _answer_open(self, peer: Contact, channel: str) -> bool:
         if len(channel) > MAX_CHANNEL:
-            raise Refused(f"a channel is named by at most {MAX_CHANNEL} characters")
+            raise Refused(f"the name of a channel has at most {MAX_CHANNEL} characters")
         for other in list(self._viewers):
-            self.is_wanted(other)  # forgets whoever looked no more
+            self.is_wanted(other)  # deletes expired viewers
         viewers = self._viewers.get(channel, {})
         if peer.node_id not in viewers and sum(map(len, self._viewers.values())) >= MAX_VIEWERS:
             raise Refused("too many viewers")
@@ -110,37 +109,37 @@ class Streams:
     # -- viewer -----------------------------------------------------------------------------------------------------
 
     def look(self, publisher: Contact, channel: str, on_frame: OnFrame) -> Callable[[], None]:
-        """Call ``on_frame(sequence, frame, age)`` at each whole new frame until what is returned is called.
+        """Call ``on_frame(sequence, frame, age)`` for each complete new frame; return a function that stops it.
 
-        ``age`` is in seconds since it was taken: as the publisher says, and half a round trip, where one was measured.
+        ``age`` is the seconds since the frame was taken: its age at the publisher and half a measured round trip.
         """
         place = (publisher.node_id, channel)
-        look = self._looks.get(place)
+        look = self._views.get(place)
         if look is None:
-            look = self._looks[place] = _Look(self, publisher, channel)
+            look = self._views[place] = _View(self, publisher, channel)
             look.renew()
         look.watchers.append(on_frame)
 
         def stop() -> None:
             if on_frame in look.watchers:
                 look.watchers.remove(on_frame)
-            if not look.watchers and self._looks.get(place) is look:
+            if not look.watchers and self._views.get(place) is look:
                 look.end()
-                del self._looks[place]
+                del self._views[place]
 
         return stop
 
     def stop(self) -> None:
-        """End everything that is looked at, and send nothing more."""
-        for look in self._looks.values():
+        """Stop all channels, viewed and published."""
+        for look in self._views.values():
             look.end()
-        self._looks.clear()
+        self._views.clear()
         self._viewers.clear()
 
     def _answer_part(
         self, peer: Contact, channel: str, sequence: int, number: int, count: int, part: bytes, age_ms: int = 0
     ) -> None:
-        look = self._looks.get((peer.node_id, channel))
+        look = self._views.get((peer.node_id, channel))
         if look is None or not 0 <= number < count <= MAX_PARTS or len(part) > PART_BYTES:
             return
         if not 0 <= age_ms <= 1000 * MAX_AGE:
@@ -153,8 +152,8 @@ class Streams:
                 on_frame(sequence, frame, age)
 
 
-class _Look:
-    """One channel looked at, kept open while there is a watcher."""
+class _View:
+    """One viewed channel, renewed while it has watchers."""
 
     def __init__(self, streams: Streams, publisher: Contact, channel: str) -> None:
         self.watchers: list[OnFrame] = []
@@ -165,11 +164,11 @@ class _Look:
         self._timer: IDelayedCall | None = None
 
     def renew(self) -> None:
-        """Ask the publisher to go on."""
+        """Renew the subscription."""
         self._timer = self._streams._clock.callLater(RENEW, self.renew)
         opened = self._streams._endpoint.ask(self._publisher, "stream.open", self._channel, changes=True)
         opened.addErrback(lambda failure: failure.trap(EntangledError))
 
     def end(self) -> None:
-        """Stop renewing; the publisher notices by itself."""
+        """Stop renewing; the subscription expires at the publisher."""
         cancel(self._timer)

@@ -1,12 +1,12 @@
-"""Token bucket: how often something may happen, or how much of it; pure."""
+"""Limit a rate with a token bucket."""
 
 from __future__ import annotations
 
 
 class TokenBucket:
-    """``rate`` tokens come in a second, up to ``size`` (None: what one second brings); it is full at first.
+    """A bucket that gains ``rate`` tokens per second up to ``size`` (None: the tokens of one second), initially full.
 
-    ``now`` is in seconds; a clock that was set back brings nothing.
+    ``now`` is in seconds; a clock that was set back adds nothing.
     """
 
     __slots__ = ("_rate", "_size", "_tokens", "_filled_at")
@@ -17,7 +17,7 @@ class TokenBucket:
         self._filled_at = 0.0
 
     def take(self, now: float, amount: float = 1.0) -> bool:
-        """Whether there is so much; it is gone then."""
+        """Take ``amount`` tokens if there are enough; return whether there were."""
         passed, self._filled_at = now - self._filled_at, now
         if passed > 0.0:
             self._tokens = min(self._size, self._tokens + passed * self._rate)
@@ -27,9 +27,9 @@ class TokenBucket:
         return True
 
     def give(self) -> None:
-        """Put back one token that was taken for nothing."""
+        """Return one token that was not used."""
         self._tokens = min(self._size, self._tokens + 1.0)
 
     def is_full(self, now: float) -> bool:
-        """Whether it is as good as a new one."""
+        """Return whether the bucket is full."""
         return self._tokens + (now - self._filled_at) * self._rate >= self._size

@@ -75,7 +75,7 @@ class ReplayCase(SiegeCase):
                 half.forget(session)
             half.clear()
             # A recording of an earlier life looks like a copy of that node: said once for each member, and no more.
-            self.assertLessEqual(len(endpoint._noted._said), len(team.houses))
+            self.assertLessEqual(len(endpoint._noted._logged), len(team.houses))
             timers = sorted(call.getTime() for call in team.clock.getDelayedCalls())
             noted, endpoint._noted = endpoint._noted, Noted()
             found.append(state_of([house.node, house.node.store, house.team.roll, timers]))

@@ -124,7 +124,7 @@ class SaidTests(SiegeCase):
             *(repr(each) + str(each) for each in (house.kept.membership, house.kept, team.signer, house.team)),
             repr(house.kept.membership.identity) + str(house.kept.membership.identity),
             repr(house.node.endpoint) + repr(house.team.door) + repr(house.team.roll),
-            repr(house.node.endpoint._own),
+            repr(house.node.endpoint._credentials),
             repr(house.team._given(house.kept.membership.shown)),
         ]
         self.assertEqual([each for each in self.secrets(team) if each in "\n".join(shown)], [])

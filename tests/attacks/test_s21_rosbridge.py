@@ -136,14 +136,14 @@ class FloodTests(SynchronousTestCase):
         self.pass_time(0.5)
         self.assertEqual(self.driver.state, "ready")
         self.taken = 0
-        take, send = End._is_taken, End._send
+        take, send = End._process_event, End._send
 
         def counted(end: End, event: Event) -> bool:
             is_taken = take(end, event)
             self.taken += is_taken and end._request is not None
             return is_taken
 
-        self.patch(End, "_is_taken", counted)
+        self.patch(End, "_process_event", counted)
         self.pongs: list[int] = []
 
         def noted(end: End, event: Event) -> bytes:

@@ -16,7 +16,7 @@ from middleware.entangled.identity import Identity, exchange_key
 from middleware.entangled.network.network import MAX_DATAGRAM, Address
 from middleware.entangled.wire.greeting import COOKIE
 from middleware.entangled.wire.noise import Initiator, Responder
-from middleware.entangled.wire.session import INIT, MAC, PROLOGUE, RESP, Credentials, _hashed, derived_key, mac_of
+from middleware.entangled.wire.session import INIT, MAC, PROLOGUE, RESP, Credentials, _keyed_hash, derived_key, mac_of
 from tests.fuzz.ground import STRANGER, TEAM, Ground, Violation
 from tests.fuzz.runner import Again, main
 from tests.middleware.gate import Gate
@@ -39,7 +39,7 @@ def init(ground: Ground, data: bytes) -> bytes:
     noise = Initiator(OWN.static, remote, random.Random(data[:1]).randbytes(32), PROLOGUE, OWN.psk)
     payload = data[1:] if data[:1] < b"\x80" else data[1:5] + OWN.public + data[5:]
     bare = bytes([INIT]) + noise.write(payload[: MAX_DATAGRAM - 200].ljust(520 + ground.room, b"\0"))
-    bare += _hashed(OWN.mac_key, bare)
+    bare += _keyed_hash(OWN.mac_key, bare)
     return bare + (bytes(MAC) if len(data) % 2 else data[-MAC:].ljust(MAC, b"\0"))
 
 

@@ -76,7 +76,7 @@ class Wire(Workload):
         self._states: dict[str, str] = {}
         self._born_at: dict[Address, float] = {}
         self._number = 0
-        carry, deliver = self._board._carry, self._board._deliver
+        carry, deliver = self._board._transmit, self._board._deliver
 
         def tapped_carry(network: Any, datagram: bytes, to: Address) -> None:
             if self._answered is not None:
@@ -95,7 +95,7 @@ class Wire(Workload):
                     (schedule.fleet.clock.seconds(), source, datagram)
                 )
 
-        vars(self._board).update(_carry=tapped_carry, _deliver=tapped_deliver)
+        vars(self._board).update(_transmit=tapped_carry, _deliver=tapped_deliver)
         # The recordings outlive a node: they are fired at its next life.
         schedule.fleet.attend(self._born, lambda place, node: None)
 
@@ -264,5 +264,5 @@ def _ways(node: EntangledNode) -> list[tuple[str, int, int]]:
         *((f"ways ({name})", len(getattr(reach, name)), MAX_KNOWN) for name in tables),
         ("holes in its router", len(reach.ways._holes), MAX_KNOWN),
         ("where it is seen", len(reach.outside._seen), MAX_KNOWN),
-        ("who was told where it is seen", len(reach.outside._told_at), MAX_KNOWN),
+        ("who was told where it is seen", len(reach.outside._notified_at), MAX_KNOWN),
     ]

@@ -67,9 +67,9 @@ class LoopbackTests(TestCase):
         group, _ = self.group(
             "", lambda: found.pop(0) if len(found) > 1 else found[0], lambda: changes.append(len(found))
         )
-        group._look_again()
+        group._update_interfaces()
         self.assertEqual(changes, [])
-        group._look_again()
+        group._update_interfaces()
         self.assertEqual(changes, [1])
 
     def test_the_loopback_is_an_interface(self) -> None:

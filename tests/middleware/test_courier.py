@@ -185,7 +185,7 @@ class HostileTests(ParcelCase):
     def test_late_parts_begin_nothing(self) -> None:
         """A part of a question that was whole before, or of an answer that nobody waits for, begins no parcel."""
         self.got(self.a.ask(self.to_b, "echo", LARGE[:5000]))
-        key = next(iter(self.b._courier._ended))[1]
+        key = next(iter(self.b._courier._completed))[1]
         got = self.fire(self.part(1, 5030, key.id))
         self.assertEqual([receipt_of(plain).is_done for plain in got], [True])
         self.fire(b"\x01\x03" + self.part(0)[2:])

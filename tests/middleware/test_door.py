@@ -336,7 +336,7 @@ class SecretTests(ClosedCase):
         self.b.rekey(self.NEW, TEAM)
         new, _ = self.endpoint(8, team=self.NEW)
         for asker in (self.a, new):
-            self.b._cookies._quiet._tokens = -1e6
+            self.b._cookies._limit._tokens = -1e6
             self.assertEqual(self.got(asker.ask(self.to_b, "echo", 1), 4 * DELAY), 1)
 
     def test_nobody_is_remembered_by_an_old_one(self) -> None:

@@ -145,9 +145,9 @@ class AskTests(EndpointCase):
         self.assertIn("no such method", self.failed(ask(self.to_b, "nothing"), Refused))
         self.assertIn("takes 1 arguments", self.failed(ask(self.to_b, "echo"), Refused))
         self.assertIn("takes 1 to 2 arguments", self.failed(ask(self.to_b, "whole"), Refused))
-        self.assertIn("argument 1 must be int, is str", self.failed(ask(self.to_b, "whole", "x"), Refused))
+        self.assertIn("argument 1 must be int, not str", self.failed(ask(self.to_b, "whole", "x"), Refused))
         self.assertIn("argument 2 must be str or None", self.failed(ask(self.to_b, "whole", 1, b"x"), Refused))
-        self.assertIn("ask for less", self.failed(ask(self.to_b, "fill", MAX_MESSAGE), Refused))
+        self.assertIn("request less", self.failed(ask(self.to_b, "fill", MAX_MESSAGE), Refused))
         self.assertEqual(self.got(ask(self.to_b, "whole", 1, None)), [1, None])
 
     def test_foreign_exceptions_stay_inside(self) -> None:
@@ -189,7 +189,9 @@ class AskTests(EndpointCase):
         self.board.kill(self.to_b.address)
         self.failed(self.a.ask(self.to_b, "echo", 1), NoAnswer, 1.0)
         self.failed(self.a.ask(self.to_b, "echo", 1, timeout=0.1), NoAnswer, 0.11)
-        self.assertIn("no key", self.failed(self.a.ask(Contact(b"\xff" * 32, self.to_b.address), "echo", 1), NoAnswer))
+        self.assertIn(
+            "is invalid", self.failed(self.a.ask(Contact(b"\xff" * 32, self.to_b.address), "echo", 1), NoAnswer)
+        )
         self.a.stop()
         self.b.stop()
         self.assertEqual(self.clock.getDelayedCalls(), [])
@@ -413,15 +415,15 @@ class AttackTests(EndpointCase):
         session = next(iter(self.a._sessions.values()))
         for rubbish in (b"\xc1", b"\x93\x01", b"\x90", self.rng.randbytes(300)):
             self.assertEqual(self.send_raw(session.seal(rubbish), self.to_a.address), 0)
-        invitation = Invitation(self.a._own, exchange_key(self.to_b.public), bytes(range(32)), 5, b"\xc1")
+        invitation = Invitation(self.a._credentials, exchange_key(self.to_b.public), bytes(range(32)), 5, b"\xc1")
         self.assertEqual(self.send_raw(invitation.datagram()), 0)
         self.assertEqual(self.b.counters, {"malformed": 5})
         self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 2)), 2)
 
     def test_key_of_another_is_not_believed(self) -> None:
         """A member that names another one's public key in its INIT gets no answer and makes no session."""
-        thief = replace(self.a._own, public=Identity(b"v" * 32).public)
-        for own in (thief, replace(self.a._own, public=b"\xff" * 32)):
+        thief = replace(self.a._credentials, public=Identity(b"v" * 32).public)
+        for own in (thief, replace(self.a._credentials, public=b"\xff" * 32)):
             invitation = Invitation(own, exchange_key(self.to_b.public), self.rng.randbytes(32), 5, b"")
             self.assertEqual(self.send_raw(invitation.datagram()), 0)
         self.assertEqual((self.b.counters, self.b._sessions), ({"forged": 2}, {}))
@@ -446,7 +448,7 @@ class AttackTests(EndpointCase):
         self.clock.advance(1)
         self.assertEqual([self.successResultOf(one) for one in asked[:3]], [0, 1, 2])
         for one in asked[3:]:
-            self.assertIn("ask again later", str(self.failureResultOf(one, Refused).value))
+            self.assertIn("try again later", str(self.failureResultOf(one, Refused).value))
         self.assertEqual(self.runs, [0, 1, 2])
         self.clock.advance(40)
         self.assertEqual(self.got(self.a.ask(self.to_b, "add", 9, changes=True)), 9)

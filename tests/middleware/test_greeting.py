@@ -60,7 +60,7 @@ class CookieTests(EndpointCase):
 
     def test_forged_cookies(self) -> None:
         """A COOKIE from elsewhere, for no INIT of ours or with a wrong seal is counted and changes nothing."""
-        self.b._cookies._quiet._tokens = -1e6
+        self.b._cookies._limit._tokens = -1e6
         self.a.ask(self.to_b, "echo", 7).addErrback(lambda failure: None)
         self.clock.advance(1.5 * DELAY)
         tap = self.taps[self.to_a.address]

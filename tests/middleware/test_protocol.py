@@ -93,7 +93,7 @@ def exchange() -> dict[str, Any]:
         clock.advance(1)
         alice.greet(to_bob.address)
         clock.advance(1)
-        bob._cookies._quiet._tokens = -1000.0
+        bob._cookies._limit._tokens = -1000.0
         for method, arguments, changes in (("echo", (1,), False), ("add", (2, 3), True), ("echo", (LARGE,), False)):
             alice.ask(to_bob, method, *arguments, changes=changes)
             clock.advance(1)

@@ -127,7 +127,7 @@ class TeamTests(SynchronousTestCase):
         ours, theirs = links(self.laptop)["refusals"], links(self.dog)["refusals"]
         self.assertIn(("dog1", "we", "revoked"), [(each["who"], each["side"], each["code"]) for each in ours])
         self.assertIn(("they", "revoked"), [(each["side"], each["code"]) for each in theirs])
-        self.assertIn("only a new code lets that node in again", ours[0]["reason"])
+        self.assertIn("admit the node again with a new code", ours[0]["reason"])
         self.assertNotIn("dog1", [member["name"] for member in team(self.laptop)["members"]])
 
     def test_refused_call(self) -> None:

@@ -1,1 +1,1 @@
-"""Kademlia: the distance of ids, whom a node knows, and how it finds others (Maymounkov and Mazieres, 2002)."""
+"""The DHT overlay: the XOR metric, routing table, lookups and membership (Maymounkov and Mazieres, 2002)."""

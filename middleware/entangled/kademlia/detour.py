@@ -1,7 +1,7 @@
-"""Detour: the ways into the network for a node to which no datagram gets through, and the way back from them.
+"""Enter the network through a tunnel when UDP is blocked, and return to UDP as soon as it works.
 
-A tunnel costs whoever serves it memory and its users time, so it is taken only when no known node answers otherwise,
-and given up as soon as its node answers without it.
+A tunnel takes memory of the serving node and delays its users' datagrams, so it is used only when no known node answers
+over UDP, and abandoned as soon as its node does.
 """
 
 from __future__ import annotations
@@ -22,22 +22,22 @@ from middleware.entangled.network.network import Address
 from middleware.entangled.wire.endpoint import Endpoint
 
 AFTER_S = 1.5
-"""Seconds for which the known nodes have the chance to answer without one."""
+"""The seconds in which the known nodes may answer over UDP before a tunnel is tried."""
 GREET_S = 4.0
-"""Seconds for a greeting: names are looked up, TCP, TLS and a WebSocket are opened first."""
+"""The timeout of a discovery request through a tunnel in seconds: it includes DNS, TCP, TLS and WebSocket."""
 BACKOFF = (0.2, 0.8)
-"""Seconds between two tries: where no tunnel is open a greeting costs nothing; when to dial is the tunnel's affair."""
+"""The shortest and longest pause in seconds between two tries; the tunnel limits the rate of dialling itself."""
 AGAIN_S = (5.0, 15.0, 60.0)
-"""Seconds between the tries to do without; the last one holds from then on."""
+"""The seconds between the attempts to return to UDP; the last one repeats."""
 LOOK_S = 1.0
 DIRECT_S = 0.5
-"""Seconds for a greeting without a detour; whoever is there answers in one round trip."""
+"""The timeout of a discovery request over UDP in seconds; a reachable node answers in one round trip."""
 
 Enter = Callable[[Contact], Coroutine[Any, Any, None]]
 
 
 class Detour:
-    """The detours of one node; ``enter`` proves a contact that was found and compares its members with ours."""
+    """The tunnels of one node; ``enter`` authenticates a discovered contact and exchanges members with it."""
 
     _log = Logger()
 
@@ -56,28 +56,28 @@ class Detour:
         self._rng = rng
         self._chores = chores
         self._enter = enter
-        self._ways: tuple[Address, ...] = ()
+        self._tunnels: tuple[Address, ...] = ()
         self._known: tuple[Address, ...] = ()
         self._tries = 0
         self._next_at = float("inf")
 
     @property
     def is_possible(self) -> bool:
-        """Whether there is any."""
-        return bool(self._ways)
+        """Whether any tunnel is configured."""
+        return bool(self._tunnels)
 
     def begin(self, ways: Sequence[Address], known: Sequence[Address]) -> None:
-        """Take note of the detours, and of the known nodes that should be reached without; called once."""
-        self._ways, self._known = tuple(ways), tuple(known)
+        """Set the tunnels, and the addresses of known nodes to return to over UDP; called once."""
+        self._tunnels, self._known = tuple(ways), tuple(known)
         if ways:
-            self._chores.every(LOOK_S, self._look)
+            self._chores.every(LOOK_S, self._try_direct)
 
     async def beside(self, join: Coroutine[Any, Any, None] | None) -> None:
-        """Enter by ``join``, or by a detour where that takes too long, whichever is first; None: by a detour."""
+        """Enter by ``join``, or by a tunnel if that takes too long, waiting for the first; None: only by a tunnel."""
         begun = [] if join is None else [Deferred.fromCoroutine(join)]
         try:
             await DeferredList(
-                [*begun, Deferred.fromCoroutine(self._tried(0.0 if join is None else AFTER_S, begun))],
+                [*begun, Deferred.fromCoroutine(self._try_repeatedly(0.0 if join is None else AFTER_S, begun))],
                 fireOnOneCallback=True,
                 fireOnOneErrback=True,
                 consumeErrors=True,
@@ -86,13 +86,13 @@ class Detour:
             error.subFailure.raiseException()
 
     async def taken(self) -> bool:
-        """Whether somebody of the team answers by any detour; the first one is enough."""
-        return bool(await first(1, [self._by(way) for way in self._ways]))
+        """Return whether a node of the team answers through any tunnel; the first answer is enough."""
+        return bool(await first(1, [self._enter_by(way) for way in self._tunnels]))
 
-    # -- inside -----------------------------------------------------------------------------------------------------
+    # -- private ----------------------------------------------------------------------------------------------------
 
-    async def _tried(self, wait: float, others: Sequence[Deferred[None]]) -> None:
-        """Try all detours again and again, until one leads in or another way did."""
+    async def _try_repeatedly(self, wait: float, others: Sequence[Deferred[None]]) -> None:
+        """Try all tunnels repeatedly, until one leads into the network or another path did."""
         pause = BACKOFF[0]
         while True:
             if wait:
@@ -102,18 +102,18 @@ class Detour:
             wait = pause * (0.75 + self._rng.random() / 2)
             pause = min(pause * 2, BACKOFF[1])
 
-    async def _by(self, way: Address) -> bool:
-        contact = await self._endpoint.greet(way, GREET_S)
+    async def _enter_by(self, address: Address) -> bool:
+        contact = await self._endpoint.greet(address, GREET_S)
         if contact.node_id == self._overlay.own_id:
-            raise NoAnswer(f"{way} leads to this node itself")
+            raise NoAnswer(f"{address} is the address of this node itself")
         await self._enter(contact)
         return True
 
-    def _look(self) -> None:
-        """Now and then see whether those to whom a detour leads answer without it."""
-        there = {contact.node_id for contact in self._overlay.contacts() if contact.address in self._ways}
+    def _try_direct(self) -> None:
+        """Check at growing intervals whether the nodes behind tunnels answer over UDP."""
+        tunnelled = {contact.node_id for contact in self._overlay.contacts() if contact.address in self._tunnels}
         now = self._clock.seconds()
-        if not there:
+        if not tunnelled:
             self._tries, self._next_at = 0, float("inf")
         elif self._next_at == float("inf"):
             self._next_at = now + AGAIN_S[0]
@@ -121,10 +121,10 @@ class Detour:
             self._tries += 1
             self._next_at = now + AGAIN_S[min(self._tries, len(AGAIN_S) - 1)]
             for address in self._known:
-                self._chores.fork(self._straight(address, there))
+                self._chores.fork(self._reopen_direct(address, tunnelled))
 
-    async def _straight(self, address: Address, there: set[bytes]) -> None:
+    async def _reopen_direct(self, address: Address, tunnelled: set[bytes]) -> None:
         found = await self._endpoint.greet(address, DIRECT_S)
-        if found.node_id in there:
-            self._log.info("{address} answers without a detour again", address=address)
+        if found.node_id in tunnelled:
+            self._log.info("{address} is reachable over UDP again", address=address)
             self._endpoint.reopen(found)

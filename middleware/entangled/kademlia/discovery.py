@@ -1,9 +1,9 @@
-"""Discovery: how a node finds its team on the LAN when it was told no address, and halves of a team find each other.
+"""Discover nodes of the team on the LAN without a configured address, and merge separate parts of a team.
 
-A node calls WHO into the group of the LAN, often while it is alone and seldom in company; some of those who hear it
-answer from their own port after a random moment, and whoever answers is greeted at its address, which proves that it
-is of the team.  Who hears a call answers with a probability that falls with the number of members and callers that it
-knows of, so that about ``ANSWERS`` come back however large the team is, also when all of it starts at one moment.
+A node multicasts WHO to the LAN, often while it has no contacts and rarely afterwards; some receivers reply from their
+own port after a random delay, and the node then sends a discovery request to each reply's address, which proves its
+membership.  A receiver replies with a probability that decreases with the number of members and senders that it knows,
+so that about ``ANSWERS`` replies are sent in a team of any size, even if all nodes start at the same moment.
 """
 
 from __future__ import annotations
@@ -27,31 +27,32 @@ from middleware.entangled.wire.greeting import HERE, WHO
 from middleware.entangled.wire.hail import HAIL
 
 ANSWERS = 4
-"""Answers to one call, on the average, where more than so many could answer."""
+"""The mean number of replies to one WHO, if more nodes could reply."""
 MOMENT = 0.1
-"""Seconds until an answer at most, and those before a node's first call: five times less."""
+"""The maximum delay of a reply in seconds; the first WHO of a node is delayed by up to a fifth of it."""
 ALONE = (0.2, 0.3, 0.5, 1.0, 2.0, 5.0)
-"""Seconds between the calls of a node that knows nobody; the last one stays."""
+"""The seconds between the multicasts of a node without contacts; the last one repeats."""
 IN_COMPANY = 30.0
-"""Seconds between two calls of all members of a team together: each waits so long for each that it knows."""
+"""The mean seconds between two multicasts of all members together: each node waits this long per member."""
 LONGEST = 900.0
 LISTEN = 0.8
-"""Seconds for which a node without known nodes listens before it takes itself for the first of its network."""
+"""The seconds after which a node without known nodes and without replies considers itself the first of its network."""
 RECENT = 2.0
 AGAIN = 4.0
-"""Seconds before the same address is greeted again."""
+"""The seconds before a discovery request to the same address is repeated."""
 AT_ONCE = 3
-"""Addresses that are greeted at the same time; who answers first names the others of its network."""
+"""The number of simultaneous discovery requests; the first node to answer names the others of its network."""
 MAX_PENDING = 64
-"""Answers that are put off at the same time, and so in ``MOMENT``."""
+"""The number of delayed replies, and so of replies within ``MOMENT``."""
 MAX_HEARD = 256
 
 
 class Discovery:
-    """One node's place in the group of its LAN.
+    """One node's discovery on its LAN.
 
-    ``counters`` counts the calls, those heard (of the team), answered and left to others, those that are not of the
-    team (foreign), came before (repeated) or were too many (crowded), and the addresses that were greeted.
+    ``counters`` counts the multicasts sent (calls), received from the team (heard), answered and not answered (left);
+    the datagrams of other teams (foreign), duplicates (repeated) and surplus ones (crowded); and the addresses that got
+    a discovery request (greeted).
     """
 
     def __init__(
@@ -75,7 +76,7 @@ class Discovery:
         self._tries = 0
         self._due = 0.0
         self._called = b""
-        self._not_again = lambda: None
+        self._cancel_turn = lambda: None
         self._heard: dict[bytes, None] = {}
         self._callers: deque[float] = deque(maxlen=MAX_HEARD)
         self._pending = 0
@@ -84,29 +85,29 @@ class Discovery:
         self._waiting: list[Deferred[None]] = []
 
     def start(self) -> None:
-        """Join the group and call."""
+        """Join the multicast group and send the first WHO."""
         self._group.listen(self._received, self._moved)
-        # A team that gets its power from one switch does not call at one moment.
-        self._not_again = self._chores.later(self._rng.random() * MOMENT / 5, self._turn)
+        # The nodes of a team that are switched on together do not multicast at the same moment.
+        self._cancel_turn = self._chores.later(self._rng.random() * MOMENT / 5, self._turn)
 
     def stop(self) -> None:
-        """Leave the group."""
+        """Leave the multicast group."""
         self._group.close()
 
     def first(self) -> Deferred[None]:
-        """Fire when one of the team was found, or nobody was for ``LISTEN`` seconds."""
+        """Return a Deferred that fires when a node of the team was found, or after ``LISTEN`` seconds."""
         found: Deferred[None] = Deferred()
         if self._overlay.contacts():
             found.callback(None)
         else:
             self._waiting.append(found)
-            self._chores.later(LISTEN, self._waited)
+            self._chores.later(LISTEN, self._fire_waiting)
         return found
 
-    # -- calling ----------------------------------------------------------------------------------------------------
+    # -- sending ----------------------------------------------------------------------------------------------------
 
     def _turn(self) -> None:
-        """Call if it is time; the next turn is soon enough for one that lost its whole team since."""
+        """Multicast if it is due; the interval also suits a node that lost all its contacts meanwhile."""
         company = len(self._overlay.contacts())
         now, wait = self._clock.seconds(), ALONE[-1]
         if company == 0:
@@ -114,11 +115,11 @@ class Discovery:
             self._tries += 1
             self._call()
         elif self._tries or now >= self._due:
-            if not self._tries:  # else it has called just before it found them
+            if not self._tries:  # otherwise it multicast just before it found them
                 self._call()
             self._tries = 0
-            self._due = now + min(LONGEST, IN_COMPANY * (company + 1)) * self._about()
-        self._not_again = self._chores.later(wait * self._about(), self._turn)
+            self._due = now + min(LONGEST, IN_COMPANY * (company + 1)) * self._draw_factor()
+        self._cancel_turn = self._chores.later(wait * self._draw_factor(), self._turn)
 
     def _call(self) -> None:
         self.counters["calls"] += 1
@@ -126,17 +127,17 @@ class Discovery:
         self._group.send(self._called)
 
     def _moved(self) -> None:
-        self._not_again()
+        self._cancel_turn()
         self._due, self._tries = 0.0, 0
-        self._turn()  # calls, in company as well
+        self._turn()  # multicasts, even with contacts
 
-    def _about(self) -> float:
+    def _draw_factor(self) -> float:
         return 0.75 + self._rng.random() / 2
 
-    def _answered(self, source: Address) -> None:
-        """Greet who answered a call, unless it is known."""
+    def _on_reply(self, source: Address) -> None:
+        """Send a discovery request to the source of a reply, unless it is a known contact."""
         now, overlay = self._clock.seconds(), self._overlay
-        # Who came to us first has told us nothing of the others yet.
+        # The first contact may not have named the other members yet.
         if (overlay.is_whole or overlay.is_large) and any(known.address == source for known in overlay.contacts()):
             return
         if self._greeting >= AT_ONCE or now - self._greeted_at.get(source, -AGAIN) < AGAIN:
@@ -151,30 +152,30 @@ class Discovery:
     async def _meet(self, address: Address) -> None:
         try:
             if await self._membership.meet(address):
-                self._waited()
+                self._fire_waiting()
         except EntangledError:
-            # A port that was somebody's a moment ago, or somebody who only listens to the team's calls.
+            # The node may have left the port, or it only listens to the multicasts of the team.
             self.counters["unmet"] += 1
         finally:
             self._greeting -= 1
 
-    def _waited(self) -> None:
+    def _fire_waiting(self) -> None:
         waiting, self._waiting = self._waiting, []
         for found in waiting:
             found.callback(None)
 
-    # -- being called -----------------------------------------------------------------------------------------------
+    # -- receiving --------------------------------------------------------------------------------------------------
 
     def _received(self, datagram: bytes, source: Address) -> None:
         kind = datagram[0] if datagram else 0
         if kind == HERE:
-            self._answered(source)
+            self._on_reply(source)
         elif kind in (WHO, HAIL) and datagram != self._called:
-            self._overheard(datagram, source)
+            self._on_request(datagram, source)
 
-    def _overheard(self, datagram: bytes, source: Address) -> None:
+    def _on_request(self, datagram: bytes, source: Address) -> None:
         digest = hashlib.blake2s(datagram, digest_size=8).digest()
-        if digest in self._heard:  # it comes once by each interface that both share; or it is a recording
+        if digest in self._heard:  # a duplicate from another interface of the same LAN, or a replay
             self.counters["repeated"] += 1
             return
         if datagram[0] == WHO:
@@ -191,7 +192,7 @@ class Discovery:
         self._chores.later(self._rng.random() * MOMENT, self._answer, datagram, source)
 
     def _answer(self, datagram: bytes, source: Address) -> None:
-        """Answer a call, or leave it to the others; by now those who called at the same moment were heard."""
+        """Reply to a WHO, or leave it to other nodes; simultaneous senders are counted by now."""
         self._pending -= 1
         since = self._clock.seconds() - RECENT
         callers = sum(1 for moment in self._callers if moment > since)

@@ -1,4 +1,4 @@
-"""Distance: the XOR metric of 160-bit ids (Kademlia, section 2.1)."""
+"""Compute the XOR metric of 160-bit ids (Kademlia, section 2.1)."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from middleware.entangled.contact import Contact
 
 
 def distance(a: bytes, b: bytes) -> int:
-    """The exclusive or of two ids, read as a number; 0 exactly where both are the same."""
+    """Return the exclusive or of two ids as a number; 0 if they are equal."""
     return int.from_bytes(a) ^ int.from_bytes(b)
 
 
 def bucket_index(own: bytes, other: bytes) -> int:
-    """The i of the k-bucket for distances from 2**i to below 2**(i+1); raises ``ValueError`` for a node's own id."""
+    """Return the i of the k-bucket for distances from 2**i to below 2**(i+1); raise ``ValueError`` for equal ids."""
     apart = distance(own, other)
     if not apart:
         raise ValueError("a node has no bucket for itself")
@@ -21,6 +21,6 @@ def bucket_index(own: bytes, other: bytes) -> int:
 
 
 def closest(contacts: Iterable[Contact], target: bytes, count: int) -> list[Contact]:
-    """At most ``count`` of ``contacts``, the closest to ``target`` first; equal ids keep the order they came in."""
+    """Return at most ``count`` of ``contacts``, the closest to ``target`` first; equal ids keep their order."""
     goal = int.from_bytes(target)
     return sorted(contacts, key=lambda contact: int.from_bytes(contact.node_id) ^ goal)[:count]

@@ -1,7 +1,7 @@
-"""Lookup: one iterative search for the k nodes closest to an id (Kademlia, section 2.3).
+"""Track one iterative search for the k nodes closest to an id (Kademlia, section 2.3), without I/O.
 
-Pure: says whom to ask, is told what came of it, and knows when it is done.  It ends when the k closest known contacts
-that have not failed have all answered, so in a quiet connected network it finds exactly the k closest nodes.
+The caller asks the contacts that ``next`` returns and reports the results.  The lookup ends when the k closest known
+contacts that have not failed have answered, so in a stable connected network it finds exactly the k closest nodes.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from middleware.entangled.kademlia.distance import closest, distance
 
 
 class _State(Enum):
-    """What is known of a candidate."""
+    """The state of a candidate."""
 
     NEW = "new"
     ASKED = "asked"
@@ -25,10 +25,10 @@ class _State(Enum):
 
 
 class Lookup:
-    """A search for ``target`` that begins at ``seeds``.
+    """A search for ``target`` that starts from ``seeds``.
 
-    ``k`` is how many are wanted; ``alpha`` how many are asked at the same time: more is quicker in bad weather and
-    costs more datagrams.  ``exclude`` is the id of the node that searches; it is never asked and never found.
+    ``k`` is the number of contacts to find, ``alpha`` the number of parallel requests: more is faster on lossy links
+    and costs more datagrams.  ``exclude`` is the id of the searching node; it is never asked and never found.
     """
 
     def __init__(
@@ -47,41 +47,40 @@ class Lookup:
 
     @property
     def is_finished(self) -> bool:
-        """Whether the k closest candidates that have not failed have all answered; so too where there are none."""
+        """Whether the k closest candidates that have not failed have answered; True without candidates."""
         return all(self._states[node_id] is _State.ANSWERED for node_id in self._nearest(_State.FAILED))
 
     def next(self) -> list[Contact]:
-        """Whom to ask now, closest first; from now on they count as asked."""
+        """Return the contacts to ask now, closest first, and mark them as asked."""
         asked = []
-        # While a slow one is given time, the next closest is asked in its stead: it stands ready if the slow one is
-        # lost.
+        # While a slow contact has time left, the next closest is asked too, in case the slow one fails.
         for node_id in self._nearest(_State.FAILED, _State.SLOW):
             if self._in_flight >= self._alpha:
                 break
             if self._states[node_id] is _State.NEW:
-                self._move(node_id, _State.ASKED)
+                self._set_state(node_id, _State.ASKED)
                 asked.append(self._contacts[node_id])
         return asked
 
     def answered(self, contact: Contact, contacts: Iterable[Contact]) -> None:
-        """Take in that ``contact`` answered with ``contacts``; of those at most the k closest are believed."""
+        """Record that ``contact`` answered with ``contacts``, of which at most the k closest are used."""
         if self._was_asked(contact):
-            self._move(contact.node_id, _State.ANSWERED)
+            self._set_state(contact.node_id, _State.ANSWERED)
             for found in closest(contacts, self._target, self._k):
                 self._add(found)
 
     def failed(self, contact: Contact) -> None:
-        """Give up on ``contact``."""
+        """Record that ``contact`` did not answer."""
         if self._was_asked(contact):
-            self._move(contact.node_id, _State.FAILED)
+            self._set_state(contact.node_id, _State.FAILED)
 
     def slow(self, contact: Contact) -> None:
-        """Free the place of ``contact`` among those in flight without giving up on it (a hedge)."""
+        """Exclude ``contact`` from the parallel requests without giving up on it (a hedge)."""
         if self._states.get(contact.node_id) is _State.ASKED:
-            self._move(contact.node_id, _State.SLOW)
+            self._set_state(contact.node_id, _State.SLOW)
 
     def closest(self) -> list[Contact]:
-        """The k closest contacts that have answered, closest first."""
+        """Return the k closest contacts that have answered, closest first."""
         answered = [c for node_id, c in self._contacts.items() if self._states[node_id] is _State.ANSWERED]
         return closest(answered, self._target, self._k)
 
@@ -94,12 +93,12 @@ class Lookup:
     def _was_asked(self, contact: Contact) -> bool:
         return self._states.get(contact.node_id, _State.NEW) is not _State.NEW
 
-    def _move(self, node_id: bytes, state: _State) -> None:
+    def _set_state(self, node_id: bytes, state: _State) -> None:
         self._in_flight += (state is _State.ASKED) - (self._states[node_id] is _State.ASKED)
         self._states[node_id] = state
 
     def _nearest(self, *without: _State) -> list[bytes]:
-        """The k closest candidates in none of these states."""
+        """Return the k closest candidates in none of these states."""
         nearest: list[bytes] = []
         for _, node_id in self._order:
             if self._states[node_id] not in without:

@@ -1,10 +1,10 @@
-"""Membership: how a node enters the network, hears of all members, and notices who comes, goes and comes back.
+"""Join the network, learn all its members, and detect members that appear, fail and return.
 
-Every ping carries a digest of the live members; where two nodes differ, one asks the other for its list and pings whom
-it did not know (nobody enters unproved).  So in a small team everybody knows everybody, and after a partition the two
-sides find each other again through any pair, whether the node that all joined by is still there or not.
+Every ping contains a digest of the live members; when two nodes differ, one requests the other's list and pings the
+members that it does not know (no member is added without authentication).  So in a small team all nodes know each
+other, and after a partition the two sides merge through any pair of nodes, even without the original bootstrap node.
 
-A network of more than ``MAX_MEMBERS`` is too large for that.  There a node sounds out its contacts (``sounding``).
+A network of more than ``MAX_MEMBERS`` nodes is too large for that.  There a node probes its contacts (``sounding``).
 """
 
 from __future__ import annotations
@@ -28,34 +28,35 @@ from middleware.entangled.network.network import Address
 from middleware.entangled.wire.endpoint import Endpoint
 
 SILENCE = 3.0
-"""Seconds without a word after which a contact is asked whether it is still there, in a team of ``SMALL``."""
+"""The seconds of silence after which a contact is pinged, in a team of up to ``SMALL`` members."""
 SMALL = 10
 MAX_SILENCE = 9.0
 REFRESH = 3600.0
-"""Seconds after which a bucket that nobody searched is refreshed (Kademlia, section 2.3)."""
+"""The seconds after which a bucket without a lookup is refreshed (Kademlia, section 2.3)."""
 BACKOFF = (0.2, 5.0)
 HINT_AFTER = 4
-"""Tries in vain after which a person is told, once, where to look: a node of another team hears no answer at all."""
+"""The failed tries after which the log suggests a diagnosis, once: a node of another team gets no answer at all."""
 MAX_FORMER = 32
-"""Addresses of known nodes and lost contacts that are tried when nobody is left."""
+"""The addresses of known nodes and lost contacts that are tried when no contact is left."""
 AGAIN = 4.0
-"""Seconds before an absent member, or one that was only named, is tried again."""
+"""The seconds before an absent member, or one that was only named, is tried again."""
 LARGE_FOR = 60.0
-"""Seconds for which one word that the network is too large to be known whole holds against those who do not see it.
-Who hears no such word for as long again begins to know the members anew."""
+"""The seconds for which one notification that the network is large is valid.  A node that gets no further one for as
+long again starts to learn all members again."""
 BREATH = 0.02
-"""Seconds that a newcomer lets its first reads, and those of others, have before it meets the next few strangers, and
-as much again at most."""
+"""The seconds that a newcomer waits before it contacts the next few unknown members, so that first reads are not
+delayed; up to as much again is added at random."""
 AT_ONCE = 8
-"""Strangers that are met at the same time: a handshake takes 0.3 ms of a core on each side."""
+"""The number of unknown members that are contacted at the same time: a handshake takes 0.3 ms of a core on each side.
+"""
 _BY_TABLE = b"-"
-"""Stands for the digest of who has none, since it goes by its table: nobody's list is like it."""
+"""The digest of a node without a list, because its network is large; it differs from every other digest."""
 PAGE = 20
-"""Members in one message."""
+"""The number of members in one message."""
 
 
 class Membership:
-    """The comings and goings around one node."""
+    """One node's view of the members."""
 
     _log = Logger()
 
@@ -67,7 +68,7 @@ class Membership:
         self._clock = clock
         self._rng = rng
         self._chores = chores
-        self._former: dict[Address, None] = {}
+        self._former_addresses: dict[Address, None] = {}
         self._tried_at: dict[bytes, float] = {}
         self._listed_at: dict[bytes, float] = {}
         self._returning = False
@@ -81,22 +82,22 @@ class Membership:
         endpoint.expose("known", self._answer_known, early=True)
 
     def start(self) -> None:
-        """Keep the contacts fresh from now on."""
+        """Start to probe the contacts."""
         self._chores.every(PROBE, self._probe)
 
     async def join(self, known: Sequence[Address], remembered: Sequence[Contact] = ()) -> None:
-        """Greet the known nodes, with back-off until one answers.
+        """Contact the known nodes, with exponential backoff until one answers.
 
-        ``remembered`` are greeted beside them, and waited for only where there are known nodes: without any, this may
-        be the first node of its network.  A known node that turns out to be this one is waited for no longer.
+        ``remembered`` contacts are tried too, but waited for only if there are known nodes: otherwise this may be the
+        first node of its network.  A known node that turns out to be this node is skipped.
         """
         others, pause, tries = list(known), BACKOFF[0], 0
         for contact in remembered:
             self._overlay.roster.remembered(contact, self._clock.seconds())
         addresses = [contact.address for contact in remembered if not contact.address.is_virtual]
-        self._former |= dict.fromkeys([*known, *addresses])
+        self._former_addresses |= dict.fromkeys([*known, *addresses])
         while others or addresses:
-            if await self._greeted(others, addresses) or self._is_entered:
+            if await self._contact_any(others, addresses) or self._is_entered:
                 return
             if self._chores.is_stopped:
                 raise NotRunning("the node stopped while it was joining")
@@ -106,20 +107,20 @@ class Membership:
             self._log.info("no answer from {known}; trying again in {s:.1f} s", known=names, s=pause)
             tries += 1
             if tries == HINT_AFTER:
-                self._log.warn("nobody lets this node in; swarm doctor SETTINGS says why")
+                self._log.warn("no known node admits this node; run: swarm doctor SETTINGS")
             await self._chores.sleep(pause * (0.75 + self._rng.random() / 2))
             pause = min(pause * 2, BACKOFF[1])
-        # Others may have come in meanwhile, and said that there are too many.
+        # Other nodes may have joined meanwhile and reported that the network is large.
         if not self._is_entered and not self._overlay.is_large:
             self._overlay.is_whole = True
 
     @property
     def is_entered(self) -> bool:
-        """Whether another way than a known node led into the network."""
+        """Whether a path other than a known node led into the network."""
         return self._is_entered
 
     async def meet(self, address: Address) -> bool:
-        """Greet whoever of the team is said to listen at ``address``: its network and this node's become one.
+        """Contact the node of the team at ``address``, which merges its network with this node's.
 
         Returns whether it is another node; raises ``NoAnswer``.
         """
@@ -130,9 +131,9 @@ class Membership:
         return True
 
     async def settle(self) -> None:
-        """Look up the own id (Kademlia, section 2.3), so that this node knows where it is and is known there."""
+        """Look up this node's id (Kademlia, section 2.3), so that it learns its neighbours and they learn it."""
         if not self._overlay.is_whole:
-            await self._chores.sleep(self._breath())
+            await self._chores.sleep(self._draw_pause())
         if not self._overlay.is_whole:
             await self._overlay.lookup(self._overlay.own_id)
         self._overlay.is_placed = True
@@ -140,20 +141,20 @@ class Membership:
             self._chores.fork(self.sounding.look_around())
 
     def lost(self, contact: Contact) -> None:
-        """Keep in mind where ``contact`` was."""
+        """Remember the address of a lost contact."""
         self.sounding.lost()
         if contact.address.is_virtual:
             return
-        keep(self._former, contact.address, None, MAX_FORMER)
+        keep(self._former_addresses, contact.address, None, MAX_FORMER)
 
     def forget(self, contact: Contact) -> None:
-        """Do not look for ``contact`` any more."""
-        self._former.pop(contact.address, None)
+        """Do not try the address of ``contact`` again."""
+        self._former_addresses.pop(contact.address, None)
 
-    # -- inside -----------------------------------------------------------------------------------------------------
+    # -- private ----------------------------------------------------------------------------------------------------
 
-    async def _greeted(self, known: list[Address], remembered: Sequence[Address]) -> bool:
-        """Whether any of them is there; takes those out of ``known`` at which this node itself answers."""
+    async def _contact_any(self, known: list[Address], remembered: Sequence[Address]) -> bool:
+        """Return whether any of the addresses answers; delete from ``known`` the addresses of this node itself."""
         addresses = list(dict.fromkeys([*known, *remembered]))
         greetings = await DeferredList([self._endpoint.greet(address) for address in addresses], consumeErrors=True)
         found = []
@@ -166,20 +167,21 @@ class Membership:
         return any([ok for ok, _ in await DeferredList(pings, consumeErrors=True)])
 
     async def _enter(self, contact: Contact) -> None:
-        """Enter the network by whom a detour led to."""
+        """Enter the network through a discovered contact."""
         await self._ping(contact)
         self._is_entered = True
 
     async def _ping(self, contact: Contact) -> None:
-        # Who does not know all members yet has no list to compare.
+        # Without all members there is no list to compare.
         digest = self._overlay.roster.digest() if self._overlay.is_whole else b""
         answer = await self._overlay.ask(contact, "ping", digest, changes=True)
         if answer == b"" and not self._overlay.is_placed and not self._overlay.is_whole:
-            self._heard_large(0.0)  # it goes by its table; for how long is asked as soon as this node is placed
+            # its network is large; the duration is requested as soon as this node has its neighbours
+            self._set_large(0.0)
         self._compare(contact, _BY_TABLE if answer == b"" else answer)
 
     def _compare(self, contact: Contact, digest: object) -> None:
-        """Ask ``contact`` for its members where it knows others than this node does."""
+        """Request the members of ``contact`` if its list differs from this node's."""
         now = self._clock.seconds()
         if self._overlay.is_large or not digest or (self._joining and not self._overlay.is_whole):
             return
@@ -190,43 +192,46 @@ class Membership:
         if len(self._listed_at) > 4 * MAX_MEMBERS:
             self._listed_at.clear()
         self._listed_at[contact.node_id] = now
-        self._chores.fork(self._list(contact) if self._overlay.is_whole else self._first_list(contact))
+        self._chores.fork(
+            self._fetch_members(contact) if self._overlay.is_whole else self._fetch_first_members(contact)
+        )
 
-    async def _first_list(self, contact: Contact) -> None:
-        """Meet the members of the network that was just joined, after a moment for those who wait for a first read.
+    async def _fetch_first_members(self, contact: Contact) -> None:
+        """Contact the members of the network that was just joined, after a delay for the first reads of other nodes.
 
-        A newcomer has no say before it has met them: whom the question does not reach is asked again, or another.
+        A newcomer has no vote before that, so a request that gets no answer is repeated, to another member if there is
+        one.
         """
         self._joining = True
         try:
             while not self._chores.is_stopped:
-                await self._chores.sleep(self._breath())
+                await self._chores.sleep(self._draw_pause())
                 try:
-                    return await self._list(contact)
+                    return await self._fetch_members(contact)
                 except NoAnswer:
-                    there = self._overlay.roster.live()
-                    if not there:
-                        return  # who greets next is asked
-                    contact = there[self._rng.randrange(len(there))]
+                    live = self._overlay.roster.live()
+                    if not live:
+                        return  # the next contact will be asked
+                    contact = live[self._rng.randrange(len(live))]
         finally:
             self._joining = False
 
-    def _breath(self) -> float:
+    def _draw_pause(self) -> float:
         return BREATH * (1 + self._rng.random())
 
-    async def _list(self, contact: Contact) -> None:
-        """Ping everybody whom ``contact`` knows and this node does not."""
+    async def _fetch_members(self, contact: Contact) -> None:
+        """Ping every member that ``contact`` knows and this node does not."""
         after, strangers = b"", []
         for _ in range(1 + MAX_MEMBERS // PAGE):
             answer = await self._overlay.ask(contact, "members", after, is_light=self._overlay.is_large)
             if answer is None or (type(answer) is int and answer > 0):
-                return self._heard_large(LARGE_FOR if answer is None else min(float(answer), LARGE_FOR))
+                return self._set_large(LARGE_FOR if answer is None else min(float(answer), LARGE_FOR))
             if self._overlay.is_large or type(answer) is int:
-                return None  # of one who has yet to hear it, or whose word is over
+                return None  # it has not learned yet that the network is large, or its notification has expired
             found = contacts_of(answer)
             for named in found:
                 self._overlay.on_named(named, contact)
-            strangers += [c for c in found if self._is_worth_a_try(c)]
+            strangers += [c for c in found if self._may_try(c)]
             if len(found) < PAGE:
                 break
             after = found[-1].node_id
@@ -234,13 +239,13 @@ class Membership:
             pings = [Deferred.fromCoroutine(self._ping(stranger)) for stranger in strangers[first : first + AT_ONCE]]
             await DeferredList(pings, consumeErrors=True)
             if first + AT_ONCE < len(strangers):
-                await self._chores.sleep(self._breath())
+                await self._chores.sleep(self._draw_pause())
         if not self._overlay.is_whole and not self._overlay.roster.is_settled:
             await self._count_absent()
         self._overlay.is_whole = not self._overlay.is_large
 
-    def _heard_large(self, seconds: float) -> None:
-        """Take it that the network is too large to be known whole, for so many ``seconds``."""
+    def _set_large(self, seconds: float) -> None:
+        """Treat the network as large during the next ``seconds``."""
         self._large_until = max(self._large_until, self._clock.seconds() + seconds)
         if not self._overlay.is_large:
             self._overlay.grew()
@@ -248,28 +253,29 @@ class Membership:
                 self._chores.fork(self.sounding.look_around())
 
     async def _count_absent(self) -> None:
-        """Count as absent whom others know and this newcomer cannot reach, or it would take its side of a cut for all.
+        """Count members as absent that others know and this newcomer cannot reach.
 
-        Nobody is counted whom no more than half of those asked name: one that lies makes no members up.  What other
-        newcomers know counts where nobody else is there.  Raises ``NoAnswer`` where nobody answers any more.
+        Otherwise a newcomer would take its side of a partition for the whole team.  A member counts only if more than
+        half of the answers name it, so a lying node cannot invent members.  The answers of newcomers count only if
+        there are no others.  Raises ``NoAnswer`` if no node answers.
         """
         there = self._overlay.roster.live()[:AT_ONCE]
         asked = [Deferred.fromCoroutine(self._overlay.ask(contact, "known")) for contact in there]
         answers = await DeferredList(asked, consumeErrors=True)
-        told: dict[bytes, dict[Contact, int]] = {}
+        answers_by_id: dict[bytes, dict[Contact, int]] = {}
         for contact, (ok, answer) in zip(there, answers, strict=True):
-            if ok or not answer.check(NoAnswer):  # who refuses has said that it says nothing
-                told[contact.node_id] = _known_of(answer)
-        if there and not told:
-            raise NoAnswer("nobody says who is known")
-        settled = [opinion for own, opinion in told.items() if any(named.node_id == own for named in opinion)]
-        opinions = settled or list(told.values())
+            if ok or not answer.check(NoAnswer):  # a node that refuses has no opinion
+                answers_by_id[contact.node_id] = _decode_known(answer)
+        if there and not answers_by_id:
+            raise NoAnswer("no member answered with the members that it knows")
+        settled = [opinion for own, opinion in answers_by_id.items() if any(named.node_id == own for named in opinion)]
+        opinions = settled or list(answers_by_id.values())
         for contact in dict.fromkeys(contact for opinion in opinions for contact in opinion):
             named = [opinion[contact] for opinion in opinions if contact in opinion]
             if 2 * len(named) > len(opinions) and contact.node_id != self._overlay.own_id:
                 self._overlay.roster.remembered(contact, self._clock.seconds() - max(named))
 
-    def _is_worth_a_try(self, contact: Contact) -> bool:
+    def _may_try(self, contact: Contact) -> bool:
         if contact.node_id == self._overlay.own_id or self._overlay.roster.get(contact.node_id) is not None:
             return False
         now = self._clock.seconds()
@@ -280,17 +286,17 @@ class Membership:
         self._tried_at[contact.node_id] = now
         return True
 
-    async def _return(self) -> None:
-        """Look for those that were known once: a radio that was out costs a node all its contacts."""
+    async def _rejoin(self) -> None:
+        """Try the remembered addresses: a radio failure costs a node all its contacts."""
         self._returning = True
         try:
-            if await self._greeted([], list(self._former)) or await self.detour.taken():
+            if await self._contact_any([], list(self._former_addresses)) or await self.detour.taken():
                 await self._overlay.lookup(self._overlay.own_id)
         finally:
             self._returning = False
 
-    async def _seek(self, contact: Contact) -> None:
-        """See whether an absent member is back at its address; a greeting costs a sixth of a handshake."""
+    async def _check_absent(self, contact: Contact) -> None:
+        """Check whether an absent member answers at its address; a discovery request costs a sixth of a handshake."""
         found = await self._endpoint.greet(contact.address)
         if found.node_id != self._overlay.own_id:
             await self._ping(found)
@@ -301,9 +307,9 @@ class Membership:
             return
         overlay.roster.strike(now)
         contacts = overlay.contacts()
-        if not contacts and (self._former or self.detour.is_possible) and not self._returning:
-            self._chores.fork(self._return())
-        # With n members each pair needs one ping in a while, so the while grows with n: the sum stays what it was.
+        if not contacts and (self._former_addresses or self.detour.is_possible) and not self._returning:
+            self._chores.fork(self._rejoin())
+        # Each pair of n members needs one ping per interval, so the interval grows with n and the total stays constant.
         patience = min(MAX_SILENCE, SILENCE * max(1.0, len(contacts) / SMALL))
         for contact in contacts:
             if overlay.silence(contact) > patience:
@@ -312,7 +318,7 @@ class Membership:
         if absent:
             contact = absent[self._rng.randrange(len(absent))]
             self._tried_at[contact.node_id] = now
-            self._chores.fork(self._seek(contact))
+            self._chores.fork(self._check_absent(contact))
         self._refresh(now)
 
     def _refresh(self, now: float) -> None:
@@ -326,18 +332,18 @@ class Membership:
     # -- in a large network -----------------------------------------------------------------------------------------
 
     def _keep_up(self, now: float) -> None:
-        self._look_whether_large(now)
+        self._check_large(now)
         self._refresh(now)
 
-    def _look_whether_large(self, now: float) -> None:
-        """Be sure from time to time that the network is still large, by what is known here or by others' word."""
+    def _check_large(self, now: float) -> None:
+        """Check from time to time whether the network is still large, by this node's contacts or by notifications."""
         overlay = self._overlay
         if overlay.sees_many:
             self._large_until = now + LARGE_FOR
         elif now > self._large_until + LARGE_FOR:
             overlay.shrank()
         elif now > self._large_until and (contacts := overlay.contacts()):
-            self._chores.fork(self._list(contacts[self._rng.randrange(len(contacts))]))
+            self._chores.fork(self._fetch_members(contacts[self._rng.randrange(len(contacts))]))
 
     def _answer_ping(self, peer: Contact, digest: bytes = b"") -> bytes:
         self._overlay.heard(peer)
@@ -345,15 +351,15 @@ class Membership:
         return b"" if self._overlay.is_large else self._overlay.roster.digest()
 
     def _answer_known(self, peer: Contact) -> list[object]:
-        """KNOWN: the settled members, and for how long each has been absent; a newcomer is not one of them itself."""
+        """KNOWN: the settled members, and the seconds of their absence; a newcomer does not include itself."""
         roster = self._overlay.roster
         known = [(self._overlay.me(), 0.0)] if roster.is_settled else []
         return [[contact.packed(), int(away)] for contact, away in known + roster.known(self._clock.seconds())]
 
     def _answer_members(self, peer: Contact, after: bytes) -> list[object] | int | None:
-        """MEMBERS: the next page of them; None where there are too many, seconds where others said so."""
+        """MEMBERS: the next page; None if the network is large, or the seconds for which reports of that are valid."""
         if len(after) not in (0, len(peer.node_id)):
-            raise Refused("members takes nothing or a node id of 20 bytes")
+            raise Refused("members: the argument must be empty or a node id of 20 bytes")
         overlay = self._overlay
         if overlay.roster.is_full or (overlay.is_large and overlay.sees_many):
             return None
@@ -363,8 +369,8 @@ class Membership:
         return [c.packed() for c in later[:PAGE]]
 
 
-def _known_of(answer: object) -> dict[Contact, int]:
-    """The members in an answer to KNOWN, and the seconds of their absence; what is none is left out."""
+def _decode_known(answer: object) -> dict[Contact, int]:
+    """Decode an answer to KNOWN: the members, and the seconds of their absence; invalid items are skipped."""
     found: dict[Contact, int] = {}
     for fields in answer[:MAX_MEMBERS] if isinstance(answer, list) else ():
         named, away = fields if isinstance(fields, list) and len(fields) == 2 else (None, None)

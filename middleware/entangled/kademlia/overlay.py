@@ -1,8 +1,8 @@
-"""Overlay: the contacts of a node, and the way to those closest to an id (Kademlia, sections 2.2 to 2.4).
+"""Keep the contacts of a node, and find the nodes closest to an id (Kademlia, sections 2.2 to 2.4).
 
-A contact enters only when it has answered from its address with its key.  Where records belong follows from here: to
-the k closest live nodes of their key.  A team whose members are all known (``roster``) needs no walk for that; beyond,
-iterative lookups find them.
+A contact is added only after it has answered from its address with its key.  Records are stored at the k closest live
+nodes of their key.  A node that knows all members of its team (``roster``) determines these without a search; in a
+larger network iterative lookups find them.
 """
 
 from __future__ import annotations
@@ -31,25 +31,26 @@ from middleware.entangled.wire.endpoint import Endpoint
 K = 8
 ALPHA = 3
 CHECK_GAP = 4.0
-"""Seconds before a stranger, or a contact at a new address, is asked again to prove itself."""
+"""The seconds before this node pings an unknown node, or a contact at a new address, again to authenticate it."""
 MISS_GAP = 0.5
-"""Seconds in which several unanswered questions are one miss: a burst of questions is no proof of death."""
+"""The seconds in which several unanswered requests count as one miss: a failed burst is no evidence of a failed node.
+"""
 FRESH = 0.1
-"""Seconds within which one sign of life is as good as many."""
+"""The seconds within which further datagrams of a contact are not recorded."""
 FIRST_HEDGE, MOST_HEDGE = 0.01, 0.15
-"""Seconds after which others are asked beside one that does not answer: while nobody was measured yet, and at most;
-else those within which nearly every answer comes."""
+"""The delay of a hedged request in seconds: before the first measurement, and at most.  Otherwise it is the time within
+which nearly all answers arrive."""
 LEAST_PATIENCE, MOST_PATIENCE, TRIES = 0.4, 2.5, 2.6
-"""Seconds, at least and at most, and usual waits that a question of a lookup may take in a large network: two tries
-where little is lost, as many as it takes where much is."""
+"""The minimum and maximum timeout in seconds of a lookup's request in a large network, and the number of initial
+timeouts that it lasts: enough for two tries; at a high loss rate it lasts longer."""
 MAX_FOUND = 512
-"""Keys whose closest nodes, as the last lookup found them, are remembered."""
+"""The number of keys for which the result of the last lookup is cached."""
 MAX_HEARD = 4096
-"""Contacts of which is kept when they were heard, or missed; who was heard longest ago is forgotten first."""
+"""The number of contacts with a recorded time of the last datagram or miss; the oldest is deleted first."""
 
 PLACING, PLACING_STEP = 15, 0.1
 MEETING, MEETING_STEP = 75, 0.02
-"""Steps for which what needs a majority waits until the members are known, and seconds of each."""
+"""The steps for which an operation that needs a majority waits until the members are known, and the seconds of each."""
 LOOKUPS_KEPT = 16
 
 
@@ -61,16 +62,16 @@ class Voters(NamedTuple):
 
     @property
     def majority(self) -> int:
-        """The least number of votes that is more than half."""
+        """The smallest number of votes that is more than half."""
         return self.size // 2 + 1
 
     def count_known(self, ids: Iterable[bytes]) -> int:
-        """Return how many of ``ids`` are voters."""
+        """Return the number of ``ids`` that are voters."""
         return len(self.ids.intersection(ids))
 
 
 class Looked(NamedTuple):
-    """A lookup that has ended: how many were asked, in how many hops, how many were found, in how many seconds."""
+    """A finished lookup: the numbers of requests, hops and contacts found, and its duration in seconds."""
 
     key: bytes
     asked: int
@@ -80,15 +81,16 @@ class Looked(NamedTuple):
 
 
 class Overlay:
-    """Who a node knows.
+    """The contacts of a node.
 
-    ``patience`` is for how many seconds a contact may have been silent that is not asked for a newcomer's sake.
-    ``on_newcomer`` and ``on_lost`` are told of contacts that come and go, ``on_named`` of each that another one names.
+    ``patience`` is the silence in seconds up to which a contact is not pinged when a new one would take its place.
+    ``on_newcomer`` and ``on_lost`` are called with contacts that appear and disappear, ``on_named`` with each contact
+    in an answer and the contact that named it.
 
-    ``is_whole`` says whether all members of the team are known, ``is_large`` that there are too many for that,
-    ``is_placed`` whether this node has looked around at all, so that where it knows few there are few; whoever asks
-    around sets them.  In a large network the table counts, and the roster has only some whom the table has no place
-    for, where it knows few.
+    ``is_whole``: all members of the team are known; ``is_large``: there are too many for that; ``is_placed``: this node
+    has looked up its neighbours, so if it knows few nodes there are few.  ``Membership`` and ``Sounding`` set them.  In
+    a large network the routing table is authoritative, and the roster has only contacts without a place in the table,
+    while few are known.
     """
 
     def __init__(self, me: Callable[[], Contact], endpoint: Endpoint, clock: IReactorTime, chores: Background) -> None:
@@ -119,31 +121,32 @@ class Overlay:
         endpoint.expose("find_node", self._answer_find_node, early=True)
 
     @cached_property
-    def _dice(self) -> random.Random:
-        # They only spread the load, so anybody may foretell them; those of the machine would be a system call each.
+    def _rng(self) -> random.Random:
+        # It only distributes load, so its numbers may be predictable; the system generator costs a system call per
+        # number.
         return random.Random(int.from_bytes(self.own_id))
 
-    # -- where things belong ----------------------------------------------------------------------------------------
+    # -- placement of records ---------------------------------------------------------------------------------------
 
     @property
     def is_complete(self) -> bool:
-        """Whether everybody is known, so that nothing has to be looked up."""
+        """Whether all nodes are known, so that no lookup is necessary."""
         return self.is_whole and not self.roster.is_full
 
     @property
     def is_sparse(self) -> bool:
-        """Whether there are more nodes than are known here, so that those close to a key have to be looked up."""
+        """Whether there are more nodes than are known here, so that the nodes close to a key must be looked up."""
         return not self.is_complete and (len(self.table) >= K or not self.is_placed)
 
     def responsible(self, key: bytes) -> list[Contact]:
-        """The k closest live nodes to ``key`` that are known here, this one included, the closest first."""
+        """Return the k closest live nodes to ``key`` that are known here, including this one, closest first."""
         if self.is_complete:
             return self.roster.closest(key, K, self.me())
         known = [*self._found.get(key, ()), *self.table.closest(key), *self.roster.live(), self.me()]
         return _closest(known, key)
 
     def neighbours(self) -> list[Contact]:
-        """The k contacts closest to this node: they are found with it, and hold what it holds."""
+        """Return the k contacts closest to this node, which hold mostly the same records."""
         version = self.table.version, self.roster.version
         if self._near_of != version:
             self._near_of, self._near = version, self.nearest(self.own_id)
@@ -151,13 +154,13 @@ class Overlay:
 
     @property
     def sees_many(self) -> bool:
-        """Whether so many are known here that nobody need be asked whether the network is large."""
+        """Whether this node knows so many contacts that the network is certainly large."""
         return self.roster.is_full or len(self.table) + len(self.roster) >= MAX_MEMBERS
 
     def keepers(self, key: bytes) -> list[Contact]:
-        """The nodes, this one not included, that may hold records of ``key``: those responsible, and those last found.
+        """Return the other nodes that may hold records of ``key``: the responsible ones, and the last ones found.
 
-        A bucket has room for k contacts only, so in a large network not all that were found are in the table.
+        A bucket has room for only k contacts, so in a large network not all nodes that were found are in the table.
         """
         if self.is_complete:
             return [c for c in self.responsible(key) if c.node_id != self.own_id]
@@ -165,17 +168,17 @@ class Overlay:
         return [contact for node_id, contact in both.items() if node_id != self.own_id]
 
     def is_responsible(self, key: bytes) -> bool:
-        """Say whether this node is one of the k closest to ``key``, as far as is known here."""
+        """Return whether this node is one of the k closest known nodes to ``key``."""
         return self.belongs(key, self.me())
 
     def belongs(self, key: bytes, contact: Contact) -> bool:
-        """Whether ``contact`` is among the k closest to ``key``, as far as is known here."""
+        """Return whether ``contact`` is among the k closest known nodes to ``key``."""
         return any(c.node_id == contact.node_id for c in self.responsible(key))
 
     async def holders(self, key: bytes) -> list[Contact]:
-        """The k closest live nodes to ``key``, this one included; looked up where not all nodes are known.
+        """Return the k closest live nodes to ``key``, including this one; looks them up if not all nodes are known.
 
-        A node that is still joining waits a little, for it knows nobody to ask.
+        A node that is still joining waits for its first contacts.
         """
         await self._wait(lambda: self.is_whole or self.is_large or len(self.roster) > 0, PLACING, PLACING_STEP)
         if not self.is_sparse:
@@ -187,17 +190,17 @@ class Overlay:
         return nearest if len(found) >= K else self.responsible(key)
 
     async def met(self) -> None:
-        """Give a node that is still joining a moment to learn who is there."""
+        """Wait a limited time for a node that is still joining to learn the members."""
         await self._wait(lambda: self.is_whole or self.is_large, MEETING, MEETING_STEP)
 
     def note_found(self, key: bytes, found: list[Contact]) -> None:
-        """Keep in mind what a lookup found."""
+        """Cache the result of a lookup."""
         keep(self._found, key, found, MAX_FOUND)
 
     def voters(self, key: bytes, targets: list[Contact]) -> Voters:
-        """Return the voters for ``key``, whose replicas are ``targets``.
+        """Return the voters for ``key`` with the replicas ``targets``.
 
-        In a team small enough for a roster absent members are voters too; in a larger network, the nodes found.
+        In a team with a roster absent members are voters too; in a larger network the voters are the nodes found.
         """
         if not (self.is_whole or self.is_large):
             # It has not met its team yet: the few nodes that it knows must not count as all.
@@ -207,7 +210,7 @@ class Overlay:
         return Voters(ids, len(ids))
 
     async def lookup(self, target: bytes) -> list[Contact]:
-        """The k live nodes closest to ``target``, this one not included (Kademlia, section 2.3)."""
+        """Return the k live nodes closest to ``target``, without this one (Kademlia, section 2.3)."""
         seeds = [*self.table.closest(target), *(self.roster.closest(target, K, self.me()) if len(self.roster) else ())]
         lookup = Lookup(target, K, ALPHA, seeds, exclude=self.own_id)
         began = self._clock.seconds()
@@ -217,7 +220,7 @@ class Overlay:
 
         async def visit(contact: Contact) -> None:
             asked.append(hops.setdefault(contact.node_id, 1))
-            named = contacts_of(await self._asked_for(contact, target))
+            named = contacts_of(await self._request_contacts(contact, target))
             for other in named:
                 self.on_named(other, contact)
                 hops.setdefault(other.node_id, hops[contact.node_id] + 1)
@@ -232,7 +235,7 @@ class Overlay:
     async def walk(
         self, lookup: Lookup, visit: Callable[[Contact], Any], is_done: Callable[[], bool] = lambda: False
     ) -> None:
-        """Visit whom ``lookup`` names, alpha at a time and one more beside each slow one, until it ends."""
+        """Visit the contacts that ``lookup`` names, alpha in parallel and another for each slow one, until it ends."""
         done: Deferred[None] = Deferred()
 
         def step() -> None:
@@ -261,7 +264,7 @@ class Overlay:
         step()
         await done
 
-    # -- who is there -----------------------------------------------------------------------------------------------
+    # -- liveness of contacts ---------------------------------------------------------------------------------------
 
     async def ask(
         self,
@@ -272,7 +275,7 @@ class Overlay:
         timeout: float | None = None,
         is_light: bool = False,
     ) -> Any:
-        """Ask ``contact``; one that does not answer is on its way out."""
+        """Send a request to ``contact``; a missing answer counts as a miss."""
         began = self._clock.seconds()
         is_met = self._endpoint.is_met(contact)
         try:
@@ -282,15 +285,16 @@ class Overlay:
         except NoAnswer:
             self.missed(contact)
             raise
-        if is_met:  # else it was a handshake, too
+        if is_met:  # otherwise the time includes a handshake
             self._round_trip.measured(self._clock.seconds() - began)
         return answer
 
-    async def _asked_for(self, contact: Contact, target: bytes) -> Any:
-        """Whom ``contact`` knows near ``target``.
+    async def _request_contacts(self, contact: Contact, target: bytes) -> Any:
+        """Request the contacts that ``contact`` knows near ``target``.
 
-        One that was heard while its answer was waited for is asked once more: where several lookups meet a stranger at
-        the same moment, only one question rides in the handshake, and the time of the others may be over after it.
+        If the contact was heard during an unanswered request, the request is repeated once: when several lookups meet
+        an unknown contact at the same moment, only one request rides in the handshake, and the others may time out
+        after it.
         """
         began = self._clock.seconds()
         try:
@@ -301,21 +305,21 @@ class Overlay:
             return await self.ask(contact, "find_node", target, timeout=self.patience_of_lookups)
 
     def hedge(self) -> float:
-        """Seconds after which others are asked beside one that does not answer: hardly any of this team takes longer.
+        """Return the seconds after which others are asked in parallel with a contact that does not answer.
 
-        The time of all is a better measure than a contact's own, of which there are few samples and old ones; to ask
-        one that is much farther away than the others costs a question or two more.
+        It is measured over all contacts, because a single contact has few and old samples; hedging a distant contact
+        costs only a few more requests.
         """
-        if self.is_large:  # strangers take a handshake, and may be far away
+        if self.is_large:  # unknown contacts need a handshake, and may be distant
             guess = self._endpoint.peers.guess
             return guess if not self._round_trip.is_measured else min(guess, max(MOST_HEDGE, self._round_trip.usual))
         return min(MOST_HEDGE, self._round_trip.usual)
 
     @property
     def patience_of_lookups(self) -> float | None:
-        """Seconds that one question of a lookup may take; None: as long as any.
+        """The timeout of one request of a lookup in seconds; None: the default.
 
-        In a large network there are always others, and some of those that are named are dead.
+        In a large network there are always alternatives, and some of the named contacts have failed.
         """
         if not self.is_large:
             return None
@@ -323,29 +327,29 @@ class Overlay:
         return min(MOST_PATIENCE, max(LEAST_PATIENCE, max(TRIES, peers.loss.tries) * peers.guess))
 
     def slow(self, contact: Contact) -> None:
-        """``contact`` took longer than it should; until it is heard, others are asked first."""
+        """Record that ``contact`` exceeded the usual time; until it is heard, others are asked first."""
         if len(self._slow) >= MAX_HEARD:
             self._slow.clear()
         self._slow.add(contact.node_id)
 
     def quickest(self, contacts: Iterable[Contact]) -> list[Contact]:
-        """``contacts`` in an order that spreads the load, those that are slow at the moment last."""
+        """Return ``contacts`` in a random order that spreads the load, with slow ones last."""
         shuffled = list(contacts)
-        self._dice.shuffle(shuffled)
+        self._rng.shuffle(shuffled)
         return sorted(shuffled, key=lambda contact: contact.node_id in self._slow)
 
     def silence(self, contact: Contact) -> float:
-        """Seconds since ``contact`` was heard."""
+        """Return the seconds since ``contact`` was heard."""
         return self._clock.seconds() - self._heard_at.get(contact.node_id, float("-inf"))
 
     def proved(self, contact: Contact) -> None:
-        """``contact`` has proved its key and its address: it answered from there."""
+        """Record that ``contact`` has proved its key and its address by an answer."""
         if contact.node_id == self.own_id:
             return
         now, node_id = self._clock.seconds(), contact.node_id
         is_fresh = now - self._heard_at.get(node_id, -FRESH) < FRESH
         if is_fresh and node_id not in self._misses and node_id not in self._slow and self.contact(node_id) == contact:
-            return  # it was said a moment ago
+            return  # it was recorded a moment ago
         is_new = self.table.get(contact.node_id) is None and self.roster.get(contact.node_id) is None
         keep(self._heard_at, node_id, now, MAX_HEARD)
         self._misses.pop(contact.node_id, None)
@@ -356,11 +360,11 @@ class Overlay:
         has_place = self.table.get(node_id) is not None
         is_new_here = self._is_for_roster(node_id, has_place) and self.roster.heard(contact, now)
         if is_new_here or (is_new and has_place):
-            # A turn later: what a newcomer is told shall not overtake the answer to its own greeting.
+            # One reactor turn later: messages to a newcomer must not overtake the answer to its own request.
             self._chores.later(0.0, self.on_newcomer, contact)
 
     def heard(self, contact: Contact) -> None:
-        """``contact`` asked or told us something in its session; a new address it has to prove first."""
+        """Record a message of ``contact`` in its session; a new address must be authenticated first."""
         if self.contact(contact.node_id) == contact:
             self.proved(contact)
             return
@@ -368,56 +372,57 @@ class Overlay:
         if self.is_large and self.sees_many and not self.table.has_place(contact.node_id):
             return
         if contact.node_id == self.own_id or now - self._checked_at.get(contact.node_id, -CHECK_GAP) < CHECK_GAP:
-            return  # in a large network not everybody finds a place here: two such must not ping each other for ever
+            # in a large network not all contacts find a place here: two such nodes must not ping each other forever
+            return
         if len(self._checked_at) > MAX_FOUND:
             self._checked_at.clear()
         self._checked_at[contact.node_id] = now
         self._chores.fork(self.check(contact))
 
     def left(self, contact: Contact) -> None:
-        """``contact`` said goodbye."""
+        """Delete ``contact``, which left the network."""
         self.table.remove(contact, self._clock.seconds())
         self.roster.left(contact.node_id)
         self._forget(contact)
 
     def turned_away(self, contact: Contact) -> None:
-        """``contact`` does not let this node in; as a member it is absent."""
+        """Record that ``contact`` rejects this node; a member is then absent."""
         now = self._clock.seconds()
         self.table.remove(contact, now)
         if self.roster.lost(contact.node_id, now):
             self._forget(contact)
 
     def known(self, node_id: bytes) -> Contact | None:
-        """The contact with this id, the absent ones among the members too."""
+        """Return the contact with this id, including absent members."""
         absent = (contact for contact in self.roster.absent() if contact.node_id == node_id)
         return self.contact(node_id) or next(absent, None)
 
     def contacts(self) -> list[Contact]:
-        """Everybody who is known here."""
+        """Return all contacts."""
         return list({c.node_id: c for c in [*self.table.contacts(), *self.roster.live()]}.values())
 
     async def check(self, contact: Contact) -> None:
-        """Ask ``contact`` whether it is there; in a large network none of them is worth a handshake."""
+        """Ping ``contact``; in a large network without opening a session."""
         await self.ask(contact, "ping", self.roster.digest(), changes=True, is_light=self.is_large)
 
     def silences(self) -> list[tuple[bytes, float]]:
-        """The ids of contacts and perhaps of others, and for how many seconds each was silent, the longest first."""
+        """Return the ids of recently heard nodes with their silence in seconds, the longest first."""
         now = self._clock.seconds()
         return [(node_id, now - at) for node_id, at in self._heard_at.items()]
 
     def contact(self, node_id: bytes) -> Contact | None:
-        """The contact with this id."""
+        """Return the contact with this id."""
         return self.roster.get(node_id) or self.table.get(node_id)
 
     def is_contact(self, contact: Contact) -> bool:
-        """Whether this very contact is known."""
+        """Return whether a contact with this key and address is known."""
         return self.contact(contact.node_id) == contact
 
     def missed(self, contact: Contact, is_over: bool = False) -> None:
-        """``contact`` did not answer, once more; ``is_over``: it is let go of at once.
+        """Record that ``contact`` did not answer; ``is_over``: delete it at once.
 
-        In a large network one miss makes a far contact stale: others of its range do as well, and a lookup that waits
-        for the dead costs more than one that passes over the living.
+        In a large network one miss makes a distant contact stale: others of its range are equivalent, and a lookup that
+        waits for a failed node costs more than one that skips a live one.
         """
         now = self._clock.seconds()
         count, at = self._misses.get(contact.node_id, (0, -MISS_GAP))
@@ -442,33 +447,33 @@ class Overlay:
             self._forget(contact)
 
     def doubted(self) -> list[Contact]:
-        """The contacts that did not answer the last time."""
+        """Return the contacts that did not answer the latest request."""
         return [contact for node_id in self._misses if (contact := self.contact(node_id)) is not None]
 
     @property
     def is_anybody_doubted(self) -> bool:
-        """Whether anybody did not answer the last time."""
+        """Whether any node did not answer the latest request."""
         return bool(self._misses)
 
     def is_doubted(self, contact: Contact) -> bool:
-        """Whether ``contact`` did not answer the last time."""
+        """Return whether ``contact`` did not answer the latest request."""
         return contact.node_id in self._misses
 
     def grew(self) -> None:
-        """Go by the table from now on: the network is too large to be known whole."""
+        """Use only the routing table from now on, because the network is too large to know all its members."""
         self.is_whole, self.is_large = False, True
         self._endpoint.peers.is_wide = True
         self.tidy()
 
     def shrank(self) -> None:
-        """Begin to know the members again, as a newcomer does: nobody has seen many for long."""
+        """Learn all members again like a newcomer, because the network is no longer large."""
         self.is_large, self.patience = False, 0.0
         self._endpoint.peers.is_wide = False
         for contact in self.table.contacts():
             self.roster.heard(contact, self._clock.seconds())
 
     def tidy(self) -> None:
-        """Forget whom a large network need not remember: members in the table or absent, and who was heard once."""
+        """Delete state that is unnecessary in a large network: members in the table or absent, and old records."""
         table, live = self.table, self.roster.live()
         spare = max(0, MAX_MEMBERS - len(table))
         extra = [contact.node_id for contact in live if table.get(contact.node_id) is None]
@@ -485,10 +490,10 @@ class Overlay:
             if at > before or node_id in kept or table.get(node_id) is not None
         }
 
-    # -- inside -----------------------------------------------------------------------------------------------------
+    # -- private ----------------------------------------------------------------------------------------------------
 
     async def _wait(self, is_over: Callable[[], bool], steps: int, step: float) -> None:
-        """Look again every ``step`` seconds until ``is_over``, for so many ``steps`` at most."""
+        """Wait until ``is_over``, checking every ``step`` seconds, at most ``steps`` times."""
         for _ in range(steps):
             if is_over():
                 return
@@ -509,11 +514,11 @@ class Overlay:
 
     def _answer_find_node(self, peer: Contact, target: bytes) -> list[object]:
         if len(target) != len(peer.node_id):
-            raise Refused("find_node takes a node id of 20 bytes")
+            raise Refused("find_node: the argument must be a node id of 20 bytes")
         return [c.packed() for c in self.nearest(target) if c.node_id != peer.node_id]
 
     def nearest(self, target: bytes) -> list[Contact]:
-        """The k closest contacts to ``target`` that are known here, this node not included."""
+        """Return the k closest contacts to ``target`` that are known here, without this node."""
         members, near = self.roster.live(), self.table.closest(target)
         if not members:
             return near
@@ -521,13 +526,13 @@ class Overlay:
 
 
 def contacts_of(answer: object) -> list[Contact]:
-    """The contacts in an answer, those that are none left out."""
+    """Decode the contacts in an answer; invalid ones are skipped."""
     found = [unpacked(fields) for fields in answer] if isinstance(answer, list) else []
     return [contact for contact in found if contact is not None]
 
 
 def _closest(contacts: list[Contact], key: bytes) -> list[Contact]:
-    """The k closest of ``contacts``, each node once; of two addresses of one node the first one named holds."""
+    """Return the k closest of ``contacts``, each node once; of two addresses of one node the first is used."""
     once: dict[bytes, Contact] = {}
     for contact in contacts:
         once.setdefault(contact.node_id, contact)

@@ -1,14 +1,13 @@
-"""Roster: all members of a team that is small enough to be known whole, and who of them counts in a majority.
+"""Keep all members of a small team, and determine the voters for majorities.
 
-Pure.  Records are stored at the closest *live* members; majorities are counted among the closest of all members, those
-that are only absent included, for nobody can tell a dead member from one behind a partition.  Two majorities then
-share a member, whatever side they were formed on.  An absent member stops to count in two cases: where a majority of
-all members is in touch and has gone on without it for ``STRUCK_S`` (dynamic voting; Jajodia and Mutchler, 1990), so
-that one after the other may leave; or after ``COUNTED_S``, whoever is in touch: longer than that no partition is
-waited for.
+Records are stored at the closest *live* members; majorities are counted among the closest of all members, including
+absent ones, because a failed member is indistinguishable from a partitioned one.  Then two majorities share a member
+even if they were formed on different sides.  An absent member stops counting in two cases: after ``STRUCK_S`` if a
+majority of all members is in touch without it (dynamic voting; Jajodia and Mutchler, 1990), so that members may leave
+one after the other; or after ``COUNTED_S`` in any case, which limits the tolerated duration of a partition.
 
-A newcomer is *settled* when it has once caught up with a majority of those before it; until then it counts in no
-majority of members, or the few behind a cut could strike the many with the help of strangers.
+A newcomer is *settled* when it has synchronised with a majority of the members before it; until then it does not count
+in majorities, or a minority behind a partition could strike the majority with the help of newcomers.
 """
 
 from __future__ import annotations
@@ -18,15 +17,16 @@ from collections.abc import Iterable
 from middleware.entangled.contact import Contact
 
 MAX_MEMBERS = 64
-"""Members that are known whole.  Beyond it a walk by Kademlia costs less than keeping everybody in mind."""
+"""The size of a team up to which all members are known; beyond it Kademlia lookups cost less than complete knowledge.
+"""
 STRUCK_S = 30.0
-"""Three rounds of mending: by then heirs hold what the absent member held."""
+"""Three rounds of repair: by then other replicas hold the records of the absent member."""
 COUNTED_S = 120.0
-"""The longest partition over which majorities stay majorities; more is safer, less writes again sooner."""
+"""The longest partition in which majorities remain valid; longer is safer, shorter allows writes earlier."""
 
 
 class _Member:
-    """A member; ``lost_at`` is None while it lives, as far as is known."""
+    """A member; ``lost_at`` is None while it is considered alive."""
 
     __slots__ = ("contact", "number", "heard_at", "lost_at", "is_settled")
 
@@ -39,9 +39,9 @@ class _Member:
 
 
 class Roster:
-    """The members that the node ``own_id`` knows, itself not among them; moments are seconds of one clock.
+    """The members that the node ``own_id`` knows, without itself; times are seconds of one clock.
 
-    ``version`` is another one whenever somebody came or went; ``is_settled`` says whether this node itself is settled.
+    ``version`` changes whenever a member appears or disappears; ``is_settled`` is the state of this node itself.
     """
 
     def __init__(self, own_id: bytes) -> None:
@@ -58,16 +58,16 @@ class Roster:
 
     @property
     def is_full(self) -> bool:
-        """Whether there is no room for another member, so that the team may be larger than what is known."""
+        """Whether there is no room for another member, so that the team may be larger than the roster."""
         return len(self._members) >= MAX_MEMBERS
 
     def get(self, node_id: bytes) -> Contact | None:
-        """The live member with this id."""
+        """Return the live member with this id."""
         member = self._members.get(node_id)
         return member.contact if member is not None and member.lost_at is None else None
 
     def heard(self, contact: Contact, now: float) -> bool:
-        """Take note that ``contact`` lives; whether it is new or was absent.  With a full roster, nobody new enters."""
+        """Record that ``contact`` is alive; return whether it is new or was absent.  A full roster adds no member."""
         member = self._members.get(contact.node_id)
         if member is None:
             if self.is_full and not self._make_room():
@@ -82,13 +82,13 @@ class Roster:
         return True
 
     def remembered(self, contact: Contact, now: float) -> None:
-        """Count ``contact``, known in an earlier life or to others, as absent since ``now`` until it is heard."""
+        """Count ``contact``, known from storage or from others, as absent since ``now`` until it answers."""
         if contact.node_id not in self._members and not self.is_full:
             self._members[contact.node_id] = _Member(contact, now, lost_at=now)
             self._sort()
 
     def lost(self, node_id: bytes, now: float) -> bool:
-        """Take note that a member answers no more; whether it was there until now."""
+        """Record that a member does not answer; return whether it was present until now."""
         member = self._members.get(node_id)
         if member is None or member.lost_at is not None:
             return False
@@ -97,37 +97,37 @@ class Roster:
         return True
 
     def left(self, node_id: bytes) -> None:
-        """Strike a member that said goodbye: it counts no more."""
+        """Delete a member that left; it no longer counts."""
         if self._members.pop(node_id, None) is not None:
             self._sort()
 
     def shed(self, node_ids: Iterable[bytes]) -> None:
-        """Strike some, where the network is too large for majorities to be counted here."""
+        """Delete members of a large network, in which majorities are not counted here."""
         found = [self._members.pop(node_id) for node_id in node_ids if node_id in self._members]
         if found:
             self._sort()
 
     def settle(self, node_id: bytes, is_settled: bool = True) -> None:
-        """Take note whether a member has once caught up, so that it counts; who says nothing else does."""
+        """Record whether a member has synchronised, so that it counts; the default is True."""
         member = self._members.get(node_id)
         if member is not None:
             member.is_settled = is_settled
 
     def live(self) -> list[Contact]:
-        """The members that live, in the order of their ids."""
+        """Return the live members, in the order of their ids."""
         return [member.contact for member in self._live]
 
     def absent(self) -> list[Contact]:
-        """The members that are absent and still count, in the order of their ids."""
+        """Return the absent members that still count, in the order of their ids."""
         return [member.contact for member in self._absent]
 
     def known(self, now: float) -> list[tuple[Contact, float]]:
-        """The settled members, and for how many seconds they have been absent."""
-        there = [(m.contact, 0.0) for m in self._live if m.is_settled]
-        return there + [(m.contact, now - m.lost_at) for m in self._absent if m.lost_at is not None and m.is_settled]
+        """Return the settled members, and the seconds of their absence."""
+        present = [(m.contact, 0.0) for m in self._live if m.is_settled]
+        return present + [(m.contact, now - m.lost_at) for m in self._absent if m.lost_at is not None and m.is_settled]
 
     def closest(self, key: bytes, count: int, me: Contact) -> list[Contact]:
-        """The ``count`` live members closest to ``key``, this node (``me``) among them, closest first."""
+        """Return the ``count`` live members closest to ``key``, including this node (``me``), closest first."""
         goal = int.from_bytes(key)
         near = [(member.number ^ goal, member.contact) for member in self._live]
         near.append((self._own_number ^ goal, me))
@@ -135,15 +135,15 @@ class Roster:
         return [contact for _, contact in near[:count]]
 
     def digest(self) -> bytes:
-        """Eight bytes that tell whether two nodes know the same live members, themselves included."""
+        """Return eight bytes that are equal if two nodes know the same live members, including themselves."""
         return self._digest
 
     def in_touch(self, now: float, within: float) -> bool:
-        """Whether a majority of all settled members was heard in the last ``within`` seconds, this node counted in."""
+        """Return whether a majority of the settled members was heard in the last ``within`` seconds, with this node."""
         return self._is_majority([member for member in self._live if now - member.heard_at <= within])
 
     def strike(self, now: float) -> list[Contact]:
-        """Strike absent members as the module says, and return them."""
+        """Delete the absent members that stop counting, and return them."""
         wait = STRUCK_S if self._is_majority(self._live) else COUNTED_S
         struck = [m for m in self._absent if m.lost_at is not None and now - m.lost_at > wait]
         for member in struck:
@@ -152,10 +152,10 @@ class Roster:
             self._sort()
         return [member.contact for member in struck]
 
-    def _is_majority(self, there: list[_Member]) -> bool:
-        """Whether these and this node are a majority of the settled members; before there are any, everybody is."""
-        everybody = self.is_settled + sum(member.is_settled for member in self._members.values())
-        return not everybody or 2 * (self.is_settled + sum(member.is_settled for member in there)) > everybody
+    def _is_majority(self, present: list[_Member]) -> bool:
+        """Return whether these and this node are a majority of the settled members; True if none is settled."""
+        total = self.is_settled + sum(member.is_settled for member in self._members.values())
+        return not total or 2 * (self.is_settled + sum(member.is_settled for member in present)) > total
 
     def _make_room(self) -> bool:
         if not self._absent:

@@ -1,10 +1,10 @@
-"""Routing table: the contacts of a node, many of them near and few of them far (Kademlia, sections 2.2 and 2.4).
+"""Keep a routing table with many near and few distant contacts (Kademlia, sections 2.2 and 2.4).
 
-The tree of the paper: a bucket covers a range of ids, one at first.  A full one is split in two where it covers the
-node's own id, and where the newcomer is among the k closest to the node, so that the node knows its whole
-neighbourhood however unbalanced the tree is (section 2.4).  In any other full bucket a contact that keeps answering is
-never displaced: nodes that have stayed long are the likeliest to stay, and nobody can flush the table by inventing
-ids.  The newcomer waits in the bucket's replacement cache.
+It is the tree of the paper: a bucket covers a range of ids, at first all of them.  A full bucket is split if it covers
+the node's own id, or if the new contact is among the k closest to the node, so that the node knows its whole
+neighbourhood in an unbalanced tree (section 2.4).  In any other full bucket a contact that keeps answering is never
+replaced: nodes that have been up for long are likely to stay up, and an attacker cannot flush the table with invented
+ids.  The new contact waits in the bucket's replacement cache.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from middleware.entangled.identity import ID_BYTES
 from middleware.entangled.kademlia.distance import bucket_index, closest
 
 STALE_AFTER = 3
-"""Misses in a row that make a contact stale: from now on any newcomer takes its place."""
+"""The successive misses that make a contact stale: any new contact may replace it."""
 DROPPED_AFTER = 5
-"""Misses in a row after which a contact goes even though nobody waits for its place."""
+"""The successive misses after which a contact is deleted even without a replacement."""
 PATIENCE = 1.0
-"""Seconds for which a contact that was heard, or that was just handed out to be pinged, is not handed out again."""
+"""The seconds for which a contact that was heard, or returned for a ping, is not returned again."""
 
 
 @dataclass(slots=True)
 class _Entry:
-    """A contact in its bucket, and how it has behaved."""
+    """A contact in its bucket with its state."""
 
     contact: Contact
     seen_at: float
@@ -53,9 +53,8 @@ class _Bucket:
 class RoutingTable:
     """The contacts of the node ``own_id``, at most ``k`` in each bucket.
 
-    More ``k`` means more replicas, more contacts to keep alive and lookups that survive more losses at once.  Moments
-    (``now``) are in seconds on one clock of the caller.  ``version`` is another one whenever a contact came, went or
-    moved.
+    A larger ``k`` means more replicas, more contacts to probe, and lookups that tolerate more simultaneous failures.
+    Times (``now``) are seconds of one clock.  ``version`` changes whenever a contact is added, deleted or moved.
     """
 
     def __init__(self, own_id: bytes, k: int = 8) -> None:
@@ -74,26 +73,26 @@ class RoutingTable:
         return self._size
 
     def get(self, node_id: bytes) -> Contact | None:
-        """The contact with this id, if it is in the table (waiting in a cache does not count)."""
+        """Return the contact with this id, if it is in the table (not in a replacement cache)."""
         bucket = self._bucket(node_id)
         entry = bucket.entries.get(node_id) if bucket else None
         return entry.contact if entry else None
 
     def contacts(self) -> list[Contact]:
-        """Every contact, nearest bucket first and in each the least recently seen first."""
+        """Return all contacts, nearest bucket first and in each the least recently seen first."""
         nearest_first = sorted(self._buckets, key=lambda bucket: bucket.low ^ self._own & -(bucket.high - bucket.low))
         return [entry.contact for bucket in nearest_first for entry in bucket.entries.values()]
 
     def closest(self, target: bytes, count: int | None = None) -> list[Contact]:
-        """The ``count`` (default k) contacts closest to ``target``, closest first.
+        """Return the ``count`` (default k) contacts closest to ``target``, closest first.
 
-        Stale contacts are passed over as long as there are enough others; they still serve a node that lost sight of
-        everybody at once, so that a dropped radio does not empty the table.
+        Stale contacts are used only if there are not enough others; they allow a node that lost all contacts at once to
+        recover, so that a radio failure does not empty the table.
         """
         wanted, goal = self._k if count is None else count, int.from_bytes(target)
         stale: list[Contact] = []
         chosen: list[Contact] = []
-        # Whatever is in a bucket nearer to the target is nearer than all that is in a farther one.
+        # All contacts in a bucket nearer to the target are nearer than all contacts in a farther one.
         for bucket in sorted(self._buckets, key=lambda bucket: (bucket.low ^ goal) & -(bucket.high - bucket.low)):
             live: list[Contact] = []
             for entry in bucket.entries.values():
@@ -106,18 +105,18 @@ class RoutingTable:
         return chosen
 
     def saw(self, contact: Contact, now: float) -> Contact | None:
-        """Take note that ``contact`` has proved its key and its address.
+        """Record that ``contact`` has proved its key and its address.
 
-        Returns the least recently seen contact of the bucket where the bucket is full: the caller pings it, and if it
-        is gone (``failed``) the newcomer moves up.  A contact that proved itself from a new address has moved there.
+        Returns the least recently seen contact of a full bucket: the caller pings it, and if it does not answer
+        (``failed``) the new contact replaces it.  A known contact at a new address has moved there.
         """
         if contact.node_id == self._own_id:
             return None
         bucket = self._bucket_of(contact.node_id)
         entry = bucket.entries.pop(contact.node_id, None)
         if entry is not None:
-            bucket.entries[contact.node_id] = entry  # the most recently seen is the last one
-            if entry.contact != contact:  # else the object that is there will do for all who keep it
+            bucket.entries[contact.node_id] = entry  # the most recently seen is last
+            if entry.contact != contact:  # otherwise keep the existing object, which others share
                 entry.contact = contact
                 self.version += 1
             entry.seen_at = entry.questioned_at = now
@@ -130,7 +129,7 @@ class RoutingTable:
         if len(bucket.entries) >= self._k:
             stale = next((node_id for node_id, entry in bucket.entries.items() if entry.is_stale), None)
             if stale is None:
-                return self._queue(bucket, contact, now)
+                return self._cache(bucket, contact, now)
             del bucket.entries[stale]
             self._size -= 1
         bucket.waiting.pop(contact.node_id, None)
@@ -140,7 +139,7 @@ class RoutingTable:
         return None
 
     def has_place(self, node_id: bytes) -> bool:
-        """Whether a contact of this id would find, or has, a place in its bucket."""
+        """Return whether a contact with this id has, or would find, a place in its bucket."""
         bucket = self._bucket(node_id)
         if bucket is None:
             return False
@@ -150,10 +149,10 @@ class RoutingTable:
         return self._may_split(bucket, node_id)
 
     def failed(self, contact: Contact, now: float) -> None:
-        """Count that ``contact`` did not answer at its address.
+        """Record that ``contact`` did not answer at its address.
 
-        After ``STALE_AFTER`` misses in a row the most recently seen newcomer takes its place; without a newcomer it
-        stays, stale, until ``DROPPED_AFTER``.  A miss at an address that the contact has left since does not count.
+        After ``STALE_AFTER`` successive misses the most recently seen waiting contact replaces it; without one it
+        stays, stale, until ``DROPPED_AFTER``.  A miss at an address that the contact has left does not count.
         """
         bucket = self._bucket(contact.node_id)
         if bucket is None:
@@ -165,25 +164,25 @@ class RoutingTable:
             return
         entry.misses += 1
         if entry.misses >= DROPPED_AFTER or (entry.is_stale and bucket.waiting):
-            self._free(bucket, contact.node_id, now)
+            self._remove_entry(bucket, contact.node_id, now)
 
     def remove(self, contact: Contact, now: float = 0.0) -> None:
-        """Let go of ``contact``, which said goodbye; whoever waits for its place gets it."""
+        """Delete ``contact``, which left the network; a waiting contact replaces it."""
         bucket = self._bucket(contact.node_id)
         if bucket is not None:
             bucket.waiting.pop(contact.node_id, None)
             if contact.node_id in bucket.entries:
-                self._free(bucket, contact.node_id, now)
+                self._remove_entry(bucket, contact.node_id, now)
 
     def searched(self, target: bytes, now: float) -> None:
-        """Take note of a lookup for ``target``, which keeps its range fresh."""
+        """Record a lookup for ``target``, which refreshes its range."""
         if target != self._own_id:
             self._searched_at[bucket_index(self._own_id, target)] = now
 
     def stale_buckets(self, now: float, older_than: float) -> list[int]:
-        """The ranges to refresh, by the i of distances from 2**i on: no lookup went there for ``older_than`` seconds.
+        """Return the ranges without a lookup for ``older_than`` seconds, by the i of distances from 2**i on.
 
-        Counted from the nearest range with a contact to the farthest possible one, for nearer ones have nobody to find
+        They extend from the nearest range with a contact to the farthest one, because nearer ranges are empty
         (Kademlia, section 2.3).
         """
         filled = [bucket_index(self._own_id, contact.node_id) for contact in self.contacts()]
@@ -193,7 +192,7 @@ class RoutingTable:
         return [i for i in range(min(filled), 8 * ID_BYTES) if self._searched_at.get(i, before) <= before]
 
     def refresh_target(self, index: int, rng: random.Random) -> bytes:
-        """A random id in the range of bucket ``index``; a lookup for it refreshes the bucket."""
+        """Return a random id in the range of bucket ``index``; a lookup for it refreshes the bucket."""
         apart = (1 << index) | rng.getrandbits(index)
         return (int.from_bytes(self._own_id) ^ apart).to_bytes(ID_BYTES)
 
@@ -213,7 +212,7 @@ class RoutingTable:
         return len(self._nearest()) < self._k or apart < self._nearest()[-1]
 
     def _nearest(self) -> list[int]:
-        """How far the k contacts closest to this node are, the closest first."""
+        """Return the distances of the k contacts closest to this node, in ascending order."""
         if self._nearest_of != self.version:
             self._nearest_of = self.version
             own = self._own
@@ -222,7 +221,7 @@ class RoutingTable:
         return self._apart
 
     def _split(self, bucket: _Bucket) -> None:
-        """Put two buckets, of half the range each, in the place of ``bucket``."""
+        """Replace ``bucket`` by two buckets of half the range each."""
         middle = (bucket.low + bucket.high) // 2
         halves = [_Bucket(bucket.low, middle), _Bucket(middle, bucket.high)]
         for node_id, entry in bucket.entries.items():
@@ -233,8 +232,8 @@ class RoutingTable:
         self._buckets[place : place + 1] = halves
         self._lows = [each.low for each in self._buckets]
 
-    def _free(self, bucket: _Bucket, node_id: bytes, now: float) -> None:
-        """Take a contact out; the most recently seen newcomer, if any, takes its place."""
+    def _remove_entry(self, bucket: _Bucket, node_id: bytes, now: float) -> None:
+        """Delete a contact; the most recently seen waiting contact replaces it."""
         del bucket.entries[node_id]
         self._size -= 1
         self.version += 1
@@ -243,11 +242,11 @@ class RoutingTable:
             bucket.entries[newcomer_id] = _Entry(newcomer, now, now)
             self._size += 1
 
-    def _queue(self, bucket: _Bucket, newcomer: Contact, now: float) -> Contact | None:
-        """Let ``newcomer`` wait, and say who should be asked whether it is still there."""
+    def _cache(self, bucket: _Bucket, newcomer: Contact, now: float) -> Contact | None:
+        """Add ``newcomer`` to the replacement cache, and return the contact to ping."""
         keep(bucket.waiting, newcomer.node_id, newcomer, self._k)
         oldest = next(iter(bucket.entries.values()))
-        # A flood of newcomers shall not become a flood of pings to one old contact.
+        # Many new contacts must not cause many pings to one old contact.
         if now - max(oldest.seen_at, oldest.questioned_at) < PATIENCE:
             return None
         oldest.questioned_at = now

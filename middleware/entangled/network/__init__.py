@@ -1,1 +1,1 @@
-"""Datagram ports: the interface, the real one, and the one in memory."""
+"""Datagram networks: the interface, UDP, tunnels, and a simulated network in memory."""

@@ -1,6 +1,6 @@
-"""Carrier: where the byte streams of tunnels come from.
+"""Define the interface that opens the byte streams of tunnels.
 
-``tcp`` has the real one, ``pipes`` the one in memory.
+``tcp`` implements it with TCP, ``pipes`` in memory.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from twisted.internet.interfaces import IProtocol
 from middleware.entangled.network.network import Address
 
 Accept = Callable[[str], IProtocol | None]
-"""Called with the numeric address of whoever has dialled; None hangs up."""
+"""Called with the numeric address of a dialling host; returns None to close the connection."""
 
 
 @dataclass(frozen=True, slots=True)
 class Strain:
-    """How the stream of one end does.
+    """The state of the stream at one end.
 
-    ``held`` are bytes that the other end has not confirmed yet (each piece may count as a full one), ``acked`` those
-    that it has so far; ``repeated`` says how often something was sent again.
+    ``held`` are the bytes that the other end has not acknowledged (each segment may count as a full one), ``acked`` the
+    bytes that it has acknowledged; ``repeated`` is the number of retransmissions.
     """
 
     held: int
@@ -31,16 +31,16 @@ class Strain:
 
 
 class Carrier(Protocol):
-    """Opens byte streams; each is spoken on by a protocol of Twisted."""
+    """Opens byte streams, each handled by a Twisted protocol."""
 
     def listen(self, accept: Accept) -> None:
-        """Be there for those that dial; raises ``PortInUse``."""
+        """Accept connections; raises ``PortInUse``."""
 
     def dial(self, to: Address, protocol: IProtocol, failed: Callable[[str], None]) -> None:
-        """Connect ``protocol`` with who listens at ``to``; ``failed`` is called with the reason where nobody does."""
+        """Connect ``protocol`` to the listener at ``to``; ``failed`` is called with the reason if that fails."""
 
     def strain(self, transport: Any) -> Strain | None:
-        """How the stream of a transport does; None where nobody can tell."""
+        """Return the state of the stream of a transport; None if it is unknown."""
 
     def close(self) -> None:
-        """Be there no more, and dial no more; streams that are open stay so.  May be called twice."""
+        """Stop listening and dialling; open streams continue.  May be called twice."""

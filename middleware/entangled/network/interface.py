@@ -1,4 +1,4 @@
-"""Interface: the network interfaces of this machine, as Linux tells of them."""
+"""List the network interfaces of this machine (Linux)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _ADDRESSES6 = Path("/proc/net/if_inet6")
 
 @dataclass(frozen=True)
 class Interface:
-    """One interface that is up; ``addresses`` are those in figures that reach beyond one link."""
+    """One interface that is up; ``addresses`` are numeric and not link-local."""
 
     index: int
     name: str
@@ -27,27 +27,27 @@ class Interface:
 
 
 def interfaces() -> list[Interface]:
-    """The interfaces that are up; none where the system does not tell."""
+    """Return the interfaces that are up; an empty list if the system does not report them."""
     found: list[Interface] = []
-    sixes = _sixes()
+    ipv6_addresses = _read_ipv6_addresses()
     try:
         names = socket.if_nameindex()
-        asked = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        probe = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     except OSError:
         return found
-    with asked:
+    with probe:
         for index, name in names:
             request = struct.pack("40s", name.encode()[:15])
             try:
-                flags = struct.unpack_from("H", fcntl.ioctl(asked, _FLAGS, request), 16)[0]
+                flags = struct.unpack_from("H", fcntl.ioctl(probe, _FLAGS, request), 16)[0]
             except OSError:
                 continue
             try:
-                fours = [socket.inet_ntoa(fcntl.ioctl(asked, _ADDRESS, request)[20:24])]
+                ipv4_addresses = [socket.inet_ntoa(fcntl.ioctl(probe, _ADDRESS, request)[20:24])]
             except OSError:
-                fours = []
+                ipv4_addresses = []
             if flags & _UP:
-                addresses = (*fours, *sixes.get(name, []))
+                addresses = (*ipv4_addresses, *ipv6_addresses.get(name, []))
                 found.append(
                     Interface(
                         index,
@@ -62,9 +62,9 @@ def interfaces() -> list[Interface]:
 
 
 def chosen(found: list[Interface], host: str) -> list[Interface]:
-    """Those of ``found`` on which a node that listens at ``host`` can be met: all, or the one that has the address.
+    """Return the interfaces in ``found`` at which a node that listens at ``host`` is reachable.
 
-    The loopback only where there is nothing else, or where the node listens there.
+    The loopback is included only if there is no other interface, or if the node listens at a loopback address.
     """
     if not is_any(host):
         return [interface for interface in found if host in interface.addresses]
@@ -73,20 +73,20 @@ def chosen(found: list[Interface], host: str) -> list[Interface]:
 
 
 def is_any(host: str) -> bool:
-    """Whether who listens at ``host`` listens at every interface."""
+    """Return whether ``host`` is an unspecified address, which stands for every interface."""
     return host in ("", "*", "0.0.0.0", "::")
 
 
 def is_loopback(host: str) -> bool:
-    """Whether ``host`` is heard on this machine alone."""
+    """Return whether ``host`` is a loopback address."""
     try:
         return ip_address(host).is_loopback
     except ValueError:
         return False
 
 
-def _sixes() -> dict[str, list[str]]:
-    """The IPv6 addresses of each interface but those of one link, which say nothing without their interface."""
+def _read_ipv6_addresses() -> dict[str, list[str]]:
+    """Return the IPv6 addresses of each interface, except link-local ones, which need a scope."""
     found: dict[str, list[str]] = {}
     try:
         lines = _ADDRESSES6.read_text(encoding="ascii").splitlines()

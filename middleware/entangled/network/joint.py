@@ -1,4 +1,4 @@
-"""Joint: a ``Network`` of two: UDP, and tunnels for those to whom no UDP leads; it picks by the address."""
+"""Combine UDP and tunnels into one ``Network`` that selects between them by the address."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from middleware.entangled.network.url import VIRTUAL
 
 
 class JointNetwork:
-    """``udp`` and ``tunnel`` as one; its address is that of ``udp``."""
+    """``udp`` and ``tunnel`` as one network; its address is the UDP address."""
 
     def __init__(self, udp: Network, tunnel: TunnelNetwork) -> None:
         self.udp = udp
@@ -20,12 +20,12 @@ class JointNetwork:
 
     @property
     def address(self) -> Address:
-        """The node's own address."""
+        """The node's address."""
         return self.udp.address
 
     @property
     def counters(self) -> Counter[str]:
-        """What both count together: sent, received, unsent, ...; and of the tunnels alone, with that before it."""
+        """The sum of both counters (sent, received, unsent, ...), and the tunnel's counters prefixed by ``tunnel``."""
         counted: Counter[str] = Counter(getattr(self.udp, "counters", {}))
         counted.update({f"tunnel {name}": number for name, number in self.tunnel.counters.items()})
         for name in ("sent", "received", "unsent"):
@@ -34,21 +34,21 @@ class JointNetwork:
 
     @property
     def ports(self) -> Ports | None:
-        """The local ports of ``udp``, where it can have several."""
+        """The local ports of ``udp``, if it supports several."""
         return ports_of(self.udp)
 
     @property
     def detours(self) -> list[Address]:
-        """The tunnels that may be dialled."""
+        """The virtual addresses of the tunnels that may be dialled."""
         return self.tunnel.detours
 
     @property
     def closed(self) -> Any:
-        """Fires when the UDP port is really free again."""
+        """Fires when the UDP port is closed."""
         return getattr(self.udp, "closed", None)
 
     def listen(self, receiver: Receiver) -> None:
-        """Open both; raises ``PortInUse`` where either cannot be."""
+        """Open both; raises ``PortInUse`` if either port is in use."""
         self.udp.listen(receiver)
         try:
             self.tunnel.listen(receiver)
@@ -57,7 +57,7 @@ class JointNetwork:
             raise
 
     def send(self, datagram: bytes, to: Address) -> None:
-        """Send by the way that the address names."""
+        """Send over the network to which the address belongs."""
         if to.host.startswith(VIRTUAL):
             self.tunnel.send(datagram, to)
         else:

@@ -1,7 +1,7 @@
-"""Lan: the multicast group of the LAN over real sockets, on every interface, IPv4 and IPv6.
+"""Join the multicast group of the LAN on every interface, with IPv4 and IPv6.
 
-Each family has two ports: one that hears the group, shared with the other nodes of this machine, and one of its own
-that calls and is answered.  Interfaces come and go (a cable, another Wi-Fi), so they are looked at every ``LOOK`` s.
+Each family has two ports: a receiving port, shared with the other nodes of this machine, and a sending port, to which
+replies go.  Interfaces appear and disappear (a cable, another Wi-Fi), so they are listed again every ``LOOK`` seconds.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ from middleware.entangled.network.multicast import GROUP, GROUP6
 from middleware.entangled.network.network import MAX_DATAGRAM, Address, Receiver
 
 LOOK = 3.0
-"""Seconds between two looks at the interfaces; a look takes 0.1 ms."""
+"""The seconds between two listings of the interfaces; a listing takes 0.1 ms."""
 _IP_PKTINFO, _IP_MULTICAST_ALL, _IPV6_MULTICAST_ALL = 8, 49, 29
 
 
 class LanMulticast:
     """A ``Multicast`` for a node that listens at ``host`` (``""``, ``"*"`` or an unspecified address: every interface).
 
-    ``counters`` counts what was sent, received and unsent.
+    ``counters`` counts datagrams: sent, received and unsent.
     """
 
     _log = Logger()
 
     def __init__(self, reactor: Any, host: str, look: Callable[[], list[Interface]] = interfaces) -> None:
-        self._moved: Callable[[], None] = lambda: None
+        self._on_move: Callable[[], None] = lambda: None
         self.counters: Counter[str] = Counter()
         self._reactor = reactor
         self._host = host
@@ -46,14 +46,16 @@ class LanMulticast:
         self._timer: IDelayedCall | None = None
 
     def listen(self, receiver: Receiver, moved: Callable[[], None]) -> None:
-        """Join on every interface, and hand each datagram to ``receiver``; a family that cannot be had is left out."""
-        self._moved = moved
-        for kind in (_Four, _Six):
+        """Join on every interface and pass each datagram to ``receiver``; an unavailable address family is skipped."""
+        self._on_move = moved
+        for kind in (_Ipv4, _Ipv6):
             try:
                 self._families.append(kind(self._reactor, receiver, self.counters))
             except OSError as error:
-                self._log.debug("no multicast of {family}: {why}", family=kind.__name__, why=error.strerror or error)
-        self._look_again()
+                self._log.debug(
+                    "multicast is not available for {family}: {why}", family=kind.__name__, why=error.strerror or error
+                )
+        self._update_interfaces()
 
     def send(self, datagram: bytes) -> None:
         """Send to the group from every address of every interface."""
@@ -68,9 +70,9 @@ class LanMulticast:
         for family in families:
             family.close()
 
-    def _look_again(self) -> None:
+    def _update_interfaces(self) -> None:
         cancel(self._timer)
-        self._timer = self._reactor.callLater(LOOK, self._look_again)
+        self._timer = self._reactor.callLater(LOOK, self._update_interfaces)
         found = chosen(self._look(), self._host)
         if found == self._known:
             return
@@ -79,13 +81,13 @@ class LanMulticast:
             for family in self._families:
                 family.join(interface)
         shown = ", ".join(f"{each.name} {' '.join(each.addresses)}" for each in found) or "no interface"
-        self._log.info("looking for the team on the LAN by {interfaces}", interfaces=shown)
+        self._log.info("searching for the team on the LAN, interfaces: {interfaces}", interfaces=shown)
         if not is_first:
-            self._moved()
+            self._on_move()
 
 
 class _Family:
-    """The two ports of one family of addresses."""
+    """The two ports of one address family."""
 
     family: socket.AddressFamily
     group: Address
@@ -93,28 +95,30 @@ class _Family:
 
     def __init__(self, reactor: Any, receiver: Receiver, counters: Counter[str]) -> None:
         self._counters = counters
-        self._ear = self._mouth = None
+        self._receiving_port = self._sending_port = None
         protocol = _Protocol(receiver, counters)
-        self._ear = self._adopted(reactor, protocol, self.bound)
+        self._receiving_port = self._open_port(reactor, protocol, self.bound)
         try:
-            self._mouth = self._adopted(reactor, _Protocol(receiver, counters), Address("", 0))
+            self._sending_port = self._open_port(reactor, _Protocol(receiver, counters), Address("", 0))
         except OSError:
             self.close()
             raise
 
     def join(self, interface: Interface) -> None:
-        """Hear the group on ``interface`` as well."""
-        if self._ear is not None:
-            # It is no member yet, or is one since an earlier look, or has no addresses of this family.
+        """Join the group on ``interface``."""
+        if self._receiving_port is not None:
+            # Fails if it is a member already, or has no addresses of this family.
             with suppress(OSError):
-                self._join(self._ear.socket, interface.index)
+                self._join(self._receiving_port.socket, interface.index)
 
     def send(self, datagram: bytes, interface: Interface) -> None:
         """Send to the group on ``interface``, from each of its addresses of this family."""
         for address in interface.addresses:
-            if (":" in address) == (self.family == socket.AF_INET6) and self._mouth is not None:
+            if (":" in address) == (self.family == socket.AF_INET6) and self._sending_port is not None:
                 try:
-                    self._mouth.socket.sendmsg([datagram], [self._by(interface.index, address)], 0, self.group)
+                    self._sending_port.socket.sendmsg(
+                        [datagram], [self._source_option(interface.index, address)], 0, self.group
+                    )
                 except OSError:
                     self._counters["unsent"] += 1
                 else:
@@ -122,63 +126,63 @@ class _Family:
 
     def close(self) -> None:
         """Close both ports."""
-        for port in (self._ear, self._mouth):
+        for port in (self._receiving_port, self._sending_port):
             if port is not None:
                 port.stopListening()
-        self._ear = self._mouth = None
+        self._receiving_port = self._sending_port = None
 
-    def _adopted(self, reactor: Any, protocol: DatagramProtocol, at: Address) -> Any:
-        with socket.socket(self.family, socket.SOCK_DGRAM) as made:
-            made.setblocking(False)
+    def _open_port(self, reactor: Any, protocol: DatagramProtocol, at: Address) -> Any:
+        with socket.socket(self.family, socket.SOCK_DGRAM) as sock:
+            sock.setblocking(False)
             if at.port:
-                # Every node of this machine hears the group.
-                made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            self._prepare(made)
-            made.bind(at)
-            return reactor.adoptDatagramPort(made.fileno(), self.family, protocol, MAX_DATAGRAM + 1)
+                # Every node of this machine receives the datagrams of the group.
+                sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            self._prepare(sock)
+            sock.bind(at)
+            return reactor.adoptDatagramPort(sock.fileno(), self.family, protocol, MAX_DATAGRAM + 1)
 
-    def _prepare(self, made: socket.socket) -> None:
+    def _prepare(self, sock: socket.socket) -> None:
         raise NotImplementedError
 
     def _join(self, ear: socket.socket, index: int) -> None:
         raise NotImplementedError
 
-    def _by(self, index: int, address: str) -> tuple[int, int, bytes]:
+    def _source_option(self, index: int, address: str) -> tuple[int, int, bytes]:
         raise NotImplementedError
 
 
-class _Four(_Family):
+class _Ipv4(_Family):
     family = socket.AF_INET
     group = GROUP
     bound = GROUP
 
-    def _prepare(self, made: socket.socket) -> None:
-        made.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 1)
-        made.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)
+    def _prepare(self, sock: socket.socket) -> None:
+        sock.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 1)
+        sock.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)
 
     def _join(self, ear: socket.socket, index: int) -> None:
         request = struct.pack("4s4si", socket.inet_aton(self.group.host), bytes(4), index)
         ear.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, request)
 
-    def _by(self, index: int, address: str) -> tuple[int, int, bytes]:
+    def _source_option(self, index: int, address: str) -> tuple[int, int, bytes]:
         return socket.IPPROTO_IP, _IP_PKTINFO, struct.pack("i4s4s", index, socket.inet_aton(address), bytes(4))
 
 
-class _Six(_Family):
+class _Ipv6(_Family):
     family = socket.AF_INET6
     group = GROUP6
     bound = Address("::", GROUP6.port)
 
-    def _prepare(self, made: socket.socket) -> None:
-        made.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
-        made.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_MULTICAST_HOPS, 1)
-        made.setsockopt(socket.IPPROTO_IPV6, _IPV6_MULTICAST_ALL, 0)
+    def _prepare(self, sock: socket.socket) -> None:
+        sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
+        sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_MULTICAST_HOPS, 1)
+        sock.setsockopt(socket.IPPROTO_IPV6, _IPV6_MULTICAST_ALL, 0)
 
     def _join(self, ear: socket.socket, index: int) -> None:
         request = struct.pack("16si", socket.inet_pton(socket.AF_INET6, self.group.host), index)
         ear.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_JOIN_GROUP, request)
 
-    def _by(self, index: int, address: str) -> tuple[int, int, bytes]:
+    def _source_option(self, index: int, address: str) -> tuple[int, int, bytes]:
         packed = socket.inet_pton(socket.AF_INET6, address)
         return socket.IPPROTO_IPV6, socket.IPV6_PKTINFO, struct.pack("16si", packed, index)
 
@@ -189,10 +193,10 @@ class _Protocol(DatagramProtocol):
         self._counters = counters
 
     def datagramReceived(self, datagram: bytes, addr: Any) -> None:
-        """Hand a datagram on."""
+        """Pass a datagram to the receiver."""
         if len(datagram) <= MAX_DATAGRAM:
             self._counters["received"] += 1
             self._receiver(datagram, Address(addr[0], addr[1]))
 
     def connectionRefused(self) -> None:
-        """Ignore the ICMP message: anybody may forge one."""
+        """Ignore the ICMP message, because it may be forged."""

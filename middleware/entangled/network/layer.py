@@ -1,4 +1,4 @@
-"""Layer: one coat of a byte stream, as bytes in and bytes out: TLS, and the way through a proxy; no socket."""
+"""Transform a byte stream without I/O: TLS, and the connection through an HTTP proxy."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ _PIECE = 16384
 
 
 class Layer(Protocol):
-    """What lies between the stream and what is said on it.  After ``fault`` nothing more comes of it."""
+    """A transformation between a transport and a protocol.  After a ``fault`` it produces nothing more."""
 
     is_open: bool
     fault: str
 
     def opening(self) -> bytes:
-        """What to send first."""
+        """Return the first bytes to send."""
 
     def received(self, data: bytes) -> tuple[bytes, bytes]:
-        """Take bytes as they come; what was inside, and what to send back at once."""
+        """Process received bytes; return the decoded bytes, and the bytes to send back at once."""
 
     def wrapped(self, data: bytes) -> bytes:
-        """What to send for ``data``, once it is open."""
+        """Encode ``data`` for sending; call it only while the layer is open."""
 
 
 class Tls:
-    """One end of TLS, by Python's own ``ssl``; ``host`` is whom a client names (SNI)."""
+    """One end of TLS, with Python's ``ssl``; ``host`` is the server name that a client sends (SNI)."""
 
     def __init__(self, context: ssl.SSLContext, host: str = "", is_server: bool = False) -> None:
         self.is_open = False
@@ -38,15 +38,15 @@ class Tls:
         self._tls = context.wrap_bio(self._in, self._out, server_side=is_server, server_hostname=host or None)
 
     def opening(self) -> bytes:
-        """What to send first."""
-        self._shake()
+        """Return the first bytes to send."""
+        self._do_handshake()
         return self._out.read()
 
     def received(self, data: bytes) -> tuple[bytes, bytes]:
-        """Take bytes as they come; what was inside, and what to send back at once."""
+        """Process received bytes; return the decrypted bytes, and the bytes to send back at once."""
         self._in.write(data)
         if not self.is_open and not self.fault:
-            self._shake()
+            self._do_handshake()
         pieces = []
         while self.is_open and not self.fault:
             try:
@@ -57,19 +57,19 @@ class Tls:
                 self._fail(error)
                 break
             if not piece:
-                self.fault = "the other end has closed TLS"
+                self.fault = "the other end closed TLS"
             pieces.append(piece)
         return b"".join(pieces), self._out.read()
 
     def wrapped(self, data: bytes) -> bytes:
-        """What to send for ``data``."""
+        """Encrypt ``data``."""
         try:
             self._tls.write(data)
         except ssl.SSLError as error:
             self._fail(error)
         return self._out.read()
 
-    def _shake(self) -> None:
+    def _do_handshake(self) -> None:
         try:
             self._tls.do_handshake()
             self.is_open = True
@@ -83,7 +83,7 @@ class Tls:
 
 
 class Proxied:
-    """The way through an HTTP proxy: CONNECT (RFC 9110, section 9.3.6); ``login`` is ``user:password``."""
+    """The connection through an HTTP proxy: CONNECT (RFC 9110, section 9.3.6); ``login`` is ``user:password``."""
 
     def __init__(self, target: str, login: str = "") -> None:
         self.is_open = False
@@ -93,60 +93,60 @@ class Proxied:
         self._buffer = bytearray()
 
     def opening(self) -> bytes:
-        """What to send first."""
+        """Return the first bytes to send."""
         login = base64.b64encode(self._login.encode()).decode()
         more = [f"Proxy-Authorization: Basic {login}"] if login else []
         return head(f"CONNECT {self._target} HTTP/1.1", f"Host: {self._target}", *more)
 
     def received(self, data: bytes) -> tuple[bytes, bytes]:
-        """Take bytes as they come; those after the proxy's answer are the stream's."""
+        """Process received bytes; bytes after the proxy's response belong to the stream."""
         if self.is_open:
             return data, b""
         self._buffer += data
         answer = taken(self._buffer)
         if answer is None:
             if len(self._buffer) >= MAX_HEAD:
-                self.fault = "no proxy answers there"
+                self.fault = "the response is not from an HTTP proxy; check the proxy's address"
             return b"", b""
         version, status = [*answer.first.split(b" "), b""][:2]
         if not version.startswith(b"HTTP/1.") or not status.startswith(b"2"):
-            self.fault = f"the proxy refuses: {answer.said!r}"
+            self.fault = f"the proxy refused the connection: {answer.said!r}"
             return b"", b""
         self.is_open = True
         rest, self._buffer = bytes(self._buffer), bytearray()
         return rest, b""
 
     def wrapped(self, data: bytes) -> bytes:
-        """What to send for ``data``."""
+        """Return ``data`` unchanged."""
         return data
 
 
 def client_context() -> ssl.SSLContext:
-    """TLS for whoever dials.  It checks no certificate: the Noise handshake inside proves who is there."""
+    """Return a client's TLS context; it verifies no certificate, because Noise authenticates the peer."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname = False
     context.verify_mode = ssl.CERT_NONE
-    _plain_web(context)
+    _configure(context)
     return context
 
 
 def server_context(pem: str) -> ssl.SSLContext:
-    """TLS for whoever is dialled; ``pem`` is a key with its certificate."""
+    """Return the TLS context of a server; ``pem`` is a key with its certificate."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    _plain_web(context)
-    # Python takes them from files only; this one is nobody else's to read, and gone at once.
+    _configure(context)
+    # Python reads them only from files; this one has mode 0600 and is deleted at once.
     with NamedTemporaryFile("w", suffix=".pem") as file:
         file.write(pem)
         file.flush()
         context.load_cert_chain(file.name)
-    # A tunnel is dialled once and stays: tickets to resume it by would be 500 bytes for nothing.
+    # A tunnel is dialled once and stays open, so session tickets would waste 500 bytes.
     context.num_tickets = 0
     context.options |= ssl.OP_NO_TICKET
     return context
 
 
-def _plain_web(context: ssl.SSLContext) -> None:
+def _configure(context: ssl.SSLContext) -> None:
     context.minimum_version = ssl.TLSVersion.TLSv1_2
     context.options |= ssl.OP_NO_RENEGOTIATION
-    # What a browser would say that wants to speak WebSocket: boxes in between choose by it.
+    # The protocol that a browser offers for WebSocket: middleboxes filter by it.
     context.set_alpn_protocols(["http/1.1"])

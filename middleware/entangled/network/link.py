@@ -1,7 +1,7 @@
-"""Link: one connection of a tunnel, which carries datagrams as a WebSocket, and what it keeps to.
+"""Carry datagrams over one WebSocket connection of a tunnel, with bounded queues.
 
-A stream delivers everything, in order, however late; for a heartbeat that is worse than a loss.  So little waits here:
-what does not fit is dropped, the newest first, and what is short goes before what is long.
+A stream delivers everything in order, however late; a late heartbeat is worse than a lost one.  Therefore queues are
+short: datagrams that do not fit are dropped, newest first, and short datagrams are sent before long ones.
 """
 
 from __future__ import annotations
@@ -22,40 +22,40 @@ from middleware.entangled.network.network import Address
 from middleware.entangled.network.websocket import WebSocket
 
 SHORT = 300
-"""Heartbeats, receipts, greetings and most questions have fewer bytes; parts of parcels have 1400."""
+"""The length limit of short datagrams: heartbeats, receipts, discovery and most requests; full fragments have 1400
+bytes."""
 MAX_WAITING, MAX_LONG = 40 * 1024, 32 * 1024
-"""Bytes that wait here, and those of them that are long."""
+"""The bytes that may wait in the transport, which cannot reorder them; with the queues less than 64 KiB."""
 MAX_SENDING = 16 * 1024
-"""Bytes that wait in the transport, where nothing overtakes them; together with the others less than 64 KiB."""
+"""The bytes that may wait in the transport, where nothing overtakes them; with the queues less than 64 KiB."""
 QUIET_S, IDLE_S = 5.0, 20.0
-"""A link on which nothing came for so long is pinged, while something is sent on it, and else."""
+"""The silence in seconds after which a link is pinged, while datagrams are sent on it and otherwise."""
 PONG_S = 5.0
-"""Who answers no ping for so long is gone, though the connection stays up."""
+"""The time in seconds without a pong after which the peer counts as gone although the connection is open."""
 STALL_S = 30.0
-"""Who takes nothing for so long is given up."""
+"""The time in seconds without progress in sending after which the link is closed."""
 CLOSE_S = 2.0
-"""So long the last words may take."""
+"""The time in seconds for the closing handshake."""
 
 
 class Owner(Protocol):
-    """Whose link it is."""
+    """Receives the events of its links."""
 
     def link_open(self, link: Link) -> bool:
-        """Learn that datagrams may pass; False ends the link."""
+        """Called when datagrams can be sent; returning False closes the link."""
 
     def link_said(self, link: Link, datagram: bytes) -> None:
-        """Take a datagram."""
+        """Process a datagram."""
 
     def link_over(self, link: Link, why: str) -> None:
-        """Learn that it is over; called once."""
+        """Called once when the link is closed."""
 
 
 @implementer(IPushProducer)
 class Link(StreamProtocol):
-    """One connection; ``address`` is what stands for the node at its other end, ``host`` where its stream came from.
+    """One connection; ``address`` is the virtual address of its peer, ``host`` the source of its stream.
 
-    ``layers`` lie around the WebSocket, the outermost first.  ``dropped`` counts the datagrams for which there was no
-    room.
+    ``layers`` surround the WebSocket, the outermost first.  ``dropped`` counts the datagrams that did not fit.
     """
 
     def __init__(
@@ -85,24 +85,24 @@ class Link(StreamProtocol):
 
     @property
     def is_open(self) -> bool:
-        """Whether datagrams pass."""
+        """Whether datagrams can be sent."""
         return self.socket.is_open and not self.is_over
 
     @property
     def is_closing(self) -> bool:
-        """Whether its last words are still on their way."""
+        """Whether the closing handshake is under way."""
         return self._closing is not None and self._closing.active()
 
     @property
     def waiting(self) -> int:
-        """Bytes that wait here."""
+        """The number of queued bytes."""
         return self._waiting
 
     def send(self, datagram: bytes) -> None:
-        """Send a datagram now, or soon, or drop it."""
+        """Send a datagram, queue it, or drop it."""
         now = self._clock.seconds()
         if self.is_open and self._paused_at is None:
-            self._put(datagram)
+            self._write_framed(datagram)
             if now - self.heard_at > QUIET_S:
                 self._ping(now)
             return
@@ -114,24 +114,24 @@ class Link(StreamProtocol):
         self._waiting += len(datagram)
 
     def look(self, now: float) -> None:
-        """See whether the other end is still there; called every second or so."""
+        """Check whether the other end is alive; called about once per second."""
         if not self.is_open:
             return
         if self._pinged_at is not None and now - self._pinged_at > PONG_S:
-            self.end("it answers no ping", is_rude=True)
+            self.end("no answer to a ping", is_rude=True)
         elif self._paused_at is not None and now - self._paused_at > STALL_S:
-            self.end("it takes nothing", is_rude=True)
+            self.end("the other end accepts no data", is_rude=True)
         elif now - self.heard_at > IDLE_S:
             self._ping(now)
 
     def end(self, why: str, code: int = NORMAL, is_rude: bool = False) -> None:
-        """Say goodbye and hang up; at once and without a word where ``is_rude``."""
+        """Close the connection: with a closing handshake, or immediately if ``is_rude``."""
         if self.is_over:
             return
         transport: Any = self.transport
         if self.is_open and not is_rude and self._paused_at is None:
             self._write(self._layers, self.socket.closing(code))
-        self._over(why)
+        self._finish(why)
         if transport is None:
             return
         transport.unregisterProducer()
@@ -142,13 +142,13 @@ class Link(StreamProtocol):
             transport.loseConnection()
 
     def forget(self) -> None:
-        """Leave nothing on the clock; who takes the last words takes them."""
+        """Cancel the timer of the closing handshake."""
         cancel(self._closing)
 
     # -- called by the stream ---------------------------------------------------------------------------------------
 
     def connectionMade(self) -> None:
-        """Begin with the outermost layer."""
+        """Open the outermost layer."""
         transport: Any = self.transport
         if self.is_over:
             transport.abortConnection()
@@ -158,7 +158,7 @@ class Link(StreamProtocol):
         self._begin(0)
 
     def dataReceived(self, data: bytes) -> None:
-        """Take bytes through all layers."""
+        """Pass bytes through all layers."""
         if self.is_over:
             return
         self.heard_at = self._clock.seconds()
@@ -176,46 +176,50 @@ class Link(StreamProtocol):
             if not was_open:
                 self._begin(number + 1)
         if data:
-            self._heard(data)
+            self._process(data)
 
     def connectionLost(self, reason: Failure | None = None) -> None:
-        """The stream is gone."""
+        """Close the link."""
         cancel(self._closing)
-        self._over("the connection was lost" if self.socket.is_open else "hung up before a tunnel began")
+        self._finish(
+            "the connection was lost"
+            if self.socket.is_open
+            else "the other end closed the connection before a tunnel was open"
+        )
 
     def pauseProducing(self) -> None:
-        """The transport has enough for now."""
+        """Queue datagrams, because the buffer of the transport is full."""
         if self._paused_at is None:
             self._paused_at = self._clock.seconds()
 
     def resumeProducing(self) -> None:
-        """The transport takes more."""
+        """Send queued datagrams, because the transport accepts more."""
         self._paused_at = None
         while self.is_open and self._paused_at is None and (self._short or self._long):
             datagram = (self._short or self._long).popleft()
             self._waiting -= len(datagram)
-            self._put(datagram)
+            self._write_framed(datagram)
 
     def stopProducing(self) -> None:
-        """The transport takes no more."""
+        """Do nothing; ``connectionLost`` follows."""
 
-    # -- inside -----------------------------------------------------------------------------------------------------
+    # -- private ----------------------------------------------------------------------------------------------------
 
     def _begin(self, number: int) -> None:
-        """Let the next layer say its first words, or the WebSocket, which lies in all of them."""
+        """Send the first bytes of a layer, or of the WebSocket inside all layers."""
         part = self._layers[number] if number < len(self._layers) else self.socket
         words = part.opening()
         if words:
             self._write(self._layers[:number], words)
 
-    def _heard(self, data: bytes) -> None:
+    def _process(self, data: bytes) -> None:
         was_open = self.socket.is_open
         datagrams, reply = self.socket.received(data)
         if reply:
             self._write(self._layers, reply)
         if self.socket.is_open and not was_open:
             if not self._owner.link_open(self):
-                self.end("there are too many")
+                self.end("too many connections")
                 return
             self.resumeProducing()
         for datagram in datagrams:
@@ -230,7 +234,7 @@ class Link(StreamProtocol):
             self._pinged_at = now
             self._write(self._layers, self.socket.ping())
 
-    def _put(self, datagram: bytes) -> None:
+    def _write_framed(self, datagram: bytes) -> None:
         self._write(self._layers, self.socket.framed(datagram))
 
     def _write(self, layers: Sequence[Layer], data: bytes) -> None:
@@ -239,7 +243,7 @@ class Link(StreamProtocol):
         transport: Any = self.transport
         transport.write(data)
 
-    def _over(self, why: str) -> None:
+    def _finish(self, why: str) -> None:
         if not self.is_over:
             self.is_over = True
             self._short.clear()

@@ -1,18 +1,18 @@
-"""Nat: a router that translates addresses, in memory, for the switchboard.
+"""Simulate a router with network address translation on a switchboard.
 
-The kinds are those that RFC 4787 tells apart by how they map and what they let in, and two that are met besides:
+The kinds differ in their mapping and filtering, in the terms of RFC 4787; two further kinds are common too:
 
-| kind    | mapping                           | lets in                              |
-|---------|-----------------------------------|--------------------------------------|
-| `full`  | one port for each inner address   | everybody                            |
-| `addr`  | the same                          | hosts that were written to           |
-| `port`  | the same                          | hosts and ports that were written to |
-| `leaky` | the same, until a port is burnt   | the same                             |
-| `sym`   | a port of its own for each target | the same                             |
-| `noudp` | none                              | nothing                              |
+| kind    | mapping                                | accepts from                   |
+|---------|----------------------------------------|--------------------------------|
+| `full`  | one port per inner address             | every address                  |
+| `addr`  | the same                               | hosts that received a datagram |
+| `port`  | the same                               | addresses that received one    |
+| `leaky` | the same, unless the port is occupied  | the same                       |
+| `sym`   | one port per inner address and target  | the same                       |
+| `noudp` | none                                   | no address                     |
 
-A *leaky* router takes what nobody inside asked for to be for itself and remembers it: whoever inside then writes to
-that stranger gets another port, since the usual one is taken (a Linux box with MASQUERADE and no firewall).
+A *leaky* router takes an unsolicited datagram for its own and remembers the sender: an inner node that then sends to
+that sender gets another port, because the usual one is occupied (a Linux router with MASQUERADE and without firewall).
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _FIRST_PORT, _LAST_PORT = 20_000, 60_000
 
 @dataclass(slots=True)
 class _Mapping:
-    """A port of the router that stands for an inner address; ``heard`` has when each target was last written to."""
+    """A port of the router for an inner address; ``heard`` has the time of the last datagram to each target."""
 
     inner: Address
     port: int
@@ -37,7 +37,7 @@ class _Mapping:
 
 
 class Nat:
-    """One router.  ``host`` is its address outside, ``lifetime`` how many seconds a mapping lives without traffic."""
+    """One router.  ``host`` is its external address, ``lifetime`` the seconds that a mapping lives without traffic."""
 
     def __init__(self, kind: NatKind, host: str, rng: random.Random, lifetime: float = 30.0) -> None:
         self.kind = kind
@@ -45,15 +45,15 @@ class Nat:
         self.lifetime = lifetime
         self._rng = rng
         self._mappings: dict[int, _Mapping] = {}
-        self._burnt: dict[tuple[int, Address], float] = {}
-        self._moved = 0
+        self._occupied: dict[tuple[int, Address], float] = {}
+        self._port_offset = 0
 
     def out(self, inner: Address, to: Address, now: float) -> Address | None:
-        """The address outside from which a datagram of ``inner`` goes to ``to``; None where it does not get out."""
+        """Return the external source address of a datagram from ``inner`` to ``to``; None if it is blocked."""
         if self.kind == "noudp":
             return None
         self._expire(now)
-        mapping = self._mapped(inner, to)
+        mapping = self._find_mapping(inner, to)
         if mapping is None:
             mapping = _Mapping(inner, self._free_port(inner, to), {})
             self._mappings[mapping.port] = mapping
@@ -61,43 +61,43 @@ class Nat:
         return Address(self.host, mapping.port)
 
     def into(self, source: Address, port: int, now: float) -> Address | None:
-        """The inner address to which a datagram of ``source`` to a port of this router goes; None where to nobody."""
+        """Return the inner destination of a datagram from ``source`` to a port of this router; None if blocked."""
         self._expire(now)
         mapping = self._mappings.get(port)
-        if mapping is None or not self._lets_in(mapping, source):
+        if mapping is None or not self._accepts(mapping, source):
             if self.kind == "leaky":
-                self._burnt[port, source] = now
+                self._occupied[port, source] = now
             return None
         mapping.heard[source] = now
         return mapping.inner
 
     def rebind(self) -> None:
-        """Forget every mapping, as after a restart; the next ones get other ports."""
+        """Forget every mapping, as after a restart; new ones get other ports."""
         self._mappings.clear()
-        self._burnt.clear()
-        self._moved = self._rng.randrange(1, 10_000)
+        self._occupied.clear()
+        self._port_offset = self._rng.randrange(1, 10_000)
 
-    def _mapped(self, inner: Address, to: Address) -> _Mapping | None:
-        mine = [mapping for mapping in self._mappings.values() if mapping.inner == inner]
+    def _find_mapping(self, inner: Address, to: Address) -> _Mapping | None:
+        own = [mapping for mapping in self._mappings.values() if mapping.inner == inner]
         if self.kind == "sym":
-            return next((mapping for mapping in mine if to in mapping.heard), None)
+            return next((mapping for mapping in own if to in mapping.heard), None)
         if self.kind == "leaky":
-            at = next((mapping for mapping in mine if to in mapping.heard), None)
-            return at or next((mapping for mapping in mine if (mapping.port, to) not in self._burnt), None)
-        return next(iter(mine), None)
+            at = next((mapping for mapping in own if to in mapping.heard), None)
+            return at or next((mapping for mapping in own if (mapping.port, to) not in self._occupied), None)
+        return next(iter(own), None)
 
     def _free_port(self, inner: Address, to: Address) -> int:
-        port = inner.port + self._moved
+        port = inner.port + self._port_offset
         while (
             port in self._mappings
-            or (port, to) in self._burnt
-            or (self.kind == "sym" and port == inner.port + self._moved)
+            or (port, to) in self._occupied
+            or (self.kind == "sym" and port == inner.port + self._port_offset)
             or port > 65535
         ):
             port = self._rng.randrange(_FIRST_PORT, _LAST_PORT)
         return port
 
-    def _lets_in(self, mapping: _Mapping, source: Address) -> bool:
+    def _accepts(self, mapping: _Mapping, source: Address) -> bool:
         if self.kind == "full":
             return True
         if self.kind == "addr":
@@ -111,5 +111,5 @@ class Nat:
                 del mapping.heard[to]
             if not mapping.heard:
                 del self._mappings[port]
-        for burnt in [burnt for burnt, at in self._burnt.items() if at < old]:
-            del self._burnt[burnt]
+        for burnt in [burnt for burnt, at in self._occupied.items() if at < old]:
+            del self._occupied[burnt]

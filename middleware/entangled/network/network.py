@@ -1,7 +1,7 @@
-"""Network: the one place where datagrams leave and enter a node.
+"""Define the interface by which a node sends and receives datagrams.
 
-``udp`` has the real one, ``switchboard`` the one in memory; ``joint`` has tunnels beside it.  Logic receives a
-``Network`` and never opens a socket.
+``udp`` implements it with UDP, ``switchboard`` in memory; ``joint`` adds tunnels.  Protocol code receives a ``Network``
+and never opens a socket.
 """
 
 from __future__ import annotations
@@ -12,27 +12,27 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 MAX_DATAGRAM = 1400
 MAX_CARRIED = 1452
-"""A datagram that carries another one for somebody else: what 1500 bytes hold besides the headers of IPv6 and UDP."""
+"""The length of a relayed datagram, which contains another one: 1500 bytes without the headers of IPv6 and UDP."""
 EVERYWHERE = "*"
 """The host that stands for every interface of both families."""
 MAX_LED = 1024
-"""Addresses of which a network keeps in mind by which local port they are written to."""
+"""The number of addresses for which a network remembers the local port to send from."""
 _RELAYED = 41
 ADDRESS = 18
-"""Bytes of an address in datagrams: an IPv6 address (16, IPv4 mapped into it) and the port (2)."""
+"""The bytes of an address in datagrams: an IPv6 address (16, IPv4 mapped into it) and the port (2)."""
 _MAPPED = bytes(10) + b"\xff\xff"
 _NONE = bytes(ADDRESS)
 
 
 class Address(NamedTuple):
-    """Where a node is reached."""
+    """The host and port of a node."""
 
     host: str
     port: int
 
     @property
     def is_virtual(self) -> bool:
-        """Whether it stands for a way that only this node has (a tunnel, a relay), and leads nobody else anywhere."""
+        """Whether it stands for a path that only this node has (a tunnel, a relay), and is useless to other nodes."""
         return self[0][:1] == "~"
 
     def __str__(self) -> str:
@@ -40,17 +40,17 @@ class Address(NamedTuple):
 
 
 def relayed(node_id: bytes) -> Address:
-    """The address that stands for the node of this id where others carry what is sent to it."""
+    """Return the virtual address of the node with this id, which is reached through relays."""
     return Address(f"~{node_id.hex()}", 1)
 
 
 def is_relayed(address: Address) -> bool:
-    """Whether an address is one that ``relayed`` gives."""
+    """Return whether an address is the result of ``relayed``."""
     return len(address.host) == _RELAYED and address.host[0] == "~"
 
 
 def packed_address(address: Address) -> bytes:
-    """The 18 bytes; zero for what is no address of the internet, such as a name."""
+    """Encode an address in 18 bytes; zero if its host is not an IP address."""
     host, port = address
     try:
         if ":" in host:
@@ -63,7 +63,7 @@ def packed_address(address: Address) -> bytes:
 
 
 def address_of(packed: bytes) -> Address | None:
-    """The address in 18 bytes; None where none was packed, or they are too few."""
+    """Decode an address from 18 bytes; None for zero, or if the length is wrong."""
     port = int.from_bytes(packed[16:], "little")
     if len(packed) != ADDRESS or not port:
         return None
@@ -80,13 +80,13 @@ class Network(Protocol):
 
     @property
     def address(self) -> Address:
-        """The node's own address; the port is known once ``listen`` was called."""
+        """The node's address; the port is known after ``listen``."""
 
     def listen(self, receiver: Receiver) -> None:
-        """Open the port and hand each datagram to ``receiver``; raises ``PortInUse`` where another holds it."""
+        """Open the port and pass each datagram to ``receiver``; raises ``PortInUse`` if the port is in use."""
 
     def send(self, datagram: bytes, to: Address) -> None:
-        """Send at most ``MAX_CARRIED`` bytes; what cannot be sent is lost, as datagrams may be."""
+        """Send at most ``MAX_CARRIED`` bytes; a datagram that cannot be sent is lost."""
 
     def close(self) -> None:
         """Close the port; may be called twice."""
@@ -94,33 +94,33 @@ class Network(Protocol):
 
 @runtime_checkable
 class Ports(Protocol):
-    """What a network can do besides, that may use several local ports: 0 stands for the one that it listens at.
+    """A network that can use several local ports: 0 stands for the listening port.
 
-    A datagram goes out by the port to which its target was led, else by the one where something from there came in
-    first.
+    A datagram leaves by the port that was assigned to its target, otherwise by the port that first received from the
+    target.
     """
 
     def open_port(self) -> int:
-        """A further local port, any free one; 0 where there is none to be had."""
+        """Open an additional free local port and return it; 0 if that fails."""
 
     def shut_port(self, port: int) -> None:
-        """Close a further port; what was led there goes by the first one again."""
+        """Close an additional port; its targets are assigned to the listening port again."""
 
     def lead(self, to: Address, port: int) -> int:
-        """Let what goes to ``to`` leave by a port from now on; gives the one by which it left so far."""
+        """Assign a local port to the target ``to``; return the previous one."""
 
     def local(self, to: Address, port: int = 0) -> Address:
-        """The address of this machine from which a datagram to ``to`` leaves (by ``port``, where given)."""
+        """Return the local source address of datagrams to ``to`` (from ``port``, if given)."""
 
     def hosts(self) -> list[str]:
-        """The addresses of this machine at which ``listen`` hears, its loopback not among them."""
+        """Return the addresses of this machine at which ``listen`` receives, without the loopback."""
 
 
 def ports_of(network: object) -> Ports | None:
-    """The local ports of a network, or of the one that it goes around (its ``ports``); None where it has only one."""
+    """Return the local ports of a network, or of the network that it wraps (its ``ports``); None if it has only one."""
     return network if isinstance(network, Ports) else getattr(network, "ports", None)
 
 
 def detours_of(network: object) -> list[Address]:
-    """The virtual addresses by which a network leads to known nodes where no datagram passes (its ``detours``)."""
+    """Return the virtual addresses by which a network reaches known nodes without UDP (its ``detours``)."""
     return list(getattr(network, "detours", ()))

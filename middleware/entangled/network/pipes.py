@@ -1,8 +1,8 @@
-"""Pipes: the byte streams of many nodes in one process; the twin of ``tcp``, without a socket.
+"""Simulate the byte streams between many nodes in one process, in place of ``tcp``.
 
-A stream delivers in order, ``delay_s`` later, at most ``rate`` bytes a second; what waits for that is its buffer, and a
-producer is paused while it is full.  A cut is not noticed by either end: bytes wait, as those of TCP do; so they do on
-a single stream that stands still (``Pipe.is_still``), where they are repeated in vain, too.
+A stream delivers in order, after ``delay_s`` seconds, at most ``rate`` bytes per second; the rest waits in its buffer,
+and a producer is paused while the buffer is full.  Neither end notices a cut: bytes wait, as in TCP.  The same happens
+on a single stalled stream (``Pipe.is_still``), which retransmits in vain.
 """
 
 from __future__ import annotations
@@ -22,33 +22,33 @@ from middleware.entangled.network.network import Address
 
 PIECE = 4096
 REPEAT_S = 0.2
-"""Seconds between two repetitions of what does not arrive."""
+"""The seconds between two retransmissions."""
 
 
 class Pipes:
-    """Joins the carriers of one process."""
+    """Connects the carriers of one process."""
 
     def __init__(self, clock: IReactorTime, delay_s: float = 0.0, rate: float = float("inf")) -> None:
         self.delay_s = delay_s
         self.rate = rate
         self.dialled: list[tuple[str, Address]] = []
-        """Who dialled whom, so far."""
+        """The dialling host and the destination of each connection so far."""
         self.streams: list[Pipe] = []
-        """The ends that dialled, of those that are open."""
+        """The dialling ends of the open connections."""
         self.clock = clock
-        self._doors: dict[Address, Accept] = {}
+        self._listeners: dict[Address, Accept] = {}
         self._cut: set[str] = set()
 
     def carrier(self, host: str, port: int = 0) -> PipeCarrier:
-        """A carrier of the machine at ``host``, which listens at ``port``."""
+        """Return a carrier of the host ``host``, which listens at ``port``."""
         return PipeCarrier(self, Address(host, port))
 
     def cut(self, host: str) -> None:
-        """Let nothing pass from or to ``host``; streams stay, and say nothing."""
+        """Block all bytes from and to ``host``; its streams stay open and stall."""
         self._cut.add(host)
 
     def heal(self) -> None:
-        """Take back every cut; what was written meanwhile arrives."""
+        """Undo every cut; the buffered bytes arrive."""
         self._cut.clear()
         for pipe in self.streams:
             for end in (pipe, pipe.other):
@@ -57,8 +57,8 @@ class Pipes:
     def _passes(self, *hosts: str) -> bool:
         return self._cut.isdisjoint(hosts)
 
-    def _open(self, host: str, to: Address, protocol: IProtocol, failed: Callable[[str], None]) -> None:
-        accept = self._doors.get(to)
+    def _connect(self, host: str, to: Address, protocol: IProtocol, failed: Callable[[str], None]) -> None:
+        accept = self._listeners.get(to)
         if not self._passes(host, to.host):
             self.clock.callLater(5.0, failed, "timed out")
             return
@@ -79,33 +79,33 @@ class Pipes:
 
 
 class PipeCarrier:
-    """One machine's carrier; a ``Carrier``."""
+    """The ``Carrier`` of one host."""
 
     def __init__(self, pipes: Pipes, address: Address) -> None:
         self._pipes = pipes
         self._address = address
 
     def listen(self, accept: Accept) -> None:
-        """Be there for those that dial; raises ``PortInUse``."""
-        if self._address in self._pipes._doors:
-            raise PortInUse(f"{self._address}: another listens there; take another port")
-        self._pipes._doors[self._address] = accept
+        """Accept connections; raises ``PortInUse``."""
+        if self._address in self._pipes._listeners:
+            raise PortInUse(f"{self._address}: the port is in use; choose another port")
+        self._pipes._listeners[self._address] = accept
 
     def dial(self, to: Address, protocol: IProtocol, failed: Callable[[str], None]) -> None:
-        """Connect ``protocol`` with who listens at ``to``."""
+        """Connect ``protocol`` to the listener at ``to``."""
         self._pipes.dialled.append((self._address.host, to))
-        # The three-way handshake.
+        # The duration of the TCP handshake.
         self._pipes.clock.callLater(
-            2 * self._pipes.delay_s, self._pipes._open, self._address.host, to, protocol, failed
+            2 * self._pipes.delay_s, self._pipes._connect, self._address.host, to, protocol, failed
         )
 
     def strain(self, transport: Any) -> Strain | None:
-        """How the stream of a transport does."""
+        """Return the state of the stream of a transport."""
         return Strain(transport.held, transport.moved, transport.repeated) if isinstance(transport, Pipe) else None
 
     def close(self) -> None:
-        """Be there no more."""
-        self._pipes._doors.pop(self._address, None)
+        """Stop listening."""
+        self._pipes._listeners.pop(self._address, None)
 
 
 @implementer(IAddress)
@@ -115,10 +115,10 @@ class _Host:
 
 
 class Pipe:
-    """One end of a stream, as Twisted's transports are.
+    """One end of a stream, with the interface of a Twisted transport.
 
-    ``is_read`` False lets nothing more be taken from it, ``is_still`` loses all that this end sends, and ``moved``
-    counts the bytes that the other end has confirmed.
+    With ``is_read`` False nothing more is read from it; ``is_still`` drops everything that this end sends; ``moved`` is
+    the number of bytes that the other end has acknowledged.
     """
 
     bufferSize = 65536  # noqa: N815
@@ -142,7 +142,7 @@ class Pipe:
 
     @property
     def is_still(self) -> bool:
-        """Whether all is lost that this end sends."""
+        """Whether everything that this end sends is lost."""
         return self._is_still
 
     @is_still.setter
@@ -152,12 +152,12 @@ class Pipe:
 
     @property
     def held(self) -> int:
-        """Bytes that are not confirmed yet."""
+        """The number of bytes that are not acknowledged."""
         return self._written - self.moved
 
     @property
     def repeated(self) -> int:
-        """How often something was repeated since the stream stands still."""
+        """The number of retransmissions since the stream stalled."""
         is_vain = self._is_still and self.held
         return int((self._pipes.clock.seconds() - self._still_since) / REPEAT_S) if is_vain else 0
 
@@ -173,31 +173,31 @@ class Pipe:
         self.pump()
 
     def registerProducer(self, producer: Any, streaming: bool) -> None:  # noqa: N802
-        """Tell ``producer`` when the buffer is full."""
+        """Pause ``producer`` while the buffer is full."""
         self._producer = producer
 
     def unregisterProducer(self) -> None:  # noqa: N802
-        """Tell nobody any more."""
+        """Remove the producer."""
         self._producer = None
 
     def loseConnection(self) -> None:  # noqa: N802
-        """Close when all is sent."""
+        """Close the stream after sending the buffer."""
         self._is_losing = True
         self.pump()
 
     def abortConnection(self) -> None:  # noqa: N802
-        """Close at once; the other end hears of it where anything gets through."""
+        """Close the stream at once; the other end is notified unless the path is cut."""
         if not self.is_lost:
             if self._pipes._passes(self.host, self.other.host):
                 self._pipes.clock.callLater(self._pipes.delay_s, self.other._lost, ConnectionAborted())
             self._lost(ConnectionAborted())
 
     def getPeer(self) -> IAddress:  # noqa: N802
-        """Whoever is at the other end."""
+        """Return the address of the other end."""
         return _Host(self.other.host)
 
     def pump(self) -> None:
-        """Move what can be moved."""
+        """Send the next bytes of the buffer, if possible."""
         if self._timer is not None or self.is_lost:
             return
         if self._is_still or not self._pipes._passes(self.host, self.other.host) or not self.other.is_read:
@@ -205,24 +205,24 @@ class Pipe:
         if self.buffer:
             piece = bytes(self.buffer[:PIECE])
             del self.buffer[:PIECE]
-            self._timer = self._pipes.clock.callLater(len(piece) / self._pipes.rate, self._moved, piece)
+            self._timer = self._pipes.clock.callLater(len(piece) / self._pipes.rate, self._on_sent, piece)
         elif self._is_losing:
             self._pipes.clock.callLater(self._pipes.delay_s, self.other._lost, ConnectionDone())
             self._lost(ConnectionDone())
 
-    def _moved(self, piece: bytes) -> None:
+    def _on_sent(self, piece: bytes) -> None:
         self._timer = None
-        self._pipes.clock.callLater(self._pipes.delay_s, self.other._came, piece)
-        self._pipes.clock.callLater(2 * self._pipes.delay_s, self._confirmed, len(piece))
+        self._pipes.clock.callLater(self._pipes.delay_s, self.other._deliver, piece)
+        self._pipes.clock.callLater(2 * self._pipes.delay_s, self._acknowledge, len(piece))
         if not self.buffer and self._is_paused and self._producer is not None:
             self._is_paused = False
             self._producer.resumeProducing()
         self.pump()
 
-    def _confirmed(self, size: int) -> None:
+    def _acknowledge(self, size: int) -> None:
         self.moved += size
 
-    def _came(self, piece: bytes) -> None:
+    def _deliver(self, piece: bytes) -> None:
         if not self.is_lost and self.protocol is not None:
             self.protocol.dataReceived(piece)
 

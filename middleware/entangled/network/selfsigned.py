@@ -1,6 +1,6 @@
-"""Selfsigned: a key and a certificate, made on the fly, that TLS can begin with; it proves nothing to anybody.  Pure.
+"""Create a private key and a self-signed certificate for TLS; they authenticate no node.
 
-An Ed25519 certificate (RFC 8410) has so few parts that they are written here: a node that serves tunnels needs neither
+An Ed25519 certificate (RFC 8410) has so few fields that it is encoded here: a node that serves tunnels needs neither
 ``cryptography`` nor a file.
 """
 
@@ -12,15 +12,15 @@ import textwrap
 from nacl import bindings
 
 _ED25519 = bytes.fromhex("300506032b6570")
-"""AlgorithmIdentifier of 1.3.101.112, which has no parameters."""
+"""The AlgorithmIdentifier of 1.3.101.112, which has no parameters."""
 _COMMON_NAME = bytes.fromhex("0603550403")
 _SUBJECT_ALTERNATIVE = bytes.fromhex("0603551d11")
-# It is checked by nobody, so it need not begin today: the clock of a robot may be far off.
+# No node verifies it, so it does not start today: the clock of a robot may be wrong.
 _FROM, _UNTIL = b"20200101000000Z", b"20991231235959Z"
 
 
 def selfsigned(seed: bytes, serial: bytes, name: str = "localhost") -> str:
-    """Key and certificate in PEM, for the key of the 32 bytes ``seed``; ``serial`` has 1 to 19 bytes."""
+    """Return key and certificate in PEM for the 32-byte ``seed``; ``serial`` has 1 to 19 bytes."""
     public, secret = bindings.crypto_sign_seed_keypair(seed)
     subject = _sequence(_der(0x31, _sequence(_COMMON_NAME, _der(0x0C, name.encode()))))
     names = _sequence(_der(0x82, name.encode()))

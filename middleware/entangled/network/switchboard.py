@@ -1,7 +1,7 @@
-"""Switchboard: the networks of many nodes in one process, with weather and cuts on purpose.
+"""Simulate the datagram networks of many nodes in one process, with delay, loss and partitions.
 
-It is the twin of ``udp``: the same interface, no socket.  Whatever happens here follows from the clock, the dice and
-the order of sending, so a run can be replayed from its seed; ``digest`` tells whether two runs were the same.
+It has the interface of ``udp`` without sockets.  Its behaviour depends only on the clock, the random generator and the
+order of sending, so a run can be reproduced from its seed; ``digest`` shows whether two runs are identical.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from middleware.entangled.network.network import MAX_CARRIED, MAX_LED, Address, 
 
 _FIRST_FREE_PORT = 49152
 _BATCH = 256
-"""Deliveries that are hashed at once; a hash object is slower to ask often than to feed much."""
+"""The number of deliveries that are hashed together, because one large update is faster than many small ones."""
 _MAX_NAMES = 50_000
 
 
 @dataclass(frozen=True)
 class Weather:
-    """What a link does to datagrams.
+    """The conditions of a link.
 
-    Each takes ``delay_s``, plus or minus up to ``jitter_s`` (even), never less than 0.  ``loss``, ``duplicate`` and
-    ``reorder`` are probabilities from 0 to 1; a reordered datagram takes as long again and a millisecond more.
+    Each datagram takes ``delay_s``, plus or minus up to ``jitter_s`` (uniform), at least 0.  ``loss``, ``duplicate``
+    and ``reorder`` are probabilities from 0 to 1; a reordered datagram is delayed by a further ``delay_s`` plus 1 ms.
     """
 
     delay_s: float = 0.0
@@ -42,7 +42,7 @@ class Weather:
     reorder: float = 0.0
 
     def delays(self, rng: random.Random) -> list[float]:
-        """The seconds that each copy of one datagram takes: none where it is lost, two where it is duplicated."""
+        """Return the delay of each copy of one datagram in seconds: none if it is lost, two if it is duplicated."""
         if self.loss and rng.random() < self.loss:
             return []
         copies = 2 if self.duplicate and rng.random() < self.duplicate else 1
@@ -61,21 +61,21 @@ CALM = Weather()
 
 
 class Link(Protocol):
-    """What lies between all nodes of a board where weather is too plain: distances, bursts, queues.
+    """A model of the links between all nodes, for distances, bursts and queues.
 
-    One object for the whole board: pairs are too many to have one each, so its state is that of senders and receivers.
+    There is one object for the whole switchboard, because pairs are too many; it keeps state per sender and receiver.
     """
 
     def delays(self, source: Address, to: Address, size: int, now: float, rng: random.Random) -> Sequence[float]:
-        """The seconds that each copy of a datagram of ``size`` bytes takes, sent at ``now``; none: it is lost."""
+        """Return the delay in seconds of each copy of a datagram of ``size`` bytes sent at ``now``; none if lost."""
 
 
 Barrier = Callable[[Address, Address], bool]
-"""Whether nothing passes from the first to the second."""
+"""Returns whether datagrams from the first address to the second are blocked."""
 
 
 class Traffic:
-    """What one port has sent and taken in: datagrams, and their bytes."""
+    """The datagrams and bytes that one port has sent and received."""
 
     __slots__ = ("sent", "sent_bytes", "received", "received_bytes")
 
@@ -84,9 +84,9 @@ class Traffic:
 
 
 class SwitchboardNetwork:
-    """One node's port on a ``Switchboard``; a ``Network`` and ``Ports``.  ``home`` is the router that it is behind.
+    """One node's port on a ``Switchboard``, behind the router ``home``; a ``Network`` and ``Ports``.
 
-    ``traffic`` counts what passes here; it may go on from a former life.
+    ``traffic`` counts its datagrams; it may be passed on to the port of a restarted node.
     """
 
     def __init__(
@@ -94,7 +94,7 @@ class SwitchboardNetwork:
     ) -> None:
         self._board = board
         self._address = address
-        self._led: dict[Address, int] = {}
+        self._port_by_target: dict[Address, int] = {}
         self.traffic = Traffic() if traffic is None else traffic
         self.home = home
         self.further: set[int] = set()
@@ -103,20 +103,20 @@ class SwitchboardNetwork:
 
     @property
     def address(self) -> Address:
-        """The node's own address."""
+        """The node's address."""
         return self._address
 
     def listen(self, receiver: Receiver) -> None:
-        """Open the port and hand each datagram to ``receiver``; raises ``PortInUse`` where another holds it."""
+        """Open the port and pass each datagram to ``receiver``; raises ``PortInUse`` if the port is in use."""
         self._board._plug(self, self._address)
         self.receiver = receiver
 
     def send(self, datagram: bytes, to: Address) -> None:
-        """Send a datagram; what cannot be sent is lost."""
+        """Send a datagram; a datagram that cannot be sent is lost."""
         if self.receiver is None or self.is_unplugged:
             self._board.counters["unsent"] += 1
         else:
-            self._board._carry(self, datagram, to)
+            self._board._transmit(self, datagram, to)
 
     def close(self) -> None:
         """Close the port; may be called twice."""
@@ -126,38 +126,38 @@ class SwitchboardNetwork:
         self._board._release(self, self._address)
 
     def open_port(self) -> int:
-        """A further local port."""
+        """Open an additional local port and return it."""
         port = self._board._free_port(self._address.host, self.home)
         self.further.add(port)
         self._board._plug(self, self._address._replace(port=port))
         return port
 
     def shut_port(self, port: int) -> None:
-        """Close a further port."""
+        """Close an additional port."""
         self.further.discard(port)
-        self._led = {to: by for to, by in self._led.items() if by != port}
+        self._port_by_target = {to: by for to, by in self._port_by_target.items() if by != port}
         self._board._release(self, self._address._replace(port=port))
 
     def lead(self, to: Address, port: int) -> int:
-        """Let what goes to ``to`` leave by ``port``; 0: by the first one."""
-        before = self._led.get(to, 0)
-        keep(self._led, to, port if port in self.further else 0, MAX_LED)
+        """Assign ``port`` to the target ``to``; 0 is the listening port."""
+        before = self._port_by_target.get(to, 0)
+        keep(self._port_by_target, to, port if port in self.further else 0, MAX_LED)
         return before
 
     def local(self, to: Address, port: int = 0) -> Address:
-        """The own address, before any translation."""
+        """Return the node's address, before any translation."""
         return self._address._replace(port=port) if port else self._source(to)
 
     def hosts(self) -> list[str]:
-        """The own address."""
+        """Return the node's host."""
         return [self._address.host]
 
     def _source(self, to: Address) -> Address:
-        port = self._led.get(to) if self._led else 0
+        port = self._port_by_target.get(to) if self._port_by_target else 0
         return self._address._replace(port=port) if port else self._address
 
-    def _came(self, datagram: bytes, source: Address, port: int) -> None:
-        if port != self._address.port and source not in self._led:
+    def _receive(self, datagram: bytes, source: Address, port: int) -> None:
+        if port != self._address.port and source not in self._port_by_target:
             self.lead(source, port)
         if self.receiver is not None:
             self.traffic.received += 1
@@ -166,13 +166,13 @@ class SwitchboardNetwork:
 
 
 class Switchboard:
-    """Joins the networks of one process; ``weather`` is the weather of every link that has none of its own.
+    """Connects the networks of one process; ``weather`` applies to every link without separate conditions.
 
-    With a ``link`` that one says how long a datagram takes, unless two addresses have a weather of their own.  Nothing
-    passes where one of the ``barriers`` stands.
+    A ``link`` determines the delays instead, unless two addresses have separate conditions.  Each of the ``barriers``
+    may block datagrams.
 
-    ``counters`` counts the datagrams that were sent, delivered, lost, cut, duplicated, unheard (nobody listens there),
-    unsent (the sender is closed or unplugged), blocked (by a router) and oversized.
+    ``counters`` counts the datagrams that were sent, delivered, lost, cut, duplicated, unheard (no listener at the
+    address), unsent (the sender is closed or unplugged), blocked (by a router) and oversized.
     """
 
     def __init__(self, clock: IReactorTime, rng: random.Random, weather: Weather = CALM) -> None:
@@ -196,17 +196,17 @@ class Switchboard:
     def network(
         self, host: str = "127.0.0.1", port: int = 0, home: Nat | None = None, traffic: Traffic | None = None
     ) -> SwitchboardNetwork:
-        """A new network at that address, behind the router ``home``; port 0 takes the next free one."""
+        """Create a network at that address, behind the router ``home``; port 0 takes the next free one."""
         return SwitchboardNetwork(self, Address(host, port or self._free_port(host, home)), home, traffic)
 
     def router(self, nat: Nat, weather: Weather = CALM) -> Nat:
-        """Put a router on the board; ``weather`` is met by all that passes it, besides that of the link."""
+        """Add a router; ``weather`` applies to all datagrams through it, in addition to the link's."""
         self._routers[nat.host] = nat
         self.router_weather[nat] = weather
         return nat
 
     def set_weather(self, a: Address, b: Address, weather: Weather | None, one_way: bool = False) -> None:
-        """Give the link between ``a`` and ``b`` (or from ``a`` to ``b``) a weather of its own; None takes it back."""
+        """Set the conditions of the link between ``a`` and ``b`` (or from ``a`` to ``b``); None resets them."""
         for link in [(a, b)] if one_way else [(a, b), (b, a)]:
             if weather is None:
                 self._links.pop(link, None)
@@ -214,29 +214,29 @@ class Switchboard:
                 self._links[link] = weather
 
     def cut(self, a: Address, b: Address, one_way: bool = False) -> None:
-        """Let nothing pass between ``a`` and ``b`` (or from ``a`` to ``b``), what is on its way included."""
+        """Block datagrams between ``a`` and ``b`` (or from ``a`` to ``b``), including those in flight."""
         self._cuts.add((a, b))
         if not one_way:
             self._cuts.add((b, a))
 
     def partition(self, *groups: Iterable[Address]) -> None:
-        """Let nothing pass from group to group; who is named in none forms one more group."""
+        """Block datagrams between groups; all addresses that are in none form another group."""
         self._sides = {address: number for number, group in enumerate(groups, start=1) for address in group}
 
     def heal(self) -> None:
-        """Take back every cut, partition and barrier; weather stays, and so do the dead."""
+        """Undo every cut, partition and barrier; link conditions and killed nodes stay."""
         self._cuts.clear()
         self._sides.clear()
         self.barriers.clear()
 
     def kill(self, address: Address) -> None:
-        """Unplug whoever listens at ``address`` without a word to it; a new network may take the address."""
+        """Unplug the network at ``address`` without notification; a new network may take the address."""
         network = self._ports.pop((None, address), None)
         if network is not None:
             network.is_unplugged = True
 
     def digest(self) -> str:
-        """The running hash, in hex, over (time, from, to, datagram) of every delivery so far."""
+        """Return a hash, in hex, of (time, from, to, datagram) of every delivery so far."""
         self._hash()
         return self._trace.hexdigest()
 
@@ -252,7 +252,7 @@ class Switchboard:
     def _plug(self, network: SwitchboardNetwork, address: Address) -> None:
         holder = self._ports.get((network.home, address))
         if holder is not None and holder is not network:
-            raise PortInUse(f"{address}: another network listens there; take another port, or 0 for any")
+            raise PortInUse(f"{address}: the port is in use; choose another port, or 0 for any")
         network.is_unplugged = False
         self._ports[network.home, address] = network
 
@@ -267,7 +267,7 @@ class Switchboard:
             return False
         return not any(barrier(source, to) for barrier in self.barriers) if self.barriers else True
 
-    def _carry(self, network: SwitchboardNetwork, datagram: bytes, to: Address) -> None:
+    def _transmit(self, network: SwitchboardNetwork, datagram: bytes, to: Address) -> None:
         self.counters["sent"] += 1
         network.traffic.sent += 1
         network.traffic.sent_bytes += len(datagram)
@@ -278,7 +278,7 @@ class Switchboard:
         home = network.home
         if home is not None:
             if (home, to) in self._ports:
-                self._clock.callLater(0.0, self._hand, home, to, source, to, datagram)
+                self._clock.callLater(0.0, self._pass_to_listener, home, to, source, to, datagram)
                 return
             outside = home.out(source, to, self._clock.seconds()) if to.host != home.host else None
             if outside is None:
@@ -291,16 +291,16 @@ class Switchboard:
         own = self._links.get((source, to)) if self._links else None
         weather = own or self.weather
         routers = (home, self._routers.get(to.host)) if self._routers else ()
-        further = [self.router_weather[router] for router in routers if router is not None] if routers else []
+        router_conditions = [self.router_weather[router] for router in routers if router is not None] if routers else []
         delays: Sequence[float]
         if self.link is not None and own is None:
             delays = self.link.delays(source, to, len(datagram), self._clock.seconds(), self._rng)
-        elif weather is CALM and not further:
+        elif weather is CALM and not router_conditions:
             self._clock.callLater(0.0, self._deliver, source, to, datagram)
             return
         else:
             delays = weather.delays(self._rng)
-        for each in further:
+        for each in router_conditions:
             delays = [delay + more for delay in delays for more in each.delays(self._rng)]
         if len(delays) != 1:
             self.counters["duplicated" if delays else "lost"] += 1
@@ -313,31 +313,31 @@ class Switchboard:
             return
         router = self._routers.get(to.host) if self._routers else None
         if router is None:
-            self._hand(None, to, source, to, datagram)
+            self._pass_to_listener(None, to, source, to, datagram)
             return
         inner = router.into(source, to.port, self._clock.seconds())
         if inner is None:
             self.counters["blocked"] += 1
         else:
-            self._hand(router, inner, source, to, datagram)
+            self._pass_to_listener(router, inner, source, to, datagram)
 
-    def _hand(self, home: Nat | None, at: Address, source: Address, to: Address, datagram: bytes) -> None:
-        """Hand a datagram to whoever listens ``at`` an address behind ``home``."""
+    def _pass_to_listener(self, home: Nat | None, at: Address, source: Address, to: Address, datagram: bytes) -> None:
+        """Pass a datagram to the listener at an address behind ``home``."""
         network = self._ports.get((home, at))
         if network is None or network.receiver is None:
             self.counters["unheard"] += 1
             return
         self.counters["delivered"] += 1
         names = self._names
-        here = names.get(source) or self._named(source)
-        there = names.get(to) or self._named(to)
-        route = f"{here}>{there} {len(datagram)}:".encode()
+        source_name = names.get(source) or self._add_name(source)
+        target_name = names.get(to) or self._add_name(to)
+        route = f"{source_name}>{target_name} {len(datagram)}:".encode()
         self._untraced += (struct.pack("<d", self._clock.seconds()), route, datagram)
         if len(self._untraced) > 3 * _BATCH:
             self._hash()
-        network._came(datagram, source, at.port)
+        network._receive(datagram, source, at.port)
 
-    def _named(self, address: Address) -> str:
+    def _add_name(self, address: Address) -> str:
         if len(self._names) > _MAX_NAMES:
             self._names.clear()
         name = self._names[address] = str(address)

@@ -1,4 +1,4 @@
-"""Tcp: the byte streams of tunnels over real TCP."""
+"""Open the byte streams of tunnels over TCP."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ from middleware.entangled.network.network import EVERYWHERE, Address
 CONNECT_S = 3.0
 _NOTSENT_LOWAT = 25
 _THIN_LINEAR_TIMEOUTS = 16
-"""Where little is on its way, as here, the first six repetitions do not come later and later (Linux, tcp(7)): with 30 %
-loss a stream would stand still for seconds."""
+"""Retransmit a stream with little data in flight, as here, six times without exponential backoff (Linux, tcp(7)):
+otherwise a stream would stall for seconds at 30 % loss."""
 _RTO_MAX_MS = 44
 LONGEST_WAIT_MS = 1000
-"""Milliseconds after which at the latest a lost piece is repeated again (Linux 6.15 and later)."""
+"""The maximum retransmission timeout in milliseconds (Linux 6.15 and later)."""
 _INFO_BYTES = 148
 UNSENT = 16 * 1024
-"""Bytes that the system may hold back of a stream (Linux): of what it holds nothing is dropped, and all is late."""
+"""The bytes of a stream that the system may buffer (Linux): buffered bytes cannot be dropped, so they arrive late."""
 
 
 class TcpCarrier:
-    """Streams over TCP; it listens at ``host`` (a numeric address; ``*``: all of IPv4 and IPv6) and ``port``."""
+    """Byte streams over TCP; it listens at ``host`` (a numeric address; ``*``: all of IPv4 and IPv6) and ``port``."""
 
     def __init__(self, reactor: Any, host: str = EVERYWHERE, port: int = 0) -> None:
         self._reactor = reactor
@@ -50,98 +50,100 @@ class TcpCarrier:
         return self._wanted if self._port is None else int(self._port.getHost().port)  # type: ignore[attr-defined]
 
     def listen(self, accept: Accept) -> None:
-        """Be there for those that dial; raises ``PortInUse``."""
+        """Accept connections; raises ``PortInUse``."""
         try:
-            port = self._listening(accept)
+            port = self._listen_on_families(accept)
         except CannotListenError as error:
-            why = getattr(error.socketError, "strerror", None) or error.socketError
+            reason = getattr(error.socketError, "strerror", None) or error.socketError
             remedy = "choose another port"
             if getattr(error.socketError, "errno", None) == errno.EACCES:
-                remedy = "let it (AmbientCapabilities=CAP_NET_BIND_SERVICE), or take a port above 1023 behind a proxy"
-            raise TunnelPortInUse(f"TCP {self._host}:{self._wanted}: {why}; {remedy}") from error
-        # What is accepted there inherits it.
-        _tuned(port.socket)
+                remedy = "permit it (AmbientCapabilities=CAP_NET_BIND_SERVICE), or use a port above 1023 behind a proxy"
+            raise TunnelPortInUse(f"TCP {self._host}:{self._wanted}: {reason}; {remedy}") from error
+        # Accepted connections inherit the options.
+        _tune(port.socket)
         self._port = port
 
     def dial(self, to: Address, protocol: IProtocol, failed: Callable[[str], None]) -> None:
-        """Connect ``protocol`` with who listens at ``to``, whose names are looked up."""
-        # Loaded by the first who dials: most nodes never do.
+        """Resolve the name in ``to``, and connect ``protocol`` to the listener there."""
+        # Imported at the first call, because most nodes never dial.
         from twisted.internet.endpoints import HostnameEndpoint
 
-        begun = HostnameEndpoint(self._reactor, to.host, to.port, timeout=CONNECT_S).connect(_Once(protocol))
-        self._dialling.add(begun)
+        attempt = HostnameEndpoint(self._reactor, to.host, to.port, timeout=CONNECT_S).connect(_SingleFactory(protocol))
+        self._dialling.add(attempt)
 
-        def made(_: object) -> None:
-            self._dialling.discard(begun)
+        def on_connected(_: object) -> None:
+            self._dialling.discard(attempt)
             transport: Any = getattr(protocol, "transport", None)
             if transport is not None and hasattr(transport, "getHandle"):
-                _tuned(transport.getHandle())
+                _tune(transport.getHandle())
 
-        def lost(failure: Failure) -> None:
-            self._dialling.discard(begun)
+        def on_failed(failure: Failure) -> None:
+            self._dialling.discard(attempt)
             if failure.check(CancelledError) is None:
                 failed(failure.getErrorMessage())
 
-        begun.addCallbacks(made, lost)
+        attempt.addCallbacks(on_connected, on_failed)
 
     def strain(self, transport: Any) -> Strain | None:
-        """How the stream of a transport does, as Linux tells (``struct tcp_info``); None on other systems."""
+        """Return the state of a transport's stream from ``struct tcp_info``; None on systems other than Linux."""
         if sys.platform != "linux" or not hasattr(transport, "getHandle"):
             return None
         try:
             info = transport.getHandle().getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _INFO_BYTES)
         except OSError:
-            return None  # it was lost meanwhile
+            return None  # the connection was lost meanwhile
         if len(info) < _INFO_BYTES:
-            return None  # before Linux 4.6
+            return None  # Linux before 4.6
         segment, unacked = struct.unpack_from("=I4xI", info, 16)
         (repeated,) = struct.unpack_from("=I", info, 100)
         acked, unsent = struct.unpack_from("=Q16xI", info, 120)
         return Strain(unacked * segment + unsent, acked, repeated)
 
     def close(self) -> None:
-        """Be there no more, and dial no more."""
-        for begun in list(self._dialling):
-            begun.cancel()
+        """Stop listening and dialling."""
+        for attempt in list(self._dialling):
+            attempt.cancel()
         if self._port is not None:
             port, self._port = self._port, None
             self.closed = port.stopListening()
 
-    def _listening(self, accept: Accept) -> Any:
+    def _listen_on_families(self, accept: Accept) -> Any:
         if self._host == EVERYWHERE:
-            # One port for both families, where the machine has both.
+            # One port for both families, if the machine has both.
             with suppress(CannotListenError):
-                return self._reactor.listenTCP(self._wanted, _Door(accept), 128, "::")
-        return self._reactor.listenTCP(self._wanted, _Door(accept), 128, "" if self._host == EVERYWHERE else self._host)
+                return self._reactor.listenTCP(self._wanted, _AcceptFactory(accept), 128, "::")
+        return self._reactor.listenTCP(
+            self._wanted, _AcceptFactory(accept), 128, "" if self._host == EVERYWHERE else self._host
+        )
 
 
-class _Door(Factory):
+class _AcceptFactory(Factory):
     noisy = False
 
     def __init__(self, accept: Accept) -> None:
         self._accept = accept
 
     def buildProtocol(self, addr: Any) -> Any:
-        """The protocol for who comes from there, or None, and the connection is closed."""
+        """Return the protocol for the connecting host, or None to close the connection."""
         return self._accept(str(addr.host))
 
 
-class _Once(Factory):
+class _SingleFactory(Factory):
     noisy = False
 
     def __init__(self, protocol: IProtocol) -> None:
         self._protocol = protocol
 
     def buildProtocol(self, addr: Any) -> Any:
-        """The protocol that waits for its connection."""
+        """Return the protocol that waits for its connection."""
         return self._protocol
 
 
-def _tuned(stream: Any) -> None:
-    """Have the system hold back little of a stream, send it at once, and send what was lost again soon."""
+def _tune(stream: Any) -> None:
+    """Limit the send buffer of a stream, send without delay, and retransmit soon."""
     options = [(socket.TCP_NODELAY, 1)]
     if sys.platform == "linux":
         options += [(_NOTSENT_LOWAT, UNSENT), (_THIN_LINEAR_TIMEOUTS, 1), (_RTO_MAX_MS, LONGEST_WAIT_MS)]
     for option, value in options:
-        with suppress(OSError):  # it was lost meanwhile, or the system has no such option
+        with suppress(OSError):  # the connection was lost meanwhile, or the system does not have the option
             stream.setsockopt(socket.IPPROTO_TCP, option, value)

@@ -1,10 +1,10 @@
-"""Tunnel: a ``Network`` whose datagrams travel as WebSocket messages over TLS, where a firewall lets no UDP pass.
+"""Carry datagrams as WebSocket messages over TLS, for networks where a firewall blocks UDP.
 
-A node that serves one has a peer for each connection, a node that dials one for each URL that it was given; both are
-known by virtual addresses, ``~wss-`` and 12 hexadecimal digits, that mean nothing to anybody else.  A URL is dialled
-when something is sent to its address, and let go when nothing was carried for a while: who sends decides whether there
-is a tunnel.  Nobody is trusted for having come by one: the wire inside proves who is there, and TLS is here only
-because what is not TLS on port 443 may not get through.
+A serving node has a tunnel per client, a dialling node one per configured URL.  Both are identified by virtual
+addresses, ``~wss-`` and 12 hexadecimal digits, which are meaningless to other nodes.  A URL is dialled when a datagram
+is sent to its address, and closed after a time without traffic, so the sender controls its lifetime.  A tunnel
+authenticates no peer: the wire protocol inside does, and TLS is used only because other traffic on port 443 may be
+blocked.
 """
 
 from __future__ import annotations
@@ -32,40 +32,40 @@ from middleware.entangled.network.websocket import MAX_PAYLOAD, WebSocket
 
 LOOK_S = 1.0
 HEAD_S = 8.0
-"""From the connection on: TLS and the greeting of the WebSocket are complete by then."""
+"""The time in seconds from the connection to the end of the TLS and WebSocket handshakes."""
 DIALLED_S = 12.0
-"""The same for who dials, through a proxy perhaps."""
+"""The same for the dialling side, possibly through a proxy."""
 UNANSWERED_S = 10.0
-"""The wire answers nobody who lacks the team's key: to whom it said nothing for so long, that is no member."""
+"""The time in seconds without an answer after which a client is no member: the wire protocol answers only members."""
 UNUSED_S = 60.0
-"""A tunnel that carried nothing for so long is let go by who dialled it."""
+"""The time in seconds without traffic after which the dialling side closes a tunnel."""
 MAX_LINKS = 256
 MAX_BEGUN = 64
-"""Connections that are not open yet; beyond, the oldest goes."""
+"""The maximum number of connections that are not open yet; beyond it the oldest is closed."""
 MAX_OF_HOST = 32
-"""Connections of one address to which the node has sent nothing; of all, and a team behind one NAT shares one, as many
-as so many tunnels may have."""
+"""The maximum number of connections of one address to which the node has sent nothing.  Because a team behind one NAT
+shares an address, all its connections together may be as many as this number of tunnels has."""
 FIRST_HOLD_S, LAST_HOLD_S = 0.5, 10.0
-"""How long after it was dialled a URL that failed is left alone."""
+"""The delay in seconds before a URL that failed is dialled again: first and longest."""
 
 
 @dataclass(slots=True, eq=False)
-class _Way:
-    """One URL that may be dialled."""
+class _Target:
+    """A URL that may be dialled."""
 
     url: Url
     hold_s: float = FIRST_HOLD_S
     hold_until: float = float("-inf")
-    told: str = ""
+    last_failure: str = ""
 
 
 class TunnelNetwork:
-    """Tunnels to ``urls``, and from whoever dials this node where it ``is_served``.
+    """Tunnels to ``urls``, and from clients if ``is_served``.
 
-    With ``is_plain`` it is served without TLS, for a reverse proxy on the same machine, which names whom it speaks
-    for in ``X-Forwarded-For``. ``proxy_for`` says by which HTTP proxy a URL is dialled. ``counters`` counts
-    datagrams: sent, received, unsent (no such tunnel), dropped (no room); and links: opened, lost, refused (no
-    greeting of ours, or not in time), crowded.
+    With ``is_plain`` it is served without TLS, for a reverse proxy on the same machine, which sends the client's
+    address in ``X-Forwarded-For``.  ``proxy_for`` returns the HTTP proxy for a URL.  ``counters`` counts datagrams:
+    sent, received, unsent (no such tunnel), dropped (no room); and links: opened, lost, refused (no valid handshake, or
+    not in time), crowded.
     """
 
     _log = Logger()
@@ -84,7 +84,7 @@ class TunnelNetwork:
         self._carrier = carrier
         self._clock = clock
         self._rng = rng
-        self._ways = {url.address: _Way(url) for url in urls}
+        self._targets = {url.address: _Target(url) for url in urls}
         self._is_served = is_served
         self._is_plain = is_plain
         self._proxy_for = proxy_for
@@ -96,37 +96,37 @@ class TunnelNetwork:
 
     @property
     def address(self) -> Address:
-        """What stands for this end; nobody can be sent to it."""
+        """The address of this end; no datagram can be sent to it."""
         return Address(VIRTUAL + "0" * 12, 1)
 
     @property
     def detours(self) -> list[Address]:
         """The addresses of the URLs that may be dialled."""
-        return list(self._ways)
+        return list(self._targets)
 
     @property
     def peers(self) -> list[Address]:
-        """The addresses to which a tunnel is open."""
+        """The addresses of open tunnels."""
         return [address for address, bundle in self._bundles.items() if bundle.is_open]
 
     def listen(self, receiver: Receiver) -> None:
-        """Serve tunnels, if so wished, and hand each datagram to ``receiver``; raises ``PortInUse``."""
+        """Start serving, if configured, and pass each datagram to ``receiver``; raises ``PortInUse``."""
         if self._receiver is None and self._is_served:
             self._carrier.listen(self._accept)
         self._receiver = receiver
 
     def send(self, datagram: bytes, to: Address) -> None:
-        """Send a datagram; where there is no tunnel yet, it waits for one, or is lost."""
+        """Send a datagram; if its tunnel is being opened the datagram is queued, or lost."""
         bundle = self._bundles.get(to) or self._begin(to)
         if bundle is None or self._receiver is None or len(datagram) > MAX_PAYLOAD:
             self.counters["unsent"] += 1
             return
         now = self._clock.seconds()
         self.counters["sent" if bundle.send(datagram, now) else "dropped"] += 1
-        self._mend(bundle, now)
+        self._adjust_links(bundle, now)
 
     def close(self) -> None:
-        """End all tunnels; may be called twice."""
+        """Close all tunnels; may be called twice."""
         self._receiver = None
         self._carrier.close()
         for link in self._links:
@@ -140,9 +140,9 @@ class TunnelNetwork:
     # -- called by the links ----------------------------------------------------------------------------------------
 
     def link_open(self, link: Link) -> bool:
-        """Count a link that is open, unless too many came from there."""
-        if self._is_plain and link.address not in self._ways:
-            host = _neighbourhood(link.socket.forwarded) or link.host
+        """Register a link that is open, unless there are too many from its address."""
+        if self._is_plain and link.address not in self._targets:
+            host = _address_block(link.socket.forwarded) or link.host
             if link.socket.forwarded and self._is_crowded(host):
                 self.counters["crowded"] += 1
                 return False
@@ -151,15 +151,15 @@ class TunnelNetwork:
         now = self._clock.seconds()
         link.begun_at = now
         bundle = self._bundles[link.address]
-        if link.address not in self._ways:
+        if link.address not in self._targets:
             self._join(link, bundle, now)
         elif sum(each.is_open for each in bundle.links) == 1:
             bundle.carried_at = now
-            self._log.info("a tunnel to {url} is open", url=str(self._ways[link.address].url))
+            self._log.info("tunnel to {url} opened", url=str(self._targets[link.address].url))
         return True
 
     def link_said(self, link: Link, datagram: bytes) -> None:
-        """Hand on a datagram."""
+        """Pass a datagram to the receiver."""
         if self._receiver is not None:
             self.counters["received"] += 1
             bundle = self._bundles.get(link.address)
@@ -168,7 +168,7 @@ class TunnelNetwork:
             self._receiver(datagram, link.address)
 
     def link_over(self, link: Link, why: str) -> None:
-        """Forget a link; one that was dialled is left alone for a while."""
+        """Forget a link, and delay the next attempt if it was dialled."""
         now = self._clock.seconds()
         bundle = self._bundles.get(link.address)
         if bundle is not None:
@@ -180,19 +180,19 @@ class TunnelNetwork:
         if self._receiver is not None:
             self._ending.add(link)
         self.counters["lost" if link.socket.is_open else "refused"] += 1
-        way = self._ways.get(link.address)
-        if way is None or (bundle is not None and bundle.links):
+        target = self._targets.get(link.address)
+        if target is None or (bundle is not None and bundle.links):
             return
         if link.socket.is_open and now - link.begun_at > LAST_HOLD_S:
-            way.hold_s = FIRST_HOLD_S
-        # Counted from when it was dialled: what took long to fail has waited already.
-        way.hold_until = link.begun_at + way.hold_s * (0.75 + self._rng.random() / 2)
-        way.hold_s = min(2 * way.hold_s, LAST_HOLD_S)
-        if link.socket.is_open or way.told != why:
-            way.told = why
-            self._log.info("no tunnel to {url}: {why}", url=str(way.url), why=why)
+            target.hold_s = FIRST_HOLD_S
+        # Measured from the attempt: an attempt that took long to fail has waited already.
+        target.hold_until = link.begun_at + target.hold_s * (0.75 + self._rng.random() / 2)
+        target.hold_s = min(2 * target.hold_s, LAST_HOLD_S)
+        if link.socket.is_open or target.last_failure != why:
+            target.last_failure = why
+            self._log.info("tunnel to {url} is not available: {why}", url=str(target.url), why=why)
 
-    # -- inside -----------------------------------------------------------------------------------------------------
+    # -- private ----------------------------------------------------------------------------------------------------
 
     @cached_property
     def _client_context(self) -> ssl.SSLContext:
@@ -207,28 +207,28 @@ class TunnelNetwork:
         return [link for bundle in self._bundles.values() for link in bundle.links]
 
     def _begin(self, to: Address) -> Bundle | None:
-        """A tunnel to a URL, which has one connection at first."""
-        way, now = self._ways.get(to), self._clock.seconds()
-        if way is None or self._receiver is None or now < way.hold_until:
+        """Open a tunnel to a URL with one connection; return None if it may not be dialled now."""
+        target, now = self._targets.get(to), self._clock.seconds()
+        if target is None or self._receiver is None or now < target.hold_until:
             return None
         bundle = Bundle(to, self._carrier.strain, now)
         bundle.token = self._rng.randbytes(16)
-        self._dial(way, bundle)
+        self._dial(target, bundle)
         return self._bundles.get(to)
 
-    def _mend(self, bundle: Bundle, now: float) -> None:
-        """Have as many connections as the line asks for, of a tunnel that was dialled here."""
-        way = self._ways.get(bundle.address)
-        if way is None or len(bundle.links) == bundle.wanted(now) == 1:
+    def _adjust_links(self, bundle: Bundle, now: float) -> None:
+        """Adjust the number of connections of a dialled tunnel to its loss."""
+        target = self._targets.get(bundle.address)
+        if target is None or len(bundle.links) == bundle.wanted(now) == 1:
             return
         for link in bundle.dead(now):
             is_still = link.is_open and bundle.wanted(now) > 1
-            link.end("it stands still" if is_still else "one is enough", is_rude=is_still)
+            link.end("the connection stalled" if is_still else "one connection is enough", is_rude=is_still)
         while bundle.links and len(bundle.links) < bundle.wanted(now) and now >= bundle.hold_until:
-            self._dial(way, bundle)
+            self._dial(target, bundle)
 
     def _join(self, link: Link, bundle: Bundle, now: float) -> None:
-        """Let an accepted connection be of the tunnel that it names; the stillest makes room where there are enough."""
+        """Add an accepted connection to the tunnel that it names; if there are too many, close the most stalled."""
         token = link.socket.token
         if not token:
             return
@@ -240,10 +240,10 @@ class TunnelNetwork:
         link.address = whole.address
         whole.add(link)
         if len(whole.links) > MOST:
-            whole.stillest(now).end("newer ones of the same tunnel need its place", is_rude=True)
+            whole.stillest(now).end("replaced by a newer connection of the same tunnel", is_rude=True)
 
-    def _dial(self, way: _Way, bundle: Bundle) -> None:
-        url, proxy = way.url, self._proxy_for(way.url)
+    def _dial(self, target: _Target, bundle: Bundle) -> None:
+        url, proxy = target.url, self._proxy_for(target.url)
         layers: list[Layer] = []
         where = Address(url.host, url.port)
         if proxy is not None:
@@ -253,45 +253,45 @@ class TunnelNetwork:
         if url.is_tls:
             layers.append(Tls(self._client_context, url.host))
         socket = WebSocket(url, bundle.token)
-        link = self._kept(Link(self, self._clock, bundle.address, url.host, layers, socket), bundle)
+        link = self._register(Link(self, self._clock, bundle.address, url.host, layers, socket), bundle)
         self._carrier.dial(where, link, lambda why: link.end(why, is_rude=True))
 
     def _accept(self, host: str) -> Link | None:
-        """A link for who has dialled from ``host``; None where there is no room for it."""
-        place = _neighbourhood(host)
-        # All that a reverse proxy brings comes from one address: it is counted when it says for whom.
+        """Return a link for a client at ``host``; None if there is no room for it."""
+        place = _address_block(host)
+        # All clients of a reverse proxy share its address: they are counted when the proxy sends theirs.
         if self._receiver is None or (not self._is_plain and self._is_crowded(place)):
             self.counters["crowded"] += 1
             return None
-        served = [link for link in self._links if link.address not in self._ways]
+        served = [link for link in self._links if link.address not in self._targets]
         begun = [link for link in served if not link.is_open]
         unproved = [link for link in served if link.is_open and not self._bundles[link.address].is_answered]
         if len(begun) >= MAX_BEGUN:
-            begun[0].end("newer ones need its place", is_rude=True)
+            begun[0].end("replaced by a newer connection", is_rude=True)
         elif len(served) >= MAX_LINKS:
             further = [link for link in served if link is not self._bundles[link.address].links[0]]
             if not (begun or unproved or further):
                 self.counters["crowded"] += 1
                 return None
-            (begun or unproved or further)[0].end("newer ones need its place", is_rude=True)
+            (begun or unproved or further)[0].end("replaced by a newer connection", is_rude=True)
         address = Address(VIRTUAL + self._rng.randbytes(6).hex(), 1)
         layers = [] if self._is_plain else [Tls(self._server_context, is_server=True)]
         bundle = Bundle(address, self._carrier.strain, self._clock.seconds())
-        return self._kept(Link(self, self._clock, address, place, layers, WebSocket()), bundle)
+        return self._register(Link(self, self._clock, address, place, layers, WebSocket()), bundle)
 
-    def _kept(self, link: Link, bundle: Bundle) -> Link:
+    def _register(self, link: Link, bundle: Bundle) -> Link:
         self._bundles[link.address] = bundle
         bundle.add(link)
         if self._timer is None:
-            self._timer = self._clock.callLater(LOOK_S, self._look)
+            self._timer = self._clock.callLater(LOOK_S, self._check_links)
         return link
 
     def _is_crowded(self, host: str) -> bool:
-        """Whether so many connections of one address are borne that another one is not."""
+        """Return whether there are too many connections of one address for another one."""
         there = [self._bundles[link.address] for link in self._links if link.host == host]
         return len(there) >= MOST * MAX_OF_HOST or sum(not each.is_answered for each in there) >= MAX_OF_HOST
 
-    def _look(self) -> None:
+    def _check_links(self) -> None:
         now = self._clock.seconds()
         self._timer = None
         self._ending = {link for link in self._ending if link.is_closing}
@@ -299,24 +299,24 @@ class TunnelNetwork:
             bundle = self._bundles.get(link.address)
             if bundle is None or link.is_over:
                 continue
-            is_ours, age = link.address in self._ways, now - link.begun_at
+            is_ours, age = link.address in self._targets, now - link.begun_at
             if not link.is_open:
                 if age > (DIALLED_S if is_ours else HEAD_S):
-                    link.end("no greeting in time", is_rude=True)
+                    link.end("the handshake timed out", is_rude=True)
             elif is_ours and now - bundle.carried_at > UNUSED_S:
-                link.end("nobody has used it for a while")
+                link.end("the tunnel is idle")
             elif not is_ours and not bundle.is_answered and age > UNANSWERED_S:
-                link.end("no member of this team")
+                link.end("the client is not a member of this team")
             else:
                 link.look(now)
         for bundle in list(self._bundles.values()):
-            self._mend(bundle, now)
+            self._adjust_links(bundle, now)
         if self._bundles or self._ending:
-            self._timer = self._clock.callLater(LOOK_S, self._look)
+            self._timer = self._clock.callLater(LOOK_S, self._check_links)
 
 
-def _neighbourhood(host: str) -> str:
-    """Who counts as one: an IPv4 address, or the 64 bits of IPv6 of which one household has all; or nobody, ""."""
+def _address_block(host: str) -> str:
+    """Return the unit of rate limits: an IPv4 address, or the /64 prefix of an IPv6 address; "" for any other text."""
     try:
         ip = ip_address(host)
     except ValueError:

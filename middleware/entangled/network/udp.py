@@ -1,4 +1,4 @@
-"""Udp: a ``Network`` over real UDP ports of Twisted."""
+"""Implement ``Network`` over UDP with Twisted."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ from middleware.entangled.errors import PortInUse
 from middleware.entangled.network.interface import interfaces, is_any
 from middleware.entangled.network.network import EVERYWHERE, MAX_CARRIED, MAX_LED, Address, Receiver
 
-# Bursts come in faster than Python reads: the usual 208 KiB hold 160 full datagrams, this holds five times as many.
+# Bursts arrive faster than Python reads: the usual 208 KiB hold 160 full datagrams, this buffer five times as many.
 RECEIVE_BUFFER = 1 << 20
 ROUTE_S = 5.0
-"""Seconds for which what the system said of a way holds: addresses of a laptop change as it moves."""
+"""The seconds for which routes and addresses are cached: they change when a laptop moves."""
 _PAIRS = 8
 
 
 class UdpNetwork:
-    """One UDP port at ``host`` and ``port`` (0: any free one), and further ones that are opened on the way.
+    """One UDP port at ``host`` and ``port`` (0: any free one), and additional ones that are opened later.
 
     ``host`` is an IP address ("0.0.0.0" or "::" for every interface of one family), or ``EVERYWHERE`` for every
-    interface of both families; where the machine has no IPv6, of the other one.
+    interface of both families; IPv6 is omitted on machines without it.
 
-    ``counters`` counts the datagrams that were sent, received, unsent (no route, no such address, full buffer) and
-    oversized.  ``closed`` fires when every port is really free again.
+    ``counters`` counts the datagrams that were sent, received, unsent (no route, invalid address, full buffer) and
+    oversized.  ``closed`` fires when every port is closed.
     """
 
     _log = Logger()
@@ -49,19 +49,19 @@ class UdpNetwork:
         self._number = port
         self._receiver: Receiver | None = None
         self._ports: dict[tuple[int, bool], Any] = {}
-        self._led: dict[Address, int] = {}
+        self._port_by_target: dict[Address, int] = {}
         self._locals: dict[str, tuple[str, float]] = {}
         self._hosts: list[str] = []
         self._hosts_at = -math.inf
 
     @property
     def address(self) -> Address:
-        """The node's own address; the port is known once ``listen`` was called."""
+        """The node's address; the port is known after ``listen``."""
         host = self._cached("", self._own_host) if is_any(self._host) else self._host
         return Address(host, self._number)
 
     def listen(self, receiver: Receiver) -> None:
-        """Open the port and hand each datagram to ``receiver``; raises ``PortInUse`` where that cannot be."""
+        """Open the port and pass each datagram to ``receiver``; raises ``PortInUse`` if that fails."""
         if self._ports:
             return
         self._receiver = receiver
@@ -71,29 +71,29 @@ class UdpNetwork:
         for left in reversed(range(1 if self._wanted else _PAIRS)):
             self._number = self._open(0, "0.0.0.0", self._wanted)
             try:
-                self._open_six(self._number)
+                self._open_ipv6(self._number)
                 return
-            except PortInUse:  # any port will do where none is wanted, but the same one in both families
+            except PortInUse:  # without a configured port any will do, but it must be the same in both families
                 self._shut(0)
                 if not left:
                     raise
 
     def send(self, datagram: bytes, to: Address) -> None:
-        """Send at most ``MAX_CARRIED`` bytes; what cannot be sent is counted and lost."""
+        """Send at most ``MAX_CARRIED`` bytes; a datagram that cannot be sent is counted and lost."""
         if len(datagram) > MAX_CARRIED:
             self.counters["oversized"] += 1
             return
         is_six = ":" in to.host
-        number = self._led.get(to, 0) if self._led else 0
+        number = self._port_by_target.get(to, 0) if self._port_by_target else 0
         port = self._ports.get((number, is_six)) or self._ports.get((0, is_six))
-        # The address comes from a peer: the system would look up what is no IP, and wait for the answer.
+        # The address comes from a peer: the system would resolve a name and block until the answer.
         if port is None or not _is_ip(to.host):
             self.counters["unsent"] += 1
             return
         try:
-            # Past the port's own ``write``, which checks the address anew each time: half of what a send costs.
+            # Bypasses the port's ``write``, which checks the address each time, at half of the cost of a send.
             port.socket.sendto(datagram, to)
-        # Ports out of range and a full buffer each raise something else.
+        # Invalid port numbers and a full buffer each raise another type.
         except (OSError, ValueError, OverflowError, TypeError):
             self.counters["unsent"] += 1
         else:
@@ -104,13 +104,13 @@ class UdpNetwork:
         if self._ports:
             ports, self._ports = list(self._ports.values()), {}
             self._receiver = None
-            self._led.clear()
+            self._port_by_target.clear()
             self.closed = gatherResults([maybeDeferred(port.stopListening) for port in ports])
 
-    # -- further ports ----------------------------------------------------------------------------------------------
+    # -- additional ports -------------------------------------------------------------------------------------------
 
     def open_port(self) -> int:
-        """A further local port, for IPv4 where that is spoken; 0 where there is none to be had."""
+        """Open an additional local port, with IPv4 if enabled, and return it; 0 if that fails."""
         if not self._ports:
             return 0
         host = "0.0.0.0" if self._host == EVERYWHERE else self._host
@@ -120,26 +120,26 @@ class UdpNetwork:
             return 0
 
     def shut_port(self, port: int) -> None:
-        """Close a further port."""
+        """Close an additional port."""
         if port:
-            self._led = {to: number for to, number in self._led.items() if number != port}
+            self._port_by_target = {to: number for to, number in self._port_by_target.items() if number != port}
             self._shut(port)
 
     def lead(self, to: Address, port: int) -> int:
-        """Let what goes to ``to`` leave by ``port``; 0: by the first one."""
-        before = self._led.get(to, 0)
-        keep(self._led, to, port, MAX_LED)
+        """Assign ``port`` to the target ``to``; 0 is the listening port."""
+        before = self._port_by_target.get(to, 0)
+        keep(self._port_by_target, to, port, MAX_LED)
         return before
 
     def local(self, to: Address, port: int = 0) -> Address:
-        """The address of this machine from which a datagram to ``to`` leaves."""
+        """Return the local source address of datagrams to ``to``."""
         host = self._host
         if is_any(host):
             host = self._cached(to.host, lambda: _route(to.host)) or self.address.host
-        return Address(host, port or self._led.get(to, 0) or self._number)
+        return Address(host, port or self._port_by_target.get(to, 0) or self._number)
 
     def hosts(self) -> list[str]:
-        """The addresses of this machine at which it hears, asked anew after ``ROUTE_S``."""
+        """Return the addresses of this machine at which it listens, cached for ``ROUTE_S``."""
         if not is_any(self._host):
             return [self._host]
         now = self._reactor.seconds()
@@ -148,35 +148,35 @@ class UdpNetwork:
         families = {is_six for _, is_six in self._ports}
         return [host for host in self._hosts if (":" in host) in families]
 
-    # -- inside -----------------------------------------------------------------------------------------------------
+    # -- private ----------------------------------------------------------------------------------------------------
 
     def _open(self, number: int | None, host: str, wanted: int) -> int:
-        """Open a port that is known by ``number``, else by its own; gives its own."""
+        """Open a port under the key ``number``, or under its port number if None; return its port number."""
         protocol = _Protocol(self, number or 0)
         try:
-            # One byte more than may come, so that what is too large is seen to be.
+            # One byte more than the maximum, to detect oversized datagrams.
             port = self._reactor.listenUDP(wanted, protocol, host, MAX_CARRIED + 1)
         except CannotListenError as error:
-            raise _in_use(host, wanted, error.socketError) from error
+            raise _port_in_use(host, wanted, error.socketError) from error
         own: int = port.getHost().port
         protocol.number = own if number is None else number
         self._keep(port, protocol.number, ":" in host)
         return own
 
-    def _open_six(self, wanted: int) -> None:
-        """Open the IPv6 port beside that of IPv4; Twisted alone would open one that takes both."""
+    def _open_ipv6(self, wanted: int) -> None:
+        """Open the IPv6 port next to the IPv4 one; Twisted would open one that receives both."""
         try:
-            with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as six:
-                six.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
-                six.setblocking(False)
-                six.bind(("::", wanted))
+            with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as sock:
+                sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
+                sock.setblocking(False)
+                sock.bind(("::", wanted))
                 port = self._reactor.adoptDatagramPort(
-                    six.fileno(), socket.AF_INET6, _Protocol(self, 0), MAX_CARRIED + 1
+                    sock.fileno(), socket.AF_INET6, _Protocol(self, 0), MAX_CARRIED + 1
                 )
         except OSError as error:
             if error.errno == errno.EADDRINUSE:
-                raise _in_use("::", wanted, error) from error
-            self._log.info("no IPv6 on this machine: {error}", error=error)
+                raise _port_in_use("::", wanted, error) from error
+            self._log.info("IPv6 is not available on this machine: {error}", error=error)
         else:
             self._keep(port, 0, True)
 
@@ -185,7 +185,7 @@ class UdpNetwork:
         try:
             port.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
         except OSError as error:
-            self._log.debug("the receive buffer stays as it is: {error}", error=error)
+            self._log.debug("cannot enlarge the receive buffer: {error}", error=error)
 
     def _shut(self, number: int) -> None:
         for is_six in (False, True):
@@ -194,13 +194,13 @@ class UdpNetwork:
                 maybeDeferred(port.stopListening)
 
     def _own_host(self) -> str:
-        # Anything beyond this machine will do: nothing is sent there (RFC 5737 and 3849).
+        # Any address outside this machine will do, because nothing is sent there (RFC 5737 and 3849).
         six = self._host == "::"
         own = [host for host in _own_hosts() if (":" in host) == six]
         return _route("2001:db8::1" if six else "192.0.2.1") or next(iter(own), "::1" if six else "127.0.0.1")
 
     def _cached(self, host: str, ask: Callable[[], str]) -> str:
-        """What the system says of the way to ``host``, asked again after ``ROUTE_S``."""
+        """Return a cached route to ``host``, calling ``ask`` again after ``ROUTE_S``."""
         found, asked_at = self._locals.get(host, ("", -math.inf))
         now = self._reactor.seconds()
         if now - asked_at > ROUTE_S:
@@ -210,37 +210,37 @@ class UdpNetwork:
             self._locals[host] = found, now
         return found
 
-    def _came(self, datagram: bytes, source: Address, number: int) -> None:
+    def _receive(self, datagram: bytes, source: Address, number: int) -> None:
         if len(datagram) > MAX_CARRIED:
             self.counters["oversized"] += 1
             return
         self.counters["received"] += 1
-        if number and source not in self._led:
+        if number and source not in self._port_by_target:
             self.lead(source, number)
         if self._receiver is not None:
             self._receiver(datagram, source)
 
 
-def _in_use(host: str, port: int, trouble: Any) -> PortInUse:
-    why = getattr(trouble, "strerror", None) or trouble
-    is_foreign = getattr(trouble, "errno", None) == errno.EADDRNOTAVAIL
+def _port_in_use(host: str, port: int, error: Any) -> PortInUse:
+    reason = getattr(error, "strerror", None) or error
+    is_foreign = getattr(error, "errno", None) == errno.EADDRNOTAVAIL
     remedy = "give host an address of this machine" if is_foreign else "choose another port, or 0 for any"
-    return PortInUse(f"UDP {host}:{port}: {why}; {remedy}")
+    return PortInUse(f"UDP {host}:{port}: {reason}; {remedy}")
 
 
 def _own_hosts() -> list[str]:
-    """The addresses of this machine that others may reach: not those of its loopback or of one link alone."""
+    """Return the addresses of this machine that other nodes may reach: no loopback or link-local ones."""
     found = [host for interface in interfaces() if not interface.is_loopback for host in interface.addresses]
     return sorted(found, key=lambda host: ":" in host)
 
 
 def _route(host: str) -> str:
-    """The own address from which the system would write to ``host``; empty where it has no way there."""
+    """Return the local source address for ``host``; empty if there is no route."""
     if not _is_ip(host):
         return ""
     try:
         with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            probe.connect((host, 9))  # sends nothing: it only asks for the way
+            probe.connect((host, 9))  # sends nothing: it only looks up the route
             return str(probe.getsockname()[0])
     except OSError:
         return ""
@@ -252,15 +252,15 @@ def _is_ip(host: str) -> bool:
 
 
 class _Protocol(DatagramProtocol):
-    """Hands on what comes in at one port, which its network knows by ``number``."""
+    """Passes on the datagrams of one port, with the key ``number`` of its network."""
 
     def __init__(self, network: UdpNetwork, number: int) -> None:
         self._network = network
         self.number = number
 
     def datagramReceived(self, datagram: bytes, addr: Any) -> None:
-        """Hand a datagram on."""
-        self._network._came(datagram, Address(addr[0], addr[1]), self.number)
+        """Pass a datagram to the network."""
+        self._network._receive(datagram, Address(addr[0], addr[1]), self.number)
 
     def connectionRefused(self) -> None:
-        """Ignore the ICMP message: anybody may forge one, and time-outs tell the same."""
+        """Ignore the ICMP message, because it may be forged, and timeouts detect the same failure."""

@@ -1,4 +1,4 @@
-"""Url: where a tunnel begins, ``wss://host:443/swarm`` or, inside one machine, ``ws://127.0.0.1:8000/swarm``.  Pure."""
+"""Parse tunnel URLs, ``wss://host:443/swarm`` or, within one machine, ``ws://127.0.0.1:8000/swarm``, and proxies."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from middleware.entangled.network.network import Address
 PATH = "/swarm"
 USUAL_PORTS = {"wss": 443, "ws": 80}
 VIRTUAL = "~wss-"
-"""How the addresses of tunnels begin, at both ends."""
+"""The prefix of the virtual addresses of tunnels, at both ends."""
 _FORM = re.compile(r"(wss?)://(\[[0-9a-fA-F:.]{2,45}\]|[A-Za-z0-9._-]{1,253})(?::([0-9]{1,5}))?(/[!-~]{0,200})?")
 
 
 class Url(NamedTuple):
-    """The parts of an address on the web; ``ws`` goes without TLS."""
+    """The parts of a tunnel URL; ``ws`` is without TLS."""
 
     scheme: str
     host: str
@@ -26,7 +26,7 @@ class Url(NamedTuple):
 
     @classmethod
     def of(cls, text: str) -> Url:
-        """The parts of ``text``; raises ``ValueError`` where it is none."""
+        """Parse a URL; raise ``ValueError`` if it is invalid."""
         found = _FORM.fullmatch(text)
         port = int(found[3] or USUAL_PORTS[found[1]]) if found else 0
         if found is None or not 0 < port < 65536:
@@ -35,18 +35,18 @@ class Url(NamedTuple):
 
     @property
     def is_tls(self) -> bool:
-        """Whether it goes over TLS."""
+        """Whether it uses TLS."""
         return self.scheme == "wss"
 
     @property
     def authority(self) -> str:
-        """Host and port, as HTTP writes them; a usual port is left out, as browsers do."""
+        """Host and port as in HTTP; a default port is omitted, as browsers do."""
         host = f"[{self.host}]" if ":" in self.host else self.host
         return host if self.port == USUAL_PORTS[self.scheme] else f"{host}:{self.port}"
 
     @property
     def address(self) -> Address:
-        """The virtual address of the node at its other end."""
+        """The virtual address of the node that serves the URL."""
         return Address(VIRTUAL + hashlib.blake2s(str(self).encode(), digest_size=6).hexdigest(), 1)
 
     def __str__(self) -> str:
@@ -54,7 +54,7 @@ class Url(NamedTuple):
 
 
 class Proxy(NamedTuple):
-    """An HTTP proxy that opens streams for others; ``login`` is ``user:password``."""
+    """An HTTP proxy with support for CONNECT; ``login`` is ``user:password``."""
 
     host: str
     port: int
@@ -62,7 +62,7 @@ class Proxy(NamedTuple):
 
     @classmethod
     def of(cls, text: str) -> Proxy:
-        """What the environment variable ``https_proxy`` says; raises ``ValueError`` where it is no proxy of ours."""
+        """Parse the environment variable ``https_proxy``; raise ``ValueError`` if it is invalid."""
         found = re.fullmatch(r"(?:http://)?(?:([^@/]+)@)?(\[[0-9a-fA-F:.]+\]|[^:@/\[\]]+)(?::([0-9]{1,5}))?/?", text)
         port = int(found[3] or 3128) if found else 0
         if found is None or not 0 < port < 65536:

@@ -1,4 +1,4 @@
-"""Websocket: datagrams as binary messages, for both ends: no text, no message longer than a datagram."""
+"""Exchange datagrams as binary WebSocket messages; text and messages longer than a datagram are errors."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from middleware.entangled.network.url import PATH, Url
 
 SUBPROTOCOL = "swarm-tunnel-1"
 TOKEN = "X-Swarm-Tunnel"
-"""The field of a request by which connections of one tunnel are known: 32 hexadecimal digits that nobody guesses."""
+"""The header field that identifies the connections of one tunnel: 32 random hexadecimal digits."""
 MAX_PAYLOAD = 2048
-"""Bytes of a message; datagrams are shorter."""
+"""The maximum length of a message in bytes; datagrams are shorter."""
 
 
 class WebSocket(End):
-    """One end of a tunnel: the client's where ``url`` is given."""
+    """One end of a tunnel connection; the client if ``url`` is given."""
 
     def __init__(self, url: Url | None = None, token: bytes = b"") -> None:
         request = None
@@ -26,9 +26,9 @@ class WebSocket(End):
             request = Request(url.authority, url.path, extra_headers=named, subprotocols=[SUBPROTOCOL])
         super().__init__(MAX_PAYLOAD, request, takes_text=False)
         self.forwarded = ""
-        """Whom a proxy before the server says that it speaks for, as it stands in its request."""
+        """The last address in ``X-Forwarded-For``, which a reverse proxy in front of the server adds."""
         self.token = token
-        """What the client named its tunnel."""
+        """The client's identifier of its tunnel."""
 
     def _answer(self, request: Request) -> AcceptConnection | RejectConnection:
         fields = dict(request.extra_headers)
@@ -43,7 +43,11 @@ class WebSocket(End):
 
     def _fault_of(self, answer: AcceptConnection | RejectConnection | Exception) -> str:
         if isinstance(answer, Exception):
-            return f"no tunnel begins there, or a proxy in between answers: {answer.__context__ or answer}"
+            return f"the server does not serve a tunnel, or a proxy in between answered: {answer.__context__ or answer}"
         if isinstance(answer, RejectConnection):
-            return f"no tunnel begins there, but HTTP status {answer.status_code}"
-        return "" if answer.subprotocol == SUBPROTOCOL else f"a WebSocket begins there, but no {SUBPROTOCOL}"
+            return f"the server does not serve a tunnel at this path; it answered with HTTP status {answer.status_code}"
+        return (
+            ""
+            if answer.subprotocol == SUBPROTOCOL
+            else f"the server accepts WebSockets, but not the subprotocol {SUBPROTOCOL}"
+        )

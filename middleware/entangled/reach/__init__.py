@@ -1,1 +1,1 @@
-"""Reach: how a node is reached that is not where others see it: introduced, or carried to by others."""
+"""NAT traversal: introductions with hole punching, relays, and the external address of a node."""

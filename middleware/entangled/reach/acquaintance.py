@@ -1,4 +1,4 @@
-"""Acquaintance: a peer that may know how another one is reached, and is asked for an introduction."""
+"""Select the peers to ask for an introduction to another peer."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from middleware.entangled.reach.outside import Outside
 from middleware.entangled.wire.peer import Peers
 
 HELPERS = 3
-"""Peers that are asked at the same time how another one is reached."""
+"""The number of peers that are asked at the same time for an introduction."""
 MAX_NAMERS = 3
-"""Peers of which is kept that they named the same node."""
+"""The number of peers remembered as having named the same node."""
 
 
 class Acquaintances:
-    """Whom a node asks about others, and who named whom.
+    """The peers that may introduce this node, and the ones that named each contact.
 
-    ``contacts`` gives the peers that are known; ``bootstraps`` are addresses of nodes that are asked rather than
-    others.  ``rng`` gives dice when they are needed.
+    ``contacts`` returns the known contacts; ``bootstraps`` are addresses of nodes that are asked first.  ``rng``
+    returns the random generator when it is needed.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class Acquaintances:
         return len(self._namers)
 
     def named(self, contact: Contact, by: Contact) -> None:
-        """Keep in mind that the peer ``by`` named ``contact``: it may know how to reach it."""
+        """Remember that the peer ``by`` named ``contact``, and so may know a path to it."""
         if not self._outside.is_far(contact.address):
             return
         namers = self._namers.pop(contact.node_id, None) or {}
@@ -60,9 +60,10 @@ class Acquaintances:
         keep(self._namers, contact.node_id, namers, MAX_KNOWN)
 
     def helpers(self, wanted: bytes, hinted: Collection[Contact], asked: Collection[bytes]) -> list[Contact]:
-        """Whom to ask about the node of that id, but for those that were ``asked``.
+        """Return the peers to ask about the node with that id, without the ones in ``asked``.
 
-        They are those that others ``hinted`` at, who named it or carries to it, bootstraps, then anybody.
+        First are the peers in ``hinted``, then the ones that named the node or relay to it, bootstrap nodes, and
+        others.
         """
         now = self._clock.seconds()
         first = [*hinted]

@@ -1,6 +1,6 @@
-"""Candidate: an address at which a peer may be reached, and which of those that others name are worth a try.
+"""Encode, decode and filter candidates: addresses at which a peer may be reachable.
 
-Pure.  Whoever names an address makes us send to it, so what no peer can have is dropped: groups, everybody, nobody.
+A named address causes this node to send there, so multicast, broadcast and unspecified ones are dropped.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import NamedTuple
 from middleware.entangled.network.network import Address
 
 MAX_CANDIDATES = 6
-"""Addresses of one node in a message."""
+"""The maximum number of addresses of one node in a message."""
 _SMALL = 24
 _OF_A_SITE: tuple[tuple[IPv4Network | IPv6Network, int], ...] = (
     (IPv4Network("10.0.0.0/8"), 16),
@@ -23,16 +23,17 @@ _OF_A_SITE: tuple[tuple[IPv4Network | IPv6Network, int], ...] = (
     (IPv6Network("fc00::/7"), 48),
     (IPv6Network("fe80::/10"), 10),
 )
-"""What RFC 1918, 3927, 4193 and 4291 keep for one site or link, and how many bits two neighbours share at least."""
+"""The ranges that RFC 1918, 3927, 4193 and 4291 reserve for one site or link, and the prefix length that two neighbours
+share at least."""
 
 
 def packed(addresses: Iterable[Address]) -> list[object]:
-    """Addresses as they stand in a message, each once."""
+    """Encode addresses for a message, each once."""
     return [[address.host, address.port] for address in list(dict.fromkeys(addresses))[:MAX_CANDIDATES]]
 
 
 def unpacked(fields: object) -> list[Address]:
-    """The addresses in a message; those that no peer can have, or that are none, are left out."""
+    """Decode the addresses in a message; impossible and invalid ones are skipped."""
     found: dict[Address, None] = {}
     for pair in fields[:MAX_CANDIDATES] if isinstance(fields, list) else ():
         if not (isinstance(pair, list) and len(pair) == 2):
@@ -44,7 +45,7 @@ def unpacked(fields: object) -> list[Address]:
 
 
 def is_possible(address: Address) -> bool:
-    """Whether a peer can have this address; names, groups and the address that stands for any are none."""
+    """Return whether a peer can have this address; names, multicast and unspecified addresses are excluded."""
     ip = _ip(address.host)
     if ip is None or not 0 < address.port < 65536:
         return False
@@ -52,16 +53,16 @@ def is_possible(address: Address) -> bool:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only this machine is reached there."""
+    """Return whether the host is a loopback address."""
     ip = _ip(host)
     return ip is not None and ip.is_loopback
 
 
 def is_near(host: str, own: str, is_translated: bool = False) -> bool:
-    """Whether nothing translates between ``host`` and ``own``: one machine, or neighbours in a site's own network.
+    """Return whether no NAT is between ``host`` and ``own``: they are one machine, or neighbours in a private network.
 
-    A node that ``is_translated`` by a router sits in a small network inside of a larger one, which may look the same:
-    there only those count whose addresses differ in the last byte alone.
+    The private network of a node that ``is_translated`` by a router is small and may be part of a larger one with the
+    same range: there only addresses that differ in the last byte are neighbours.
     """
     one, other = _place(host), _place(own)
     if one is None or other is None or one.version != other.version:
@@ -75,7 +76,7 @@ def is_near(host: str, own: str, is_translated: bool = False) -> bool:
 
 
 class _Place(NamedTuple):
-    """An address as a number, and which of ``_OF_A_SITE`` it is in (with 0 ``bits``: in none)."""
+    """An address as a number, and the index of its range in ``_OF_A_SITE`` (with 0 ``bits``: in none)."""
 
     version: int
     number: int

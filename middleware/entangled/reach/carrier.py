@@ -1,6 +1,6 @@
-"""Carrier: who carries to nodes that this one does not reach itself.
+"""Send datagrams through relays to nodes that this one cannot reach directly.
 
-CARRY asks a carrier to hand a datagram on (``relay`` is its side of that), and CARRIED brings what others sent so.
+CARRY asks a relay to forward a datagram (``relay`` is the other side), and CARRIED delivers a forwarded datagram.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from middleware.entangled.wire.endpoint import Endpoint
 from middleware.entangled.wire.session import Session
 
 MAX_CARRIERS = 3
-"""Peers of which is kept that they carry to the same node."""
+"""The number of relays remembered for the same node."""
 
 
 class Carriers:
-    """The peers that carry to each node, by its id, and what goes by them."""
+    """The relays to each node, by its id, and the datagrams through them."""
 
     def __init__(self, own_id: bytes, endpoint: Endpoint, paths: PathNetwork, clock: IReactorTime) -> None:
         self._own_id = own_id
@@ -35,7 +35,7 @@ class Carriers:
         return len(self._carriers)
 
     def note(self, to: bytes, carrier: bytes) -> None:
-        """Take note that somebody carries to the node of that id."""
+        """Record that a peer relays to the node with that id."""
         carriers = self._carriers.pop(to, None) or {}
         carriers[carrier] = self._clock.seconds()
         if len(carriers) > MAX_CARRIERS:
@@ -43,16 +43,16 @@ class Carriers:
         keep(self._carriers, to, carriers, MAX_KNOWN)
 
     def of(self, to: bytes) -> list[bytes]:
-        """The public keys of those who carry to the node of that id."""
+        """Return the public keys of the relays to the node with that id."""
         return list(self._carriers.get(to, ()))
 
     def contacts(self, to: bytes) -> list[Contact]:
-        """Those of them whom this node reaches directly."""
+        """Return the relays to that node that this node reaches directly."""
         sessions = [self._endpoint.peers.direct_session(public) for public in self.of(to)]
         return [session.contact for session in sessions if session is not None]
 
     def session(self, to: bytes) -> Session | None:
-        """The direct session with who was last known to carry to the node of that id."""
+        """Return the direct session with the latest known relay to the node with that id."""
         carriers = self._carriers.get(to, {})
         for public in sorted(carriers, key=lambda public: -carriers[public]):
             session = self._endpoint.peers.direct_session(public)
@@ -61,7 +61,7 @@ class Carriers:
         return None
 
     def carry(self, datagram: bytes, to: Address) -> None:
-        """Have a datagram carried to the node for which that address stands; it is lost where nobody does."""
+        """Send a datagram through a relay to the node with that virtual address; it is lost if there is no relay."""
         target = _id_in(to)
         carrier = self.session(target) if target else None
         if carrier is None:
@@ -70,7 +70,7 @@ class Carriers:
             self._endpoint.send_inside(carrier, bytes([CARRY]) + target + datagram)
 
     def on_carried(self, session: Session, plain: bytes, source: Address) -> None:
-        """Take what the peer of ``session`` carried here."""
+        """Process a datagram that the peer of ``session`` relayed to this node."""
         inner, sender = plain[HEAD:], plain[1:HEAD]
         if not inner or is_relayed(session.contact.address) or sender == self._own_id:
             self._endpoint.counters["malformed"] += 1

@@ -1,6 +1,6 @@
-"""Introducer: the third, who tells each of two peers where it sees the other, so that they knock at the same time.
+"""Introduce two peers: send each the other's addresses, so that both send INITs at the same time (hole punching).
 
-``Allowance`` says how often a peer may have this node introduce it, and make it knock at others.
+``Allowance`` limits the rate at which a peer may request introductions, and cause this node to send INITs to others.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from middleware.entangled.token_bucket import TokenBucket
 from middleware.entangled.wire.endpoint import Endpoint
 
 USUAL = 0
-"""The order in which two knock at their usual ports; in all others they do so at fresh ones."""
+"""The order in which both peers send from their usual ports; in all other orders they use additional ports."""
 ASKED_S = 1.0
-"""Seconds for which an answer is waited for."""
+"""The timeout of a request in seconds."""
 INTRODUCTIONS = 20.0
-"""Times in a second, and at once twice as often, that one peer may have this node introduce it."""
+"""The introductions per second that one peer may request; twice as many in one burst."""
 MEETS, MEETS_AT_ONCE = 1.0, 60.0
-"""Times in a second, and at once, that one peer may make this node knock where nobody answers.  Who is met does not
-count; so a member that names addresses of strangers gets 0.2 MB/s sent there by this node, and a team that starts
-behind routers none the less meets in a moment."""
+"""The attempts per second, and in one burst, that one peer may cause this node to make to nodes that do not answer.
+Successful ones do not count.  So a member that names addresses of strangers causes 0.2 MB/s there from this node, and a
+team that starts behind routers still connects quickly."""
 
 
 class Allowance:
-    """What is left to each peer, and who introduced whom."""
+    """The rate limit of each peer, and the introducer of each peer."""
 
     def __init__(self, clock: IReactorTime) -> None:
         self._clock = clock
@@ -43,19 +43,19 @@ class Allowance:
         return len(self._buckets)
 
     def may_introduce(self, asker: bytes) -> bool:
-        """Whether that peer may have this node introduce it once more; then this is counted."""
+        """Return whether that peer may request another introduction, and count it."""
         return self._may("introduce", asker, INTRODUCTIONS, 2 * INTRODUCTIONS)
 
     def may_meet(self, introducer: bytes) -> bool:
-        """Whether that peer may make this node knock once more; then this is counted."""
+        """Return whether that peer may cause another attempt of this node, and count it."""
         return self._may("meet", introducer, MEETS, MEETS_AT_ONCE)
 
     def introduced(self, public: bytes, introducer: bytes) -> None:
-        """Take note of who makes this node knock at a peer."""
+        """Record the introducer of a peer."""
         keep(self._introducers, public, introducer, MAX_KNOWN)
 
     def met(self, public: bytes) -> None:
-        """Give back to who introduced a peer what this cost: it has answered."""
+        """Refund the attempt to its introducer, because the peer has answered."""
         bucket = self._buckets.get(("meet", self._introducers.pop(public, b"")))
         if bucket is not None:
             bucket.give()
@@ -68,7 +68,7 @@ class Allowance:
 
 
 class Introducer:
-    """Introduces peers to each other, as often as the ``allowance`` says; ``relay`` would carry for them."""
+    """Introduces peers to each other, within the ``allowance``; ``relay`` forwards for them if there is room."""
 
     def __init__(
         self,
@@ -89,9 +89,9 @@ class Introducer:
     async def answer_introduce(
         self, peer: Contact, wanted: bytes, candidates: list[object], order: int
     ) -> list[object] | None:
-        """REACH.INTRODUCE: tell the node of that id where ``peer`` is, and ``peer`` where it is; nil: not known."""
+        """REACH.INTRODUCE: send the addresses of ``peer`` to the node with that id, return its; nil: unknown node."""
         if len(wanted) != ID_BYTES or not self._allowance.may_introduce(peer.public):
-            raise Refused("no introduction: that is no id, or too many are wanted")
+            raise Refused("no introduction: the node id is invalid, or the rate limit is exceeded")
         session = self._known.session(wanted)
         if session is None or self._clock.seconds() - session.heard_at > LIVELY_S:
             return None
@@ -110,5 +110,5 @@ class Introducer:
 
 
 def _as_seen(contact: Contact, is_fresh: bool) -> list[Address]:
-    """Where this node sees a peer, which is no help where the peer uses a fresh port."""
+    """Return the source address of a peer, unless the peer uses an additional port."""
     return [contact.address] if not is_fresh and is_possible(contact.address) else []

@@ -1,4 +1,4 @@
-"""Known: what is kept of other nodes, none of it without end."""
+"""Keep bounded state of other nodes for NAT traversal."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from middleware.entangled.wire.peer import MAX_PEERS, Peers
 from middleware.entangled.wire.session import Session
 
 LIVELY_S = 20.0
-"""Seconds since a peer was heard for which it is worth asking."""
+"""The seconds since the latest datagram of a peer within which it is asked for help."""
 MAX_KNOWN = 1024
-"""Peers of which is kept who named them, who carries to them, and the like."""
+"""The number of peers with remembered namers, relays and similar state."""
 
 
 class Known:
-    """Who has which id: peers with which this node has, or shall have, a session."""
+    """Maps node ids to peers with sessions, or that are about to have one."""
 
     def __init__(self, peers: Peers) -> None:
         self._peers = peers
@@ -24,17 +24,17 @@ class Known:
         return len(self._publics)
 
     def note(self, public: bytes) -> None:
-        """Take note of a peer."""
+        """Add a peer."""
         keep(self._publics, node_id(public), public, MAX_PEERS)
 
     def forget(self, public: bytes) -> None:
-        """Forget a peer."""
+        """Delete a peer."""
         self._publics.pop(node_id(public), None)
 
     def session(self, wanted: bytes) -> Session | None:
-        """The newest session with the node of that id."""
+        """Return the newest session with the node of that id."""
         return self._peers.session(self._publics.get(wanted, b""))
 
     def direct_session(self, wanted: bytes) -> Session | None:
-        """The newest session with the node of that id that no other node carries."""
+        """Return the newest session with the node of that id that is not relayed."""
         return self._peers.direct_session(self._publics.get(wanted, b""))

@@ -1,7 +1,7 @@
-"""Mirror: how a node learns the address that others see when it sends, by each of its local ports.
+"""Learn the external address of each local port from peers.
 
-MIRROR ``0x06 | token 8 | zero 18`` is answered by IMAGE ``0x07 | token 8 | address 16, port 2`` to where it came from;
-both travel in a session.
+MIRROR ``0x06 | token 8 | zero 18`` is answered by IMAGE ``0x07 | token 8 | address 16, port 2``, sent to its source
+address; both are sent in a session.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ RATE, BURST = 50.0, 100.0
 
 
 class Mirror:
-    """Asks peers for the own address, and tells them theirs; ``send`` seals for a session and sends to an address.
+    """Asks peers for this node's external address, and answers such requests.
 
-    ``rng`` gives dice when they are needed.
+    ``send`` seals a message and sends it to an address; ``rng`` returns the random generator when needed.
     """
 
     def __init__(
@@ -49,7 +49,7 @@ class Mirror:
         self._pending: dict[bytes, Callable[[Address | None], None]] = {}
 
     def look(self, session: Session, port: int = 0) -> Deferred[Address | None]:
-        """The address that the peer of ``session`` sees when this node sends by ``port``; None where none was told."""
+        """Return this node's address as the peer of ``session`` sees it for ``port``; None if it does not answer."""
         seen: Deferred[Address | None] = Deferred()
         token = self._rng().randbytes(_TOKEN)
         to = session.contact.address
@@ -78,13 +78,13 @@ class Mirror:
         return seen
 
     def on_mirror(self, session: Session, plain: bytes, source: Address) -> None:
-        """Tell a peer the address that it wrote from."""
+        """Send a peer its source address."""
         if len(plain) != _LENGTH or not self._bucket.take(self._clock.seconds()):
             return
         self._send(session, bytes([IMAGE]) + plain[1 : 1 + _TOKEN] + packed_address(source), source)
 
     def on_image(self, session: Session, plain: bytes, source: Address) -> None:
-        """Take the answer."""
+        """Process the answer to a MIRROR."""
         done = self._pending.get(plain[1 : 1 + _TOKEN])
         if len(plain) == _LENGTH and done is not None:
             done(address_of(plain[1 + _TOKEN :]))

@@ -1,4 +1,4 @@
-"""Passage: by which way a peer is reached, in a word that people know; pure."""
+"""Classify the path to a peer in terms that operators know."""
 
 from __future__ import annotations
 
@@ -12,12 +12,11 @@ KINDS: tuple[Kind, ...] = ("none", "machine", "lan", "direct", "punched", "carri
 
 
 class Passage(NamedTuple):
-    """The way to one peer.
+    """The path to one peer.
 
-    ``kind`` is ``machine`` (this one), ``lan``, ``direct`` (through the internet, and nobody helps), ``punched``
-    (routers were opened by an introduction), ``carried`` (by the node whose id is ``by``; empty: nobody does now),
-    ``tunnel`` (TLS, where no datagram passes) or ``none``.  ``since`` is the moment from which it is that way, None
-    with ``none``.
+    ``kind`` is ``machine`` (the same one), ``lan``, ``direct`` (through the internet without help), ``punched`` (opened
+    by an introduction), ``carried`` (relayed by the node with the id ``by``; empty: no relay at present), ``tunnel``
+    (TLS, if UDP is blocked) or ``none``.  ``since`` is the time from which the path has this kind, None with ``none``.
     """
 
     kind: Kind
@@ -27,7 +26,7 @@ class Passage(NamedTuple):
 
 
 def kind_of(address: Address, own: Address, is_translated: bool, was_introduced: bool) -> Kind:
-    """What a session with a peer at ``address`` goes by; datagrams to it leave from ``own``."""
+    """Return the kind of a session with a peer at ``address``; datagrams to it are sent from ``own``."""
     if is_relayed(address):
         return "carried"
     if address.is_virtual:

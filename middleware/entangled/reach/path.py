@@ -1,7 +1,7 @@
-"""Path: a network in which a node that others carry to has an address, too.
+"""Wrap a network so that nodes behind relays have addresses.
 
-It goes around the node's own network.  What is sent to such an address is handed to ``carry``; what others carried here
-is given to the receiver as if it had come from there.
+Datagrams to such an address are passed to ``carry``; relayed datagrams are passed to the receiver with such a source
+address.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from middleware.entangled.network.network import Address, Network, Receiver, is_
 
 
 class PathNetwork:
-    """``network``, and what others carry; ``ports`` is the network itself, where it can have more than one port."""
+    """``network`` with relayed paths; ``ports`` is the network itself, if it supports several ports."""
 
     def __init__(self, network: Network) -> None:
         self.carry: Callable[[bytes, Address], None] = lambda datagram, to: None
@@ -23,12 +23,12 @@ class PathNetwork:
 
     @property
     def address(self) -> Address:
-        """The address of the network underneath."""
+        """The address of the underlying network."""
         return self._network.address
 
     @property
     def counters(self) -> Counter[str]:
-        """What the network underneath counts; nothing where it counts nothing."""
+        """The counters of the underlying network; empty if it has none."""
         counters = getattr(self._network, "counters", None)
         return counters if isinstance(counters, Counter) else Counter()
 
@@ -38,7 +38,7 @@ class PathNetwork:
         self._receiver = receiver
 
     def send(self, datagram: bytes, to: Address) -> None:
-        """Send, or have it carried."""
+        """Send a datagram directly or through a relay."""
         if is_relayed(to):
             self.carry(datagram, to)
         else:
@@ -50,29 +50,29 @@ class PathNetwork:
         self._network.close()
 
     def carried(self, datagram: bytes, source: Address) -> None:
-        """Take a datagram that somebody carried here for the node with that address."""
+        """Receive a relayed datagram from the node with that address."""
         if self._receiver is not None:
             self._receiver(datagram, source)
 
     # -- local ports ------------------------------------------------------------------------------------------------
 
     def open_port(self) -> int:
-        """A further local port; 0 where the network underneath has only one."""
+        """Open an additional local port and return it; 0 if the underlying network has only one."""
         return self._ports.open_port() if self._ports is not None else 0
 
     def shut_port(self, port: int) -> None:
-        """Close a further port."""
+        """Close an additional port."""
         if self._ports is not None:
             self._ports.shut_port(port)
 
     def lead(self, to: Address, port: int) -> int:
-        """Let what goes to ``to`` leave by a port; gives the one by which it left so far."""
+        """Assign a local port to the target ``to``; return the previous one."""
         return self._ports.lead(to, port) if self._ports is not None else 0
 
     def local(self, to: Address, port: int = 0) -> Address:
-        """The address of this machine from which a datagram to ``to`` leaves."""
+        """Return the local source address of datagrams to ``to``."""
         return self._ports.local(to, port) if self._ports is not None else self._network.address
 
     def hosts(self) -> list[str]:
-        """The addresses of this machine at which it hears."""
+        """Return the addresses of this machine at which it listens."""
         return self._ports.hosts() if self._ports is not None else [self._network.address.host]

@@ -1,11 +1,11 @@
-"""Reach: paths to peers that do not answer where others see them.
+"""Find paths to peers behind NAT.
 
-Routers that translate addresses let in only what was asked for from inside.  So two nodes behind such routers are
-*introduced* by a third that both speak with: it tells each where it sees the other, and both knock at the same time;
-their INITs open the routers for each other.  Where that is not enough, they knock again from fresh local ports, and in
-the end the third *carries* for them (``relay``), while they try again now and then.
+A router with NAT accepts only datagrams that its inside requested.  Therefore two nodes behind such routers are
+*introduced* by a third node with sessions to both: it sends each the other's external address, and both send INITs at
+the same time, which open the routers for each other (hole punching).  If that fails, they retry from additional local
+ports, and finally the third node *relays* (``relay``) while they retry periodically.
 
-A peer that answers at once, and one in this node's own network, never sees any of this.
+A peer that answers at once, or in the same private network, needs none of this.
 """
 
 from __future__ import annotations
@@ -39,27 +39,28 @@ from middleware.entangled.wire.peer import Opening, Peer
 from middleware.entangled.wire.session import Session
 
 FRESH_AT = 0.5
-"""Seconds after its beginning from which a handshake is tried from a fresh local port, too."""
+"""The age in seconds from which a handshake is also tried from an additional local port."""
 CARRIED_AT = 0.9
-"""Seconds after its beginning from which a handshake goes by those who carry, too: most direct ways are found by then,
-and what is asked with the usual patience of 1.5 s is answered yet."""
+"""The age in seconds from which a handshake is also sent through relays: most direct paths are found by then, and a
+request with the default timeout of 1.5 s can still be answered."""
 WELL_S = 3.0
-"""Seconds since a peer was heard for which its way is left alone."""
+"""The seconds since the latest datagram of a peer within which its path is not changed."""
 AT_ONCE = 1
 WE_WAIT = {3: 0.15, 5: 0.7}
 THEY_WAIT = {2: 0.15, 4: 0.7}
 ORDERS = (2, 3, 4, 5, AT_ONCE)
-"""In which order two knock: at their usual ports; or at fresh ones, at the same time or one some seconds after the
-other.  A knock that comes too early spoils some routers' ports, and does no harm to others; nobody knows which."""
+"""The order in which the two peers send INITs: from their usual ports; or from additional ones, at the same time or
+with a delay.  An INIT that arrives too early spoils the port of some routers.  The kind of the router is not known, so
+all orders are tried."""
 UPGRADING_S = 1.2
 TICK = 1.0
 OPENED_GAP = 2.0
-"""Seconds at least between two times at which sessions are opened anew since this node's address changed."""
+"""The minimum seconds between two reopenings of sessions after changes of this node's address."""
 
 
 @dataclass(slots=True)
 class _Attempt:
-    """What is done to find one peer: who was asked, who knows it, and which others they named."""
+    """The search for a path to one peer: the nodes asked, the ones that know it, and others that they named."""
 
     peer: Peer
     node_id: bytes
@@ -71,9 +72,9 @@ class _Attempt:
 
 
 class Reach:
-    """Finds ways to peers, by introductions and by those who carry, and keeps them up, for one node.
+    """Finds and maintains paths to peers for one node, by introductions and relays.
 
-    ``contacts`` gives the peers that are known.
+    ``contacts`` returns the known contacts.
     """
 
     def __init__(
@@ -110,7 +111,7 @@ class Reach:
         endpoint.route_inside(CARRIED, self._carriers.on_carried)
         endpoint.route_inside(MIRROR, self.mirror.on_mirror)
         endpoint.route_inside(IMAGE, self.mirror.on_image)
-        # Run once for each question, however often it is repeated: each run would open another port.
+        # Run at most once per request, because each run would open another port.
         endpoint.expose("reach.introduce", self.introducer.answer_introduce, changes=True)
         endpoint.expose("reach.meet", self._answer_meet, changes=True)
         endpoint.expose("reach.seen", self.outside.answer_seen, changes=True)
@@ -124,28 +125,28 @@ class Reach:
 
     @cached_property
     def _rng(self) -> random.Random:
-        # Dice of its own: they only spread the load, and the endpoint's shall fall as they would without it.
+        # Separate from the endpoint's generator, so that the endpoint's numbers stay the same; it only spreads load.
         return random.Random(int.from_bytes(self._own_id))
 
     def _let_go(self, public: bytes) -> None:
-        """Forget a peer that was silent for long, and with which there is no session."""
+        """Delete the state of a peer that was silent for long and has no session."""
         self._known.forget(public)
         self.outside.forget(public)
         self.ways.forget(public)
 
-    # -- finding a way ----------------------------------------------------------------------------------------------
+    # -- finding a path ---------------------------------------------------------------------------------------------
 
     async def _find(self, opening: Opening) -> None:
-        """Help a handshake of ours that was not answered at first."""
+        """Help an outgoing handshake that got no early answer."""
         attempt = _Attempt(opening.peer, node_id(opening.peer.public), opening)
         if not self._helpers(attempt):
             return
         since, now = opening.started_at, self._clock.seconds()
         self._peers.hold(opening, now + ASKED_S + CARRIED_AT)
-        self._chores.later(max(0.0, since + CARRIED_AT - now), self._have_carried, opening)
-        await self._ask_around(attempt)
+        self._chores.later(max(0.0, since + CARRIED_AT - now), self._send_by_relay, opening)
+        await self._ask_helpers(attempt)
         if not attempt.helpful and self._is_pending(opening):
-            await self._ask_around(attempt)  # others, or those that the first ones named
+            await self._ask_helpers(attempt)  # other helpers, or the ones that the first named
         if not self._is_pending(opening):
             return
         if not attempt.helpful:
@@ -153,32 +154,32 @@ class Reach:
             return
         self._peers.hold(opening, since + HELD_S)
         if not attempt.candidates or self._clock.seconds() > since + CARRIED_AT:
-            self._have_carried(opening)
+            self._send_by_relay(opening)
         await self._chores.sleep(max(0.0, since + FRESH_AT - self._clock.seconds()))
-        await self._knock_afresh(attempt, AT_ONCE)
+        await self._punch_from_new_port(attempt, AT_ONCE)
 
     async def _upgrade(self, peer: Peer, step: int) -> None:
-        """Try the direct way to a peer to whom others carry."""
+        """Try a direct path to a relayed peer."""
         attempt = _Attempt(peer, node_id(peer.public))
         if peer.opening is None:
-            await self._ask_around(attempt)
+            await self._ask_helpers(attempt)
         candidates = list(attempt.candidates)
         session = peer.session
         if not candidates or session is None or not is_relayed(session.contact.address) or peer.opening is not None:
             return
-        if self._knock(peer.public, candidates, 0, UPGRADING_S):
+        if self._start_punching(peer.public, candidates, 0, UPGRADING_S):
             attempt.opening = peer.opening
             await self._chores.sleep(FRESH_AT)
-            await self._knock_afresh(attempt, ORDERS[step % len(ORDERS)])
+            await self._punch_from_new_port(attempt, ORDERS[step % len(ORDERS)])
 
-    async def _ask_around(self, attempt: _Attempt) -> None:
-        """Ask some helpers for an introduction, and knock where the first of them say."""
+    async def _ask_helpers(self, attempt: _Attempt) -> None:
+        """Request introductions from some helpers, and send INITs to the addresses in the first answers."""
         helpers = self._helpers(attempt)
         attempt.asked |= {helper.public for helper in helpers}
 
         async def ask(helper: Contact) -> bool:
-            found = await self._introduced(attempt, helper, self._own(helper), USUAL)
-            self._knock_further(attempt, found)
+            found = await self._request_introduction(attempt, helper, self._own_candidates(helper), USUAL)
+            self._punch_at(attempt, found)
             return bool(attempt.helpful)
 
         await until(lambda results: any(results), [ask(helper) for helper in helpers])
@@ -186,8 +187,8 @@ class Reach:
     def _helpers(self, attempt: _Attempt) -> list[Contact]:
         return self.acquaintances.helpers(attempt.node_id, attempt.hinted, attempt.asked)
 
-    async def _knock_afresh(self, attempt: _Attempt, order: int) -> None:
-        """Try again from a fresh local port: early knocks of the other side may have spoilt the first one."""
+    async def _punch_from_new_port(self, attempt: _Attempt, order: int) -> None:
+        """Retry from an additional local port, because early INITs of the other side may have spoilt the usual one."""
         opening = attempt.opening
         if opening is None or not self._is_pending(opening) or not attempt.helpful:
             return
@@ -202,26 +203,28 @@ class Reach:
         if seen is None or not self._is_pending(opening):
             return
         own = [seen, self._paths.local(helper.address, port)]
-        found = await self._introduced(attempt, helper, own, order)
+        found = await self._request_introduction(attempt, helper, own, order)
         if wait:
             await self._chores.sleep(wait)
-        self._lead(attempt.peer, found, port)
-        self._knock_further(attempt, found)
+        self._assign_port(attempt.peer, found, port)
+        self._punch_at(attempt, found)
 
-    def _knock_further(self, attempt: _Attempt, found: list[Address]) -> None:
+    def _punch_at(self, attempt: _Attempt, found: list[Address]) -> None:
         if found and attempt.opening is not None:
             self.ways.introduced(attempt.peer.public)
             self._peers.knock_at(attempt.opening, found)
 
-    async def _introduced(self, attempt: _Attempt, helper: Contact, own: list[Address], order: int) -> list[Address]:
-        """The addresses of the peer, as ``helper`` tells them after it told ours to the peer."""
+    async def _request_introduction(
+        self, attempt: _Attempt, helper: Contact, own: list[Address], order: int
+    ) -> list[Address]:
+        """Request an introduction from ``helper``, which sends ``own`` to the peer; return the peer's addresses."""
         answer = await self._endpoint.ask(
             helper, "reach.introduce", attempt.node_id, packed(own), order, timeout=ASKED_S, changes=True
         )
         if not (isinstance(answer, list) and len(answer) == 3):
             return []
         fields, carriers, may_carry = answer
-        found = [address for address in unpacked(fields) if self._is_worth(address)]
+        found = [address for address in unpacked(fields) if self._is_usable(address)]
         attempt.helpful.append(helper)
         attempt.candidates.update(dict.fromkeys(found))
         if may_carry is True and not is_relayed(helper.address):
@@ -232,20 +235,20 @@ class Reach:
                 attempt.hinted.append(contact)
         return found
 
-    def _have_carried(self, opening: Opening) -> None:
-        """Let those who carry to the peer carry a handshake, too."""
+    def _send_by_relay(self, opening: Opening) -> None:
+        """Send a handshake through a relay too, if there is one."""
         peer_id = node_id(opening.peer.public)
         if self._is_pending(opening) and self._carriers.session(peer_id) is not None:
             self._peers.knock_at(opening, [relayed(peer_id)])
 
-    def _knock(self, public: bytes, candidates: list[Address], port: int, seconds: float) -> bool:
-        """Knock at the addresses of a peer by one of our ports; whether that could be begun."""
+    def _start_punching(self, public: bytes, candidates: list[Address], port: int, seconds: float) -> bool:
+        """Send INITs to the addresses of a peer from a local port; return whether that started."""
         try:
             peer = self._peers.peer(Contact(public, candidates[0]))
         except ValueError:
             return False
         if port:
-            self._lead(peer, candidates, port)
+            self._assign_port(peer, candidates, port)
         if peer.opening is None and not self._peers.open(peer, candidates[0], is_wanted=False):
             return False
         self.ways.introduced(public)
@@ -255,46 +258,46 @@ class Reach:
             self._peers.knock_at(opening, candidates)
         return True
 
-    def _lead(self, peer: Peer, addresses: Iterable[Address], port: int) -> None:
-        """Write to these addresses of a peer by a port of ours, but for one by which it is well reached already."""
+    def _assign_port(self, peer: Peer, addresses: Iterable[Address], port: int) -> None:
+        """Assign a local port to these addresses of a peer, except one with a working session."""
         session, before = peer.session, self._clock.seconds() - WELL_S
         used = session.contact.address if session is not None and session.heard_at > before else None
         for address in addresses:
             if address != used:
                 self._paths.lead(address, port)
 
-    # -- what others ask --------------------------------------------------------------------------------------------
+    # -- requests of peers ------------------------------------------------------------------------------------------
 
     async def _answer_meet(self, peer: Contact, public: bytes, candidates: list[object], order: int) -> list[object]:
-        """REACH.MEET: knock at the candidates of ``public``, whom ``peer`` introduces; gives the own ones."""
+        """REACH.MEET: send INITs to the candidates of ``public``, introduced by ``peer``; return this node's."""
         if not self._allowance.may_meet(peer.public):
-            raise Refused("too many introductions to who does not answer")
-        found = [address for address in unpacked(candidates) if self._is_worth(address)]
-        stranger = node_id(public)
-        if stranger == self._own_id:
-            raise Refused("that is this node itself")
+            raise Refused("too many introductions to nodes that do not answer")
+        found = [address for address in unpacked(candidates) if self._is_usable(address)]
+        wanted_id = node_id(public)
+        if wanted_id == self._own_id:
+            raise Refused("the peer to meet is this node itself")
         self._known.note(public)
         self._allowance.introduced(public, peer.public)
         if not is_relayed(peer.address):
-            self._carriers.note(stranger, peer.public)
+            self._carriers.note(wanted_id, peer.public)
         self._upgrades.put_off(public, self._clock.seconds())
-        port, own = 0, self._own(peer)
+        port, own = 0, self._own_candidates(peer)
         session = self._peers.direct_session(peer.public)
-        if order != USUAL and session is not None and (further := self._open_port()):
-            seen = await self.mirror.look(session, further)
+        if order != USUAL and session is not None and (additional := self._open_port()):
+            seen = await self.mirror.look(session, additional)
             if seen is not None:
-                port, own = further, [seen, self._paths.local(peer.address, further)]
+                port, own = additional, [seen, self._paths.local(peer.address, additional)]
         if found:
-            # The one who is to meet us hears of it later than who introduces us: both shall knock at the same time, for
-            # a knock that comes too early may spoil the port that it comes to.
+            # The other peer gets our addresses later, through the introducer: both must send at the same time, because
+            # an INIT that arrives too early may spoil the port of a router.
             wait = (self._endpoint.round_trip(peer) or 0.0) + THEY_WAIT.get(order, 0.0)
-            self._chores.later(wait, self._knock, public, found, port, HELD_S)
+            self._chores.later(wait, self._start_punching, public, found, port, HELD_S)
         return [packed(own), bool(port)]
 
-    # -- upkeep -----------------------------------------------------------------------------------------------------
+    # -- maintenance ------------------------------------------------------------------------------------------------
 
     def _open_again(self, teller: Contact) -> None:
-        """Open the ways through the own router anew, and try soon to do without those who carry."""
+        """Reopen the sessions through NAT mappings, and soon retry direct paths."""
         now = self._clock.seconds()
         if now - self._opened_at < OPENED_GAP:
             return
@@ -312,10 +315,10 @@ class Reach:
                 self._upgrades.add(public, self._own_id > session.contact.node_id, now)
         else:
             self._upgrades.drop(public)
-        self._wake()
+        self._schedule_tick()
 
-    def _wake(self) -> None:
-        """Go on with the upkeep as long as there is something to keep up."""
+    def _schedule_tick(self) -> None:
+        """Schedule the next maintenance, if there is something to maintain."""
         if not self._is_ticking and (self._upgrades or self.ways.has_holes or self._ports):
             self._is_ticking = True
             self._chores.later(TICK, self._tick)
@@ -327,24 +330,24 @@ class Reach:
             self._chores.fork(self._upgrade(peer, step))
         self.outside.show(now)
         self._is_ticking = False
-        self._wake()
+        self._schedule_tick()
 
-    # -- small things -----------------------------------------------------------------------------------------------
+    # -- helpers ----------------------------------------------------------------------------------------------------
 
-    def _is_worth(self, address: Address) -> bool:
+    def _is_usable(self, address: Address) -> bool:
         return is_possible(address) and (not is_loopback(address.host) or is_loopback(self._paths.local(address).host))
 
     def _is_pending(self, opening: Opening) -> bool:
         return opening.peer.opening is opening
 
-    def _own(self, helper: Contact) -> list[Address]:
-        """The own addresses, as this machine knows them; first the one from which it writes to ``helper``."""
+    def _own_candidates(self, helper: Contact) -> list[Address]:
+        """Return this machine's addresses, first the source address of datagrams to ``helper``."""
         first = self._paths.local(helper.address)
         others = [Address(host, self._paths.address.port) for host in self._paths.hosts()]
         return list(dict.fromkeys([first, *others]))[: MAX_CANDIDATES - 1]
 
     def _open_port(self) -> int:
-        """A fresh local port; 0 where there are too many."""
+        """Open an additional local port and return it; 0 if there are too many."""
         port = self._ports.open()
-        self._wake()
+        self._schedule_tick()
         return port

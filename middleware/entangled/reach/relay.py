@@ -1,8 +1,8 @@
-"""Relay: carries datagrams from one peer to another that cannot reach each other, as far as there is room for it.
+"""Relay datagrams between two peers that cannot reach each other, within rate limits.
 
-Only what a peer sends in its session is carried, only to another peer with a session, and never over more than one
-node: who is reached through others carries for nobody that way.  What is inside is sealed between the two; who carries
-it can neither read nor change it.
+Only messages in a session are relayed, only to another peer with a session, and only over one hop: a node that is
+reached through relays does not relay over that path.  The content is encrypted between the two peers; the relay can
+neither read nor change it.
 """
 
 from __future__ import annotations
@@ -22,16 +22,17 @@ CARRY = 0x03
 CARRIED = 0x05
 HEAD = 1 + ID_BYTES
 PAIR_RATE, PAIR_BURST = 8_000.0, 65_536.0
-"""Bytes that one pair may send in a second for long (64 kbit/s), and at once: a call, a join, an order, no films."""
+"""The bytes that one pair may send per second (64 kbit/s), and in one burst: enough for requests and orders, not for
+video."""
 ALL_RATE, ALL_BURST = 128_000.0, 524_288.0
 MAX_PAIRS = 256
 ONE_SIDED_S = 120.0
-"""Seconds for which one of two may send to the other without a word from it."""
+"""The seconds for which one of two peers may send to the other without receiving from it."""
 
 
 @dataclass(slots=True)
 class _Pair:
-    """Two peers; ``heard`` has when each last sent, by its id."""
+    """Two peers; ``heard`` has the time of the latest datagram of each, by its id."""
 
     begun_at: float
     bucket: TokenBucket = field(default_factory=lambda: TokenBucket(PAIR_RATE, PAIR_BURST))
@@ -39,10 +40,9 @@ class _Pair:
 
 
 class Relay:
-    """Carries for others.  ``session_of`` gives the session by which a peer is reached directly, by its id.
+    """Relays for others.  ``session_of`` returns the direct session with a peer, by its id.
 
-    ``counters`` counts what was carried, in datagrams (``carried``), and what was not, for want of room
-    (``uncarried``).
+    ``counters`` counts the datagrams that were relayed (``carried``) and rejected by the limits (``uncarried``).
     """
 
     def __init__(
@@ -64,25 +64,25 @@ class Relay:
 
     @property
     def has_room(self) -> bool:
-        """Whether another pair may be carried for."""
+        """Whether another pair can be relayed."""
         self._forget_idle()
         return len(self._pairs) < MAX_PAIRS
 
     def on_carry(self, session: Session, plain: bytes, source: Address) -> None:
-        """Hand on what the peer of ``session`` wants carried."""
+        """Forward a datagram of the peer of ``session``."""
         inner, to = plain[HEAD:], plain[1:HEAD]
         sender = session.contact.node_id
         if not inner or len(inner) > MAX_DATAGRAM or is_relayed(session.contact.address) or to == sender:
             self._counters["malformed"] += 1
             return
         target = self._session_of(to)
-        if target is None or not self._may(sender, to, len(inner)):
+        if target is None or not self._is_allowed(sender, to, len(inner)):
             self._counters["uncarried"] += 1
             return
         self._counters["carried"] += 1
         self._send(target, bytes([CARRIED]) + sender + inner)
 
-    def _may(self, sender: bytes, to: bytes, size: int) -> bool:
+    def _is_allowed(self, sender: bytes, to: bytes, size: int) -> bool:
         now = self._clock.seconds()
         key = (min(sender, to), max(sender, to))
         pair = self._pairs.get(key)

@@ -1,4 +1,4 @@
-"""Upgrade: when a peer to whom others carry is tried directly again."""
+"""Schedule the attempts to replace relayed paths by direct ones."""
 
 from __future__ import annotations
 
@@ -10,26 +10,25 @@ from middleware.entangled.reach.known import MAX_KNOWN
 from middleware.entangled.wire.peer import Peer, Peers
 
 PAUSES = (1.0, 2.0, 5.0, 5.0, 15.0, 60.0)
-"""Seconds after which a carried pair tries the direct way again; the last one is repeated.
+"""The seconds between attempts of a relayed pair to connect directly; the last one is repeated.
 
-As many are short as there are orders in which two knock at fresh ports: but one of them may do.
-"""
+There are as many short ones as orders of sending with additional ports, because only one order may succeed."""
 TURN = 0.5
-"""Seconds by which one of the two is behind the other, so that only one of them tries."""
+"""The seconds by which one of the two peers is delayed, so that only the other one tries."""
 GIVEN_UP_S = 60.0
-"""Seconds after which a silent carried peer is given up."""
+"""The silence in seconds after which a relayed peer is given up."""
 
 
 @dataclass(slots=True)
 class _Upgrade:
-    """A carried peer, and when the direct way is tried next."""
+    """A relayed peer, and the time of the next direct attempt."""
 
     due: float
     step: int = 0
 
 
 class Upgrades:
-    """The carried peers."""
+    """The relayed peers."""
 
     def __init__(self, peers: Peers) -> None:
         self._peers = peers
@@ -39,27 +38,27 @@ class Upgrades:
         return len(self._upgrades)
 
     def add(self, public: bytes, is_behind: bool, now: float) -> None:
-        """Try the direct way to a peer from now on; the one of the two who ``is_behind`` leaves it to the other."""
+        """Schedule direct attempts to a peer; of the two, the node that ``is_behind`` starts later."""
         if public not in self._upgrades:
             keep(self._upgrades, public, _Upgrade(now + PAUSES[0] + (TURN if is_behind else 0.0)), MAX_KNOWN)
 
     def drop(self, public: bytes) -> None:
-        """Try no more: nobody carries to that peer."""
+        """Stop the attempts to a peer."""
         self._upgrades.pop(public, None)
 
     def put_off(self, public: bytes, now: float) -> None:
-        """Leave it to the peer for once, which is at it."""
+        """Delay the next attempt, because the peer is trying."""
         upgrade = self._upgrades.get(public)
         if upgrade is not None:
             upgrade.due = max(upgrade.due, now + _pause(upgrade.step) + TURN)
 
     def hurry(self, now: float) -> None:
-        """Try all of them at once, and often at first, as if they were new."""
+        """Try all peers immediately, and restart the schedule."""
         for upgrade in self._upgrades.values():
             upgrade.due, upgrade.step = now, 0
 
     def due(self, now: float) -> Iterator[tuple[Peer, int]]:
-        """The peers whose turn it is, and how often each was tried before; the silent ones are given up."""
+        """Yield each peer that is due and the number of its earlier attempts; silent peers are given up."""
         for public, upgrade in list(self._upgrades.items()):
             peer = self._peers.known(public)
             if peer is None or peer.session is None or now - peer.session.heard_at > GIVEN_UP_S:

@@ -1,4 +1,4 @@
-"""Way: by which way each peer is reached, since when, and which of the ways go through a hole in the own router."""
+"""Track the path to each peer, its duration, and the paths through NAT mappings."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from middleware.entangled.wire.peer import Peers
 from middleware.entangled.wire.session import Session
 
 HELD_S = 5.0
-"""Seconds for which a handshake goes on that others help with."""
+"""The seconds for which a handshake continues while other nodes help."""
 OPENED = 64
-"""Sessions that are opened anew when this node's address changed."""
+"""The number of sessions that are reopened when this node's address changes."""
 MAX_FRESH = 16
-"""Fresh local ports at the same time."""
+"""The maximum number of additional local ports."""
 SHUT_S = 60.0
-"""Seconds after which a fresh port is closed where no session goes by it."""
+"""The seconds after which an additional port without a session is closed."""
 
 
 class Ways:
-    """The ways to peers with which there are, or were, sessions."""
+    """The paths to peers with present or former sessions."""
 
     def __init__(
         self, peers: Peers, paths: PathNetwork, outside: Outside, carriers: Carriers, clock: IReactorTime
@@ -41,7 +41,7 @@ class Ways:
         self._holes: dict[bytes, None] = {}
 
     def passage(self, contact: Contact) -> Passage:
-        """How a peer is reached now, by whom, and since when."""
+        """Return the path to a peer at present, with its relay and its start."""
         session = self._peers.session(contact.public)
         if session is None:
             return Passage("none")
@@ -52,41 +52,38 @@ class Ways:
         return Passage(kind, session.contact.address, by, since if noted == kind else session.opened_at)
 
     def needs_use(self, contact: Contact) -> bool:
-        """Whether the way to a peer is open for only so long as it is used: routers forget whom they let in."""
+        """Return whether the path to a peer stays open only while it is used, because NAT mappings expire."""
         kind, _ = self._passages.get(contact.public, ("none", 0.0))
         return self._outside.is_translated or contact.address.is_virtual or kind == "punched"
 
     @property
     def has_holes(self) -> bool:
-        """Whether any way goes, or went lately, through a hole in the own router."""
+        """Whether any path uses, or recently used, a NAT mapping of this node's router."""
         return bool(self._holes)
 
     def uses(self, port: int) -> bool:
-        """Whether a session through a hole in the own router goes by this local port."""
+        """Return whether a session through a NAT mapping uses this local port."""
         for public in self._holes:
             session = self._peers.direct_session(public)
             if session is not None and self._paths.local(session.contact.address).port == port:
                 return True
         return False
 
-    # -- what happens to them ---------------------------------------------------------------------------------------
+    # -- events -----------------------------------------------------------------------------------------------------
 
     def introduced(self, public: bytes) -> None:
-        """Take note that somebody introduces this node and a peer to each other now."""
+        """Record that this node and a peer are being introduced."""
         keep(self._introduced_at, public, self._clock.seconds(), MAX_KNOWN)
 
     def established(self, session: Session) -> None:
-        """Take note of a session that is used from now on."""
+        """Record a new session."""
         self._note_passage(session)
         address = session.contact.address
         if not is_relayed(address) and self._outside.is_far(address):
             keep(self._holes, session.contact.public, None, MAX_KNOWN)
 
     def open_again(self, teller: bytes) -> None:
-        """Open the sessions anew that went through a hole in the own router, the newest ones of them at least.
-
-        All but the one with ``teller``, who said that this node is seen elsewhere.
-        """
+        """Reopen the latest sessions through NAT mappings, except the one with ``teller``, which reported it."""
         for public in list(reversed(self._holes))[:OPENED]:
             peer = self._peers.known(public)
             if peer is None or peer.session is None:
@@ -95,25 +92,25 @@ class Ways:
                 self._peers.open(peer, peer.session.contact.address)
 
     def lost(self, contact: Contact) -> None:
-        """Forget since when a peer was reached: it is no more."""
+        """Forget the path to a peer that is gone."""
         self._passages.pop(contact.public, None)
 
     def forget(self, public: bytes) -> None:
-        """Forget a peer with which there is no session."""
+        """Delete the state of a peer without a session."""
         for table in (self._passages, self._introduced_at, self._holes):
             table.pop(public, None)
 
     def _note_passage(self, session: Session) -> None:
-        """Take note since when a peer is reached as it is now; a successor of a session changes nothing of that."""
+        """Record the start of the present kind of path; a renewed session does not change it."""
         public = session.contact.public
         peer = self._peers.known(public)
         if peer is None or peer.session is not session:
-            return  # the one that was there is used on
+            return  # the existing session is still in use
         kind, noted = self._kind(session), self._passages.get(public)
         if noted is None and len(peer.sessions) > 1:
             former = peer.sessions[-2]
             noted = (self._kind(former), former.opened_at)
-        if noted is not None or kind == "punched":  # else the session itself says it
+        if noted is not None or kind == "punched":  # otherwise the session has this information
             since = noted[1] if noted is not None and noted[0] == kind else self._clock.seconds()
             keep(self._passages, public, (kind, since), MAX_KNOWN)
 
@@ -127,7 +124,7 @@ class Ways:
 
 
 class FreshPorts:
-    """Further local ports, from which a node knocks where early knocks may have spoilt its usual one."""
+    """Additional local ports for hole punching, if early INITs may have spoilt the usual port."""
 
     def __init__(self, paths: PathNetwork, ways: Ways, clock: IReactorTime) -> None:
         self._paths = paths
@@ -142,7 +139,7 @@ class FreshPorts:
         return port in self._opened_at
 
     def open(self) -> int:
-        """A fresh local port; 0 where there are too many."""
+        """Open an additional local port and return it; 0 if there are too many."""
         now = self._clock.seconds()
         if len(self._opened_at) >= MAX_FRESH:
             unused = self._unused_since(now - HELD_S)
@@ -155,12 +152,12 @@ class FreshPorts:
         return port
 
     def shut_unused(self, now: float) -> None:
-        """Close those that were opened long ago, and by which no session goes."""
+        """Close the ports that were opened long ago and have no session."""
         for port in self._unused_since(now - SHUT_S):
             self._shut(port)
 
     def _unused_since(self, before: float) -> list[int]:
-        """Those by which no session goes though they were opened before that moment, the oldest first."""
+        """Return the ports without a session that were opened before a time, the oldest first."""
         return [port for port, at in self._opened_at.items() if at < before and not self._ways.uses(port)]
 
     def _shut(self, port: int) -> None:

@@ -1,1 +1,1 @@
-"""The sealed wire: handshakes, sessions, messages, and the endpoint that asks and answers over them."""
+"""The wire protocol: handshakes, encrypted sessions, messages, and the endpoint that sends and answers requests."""

@@ -1,6 +1,6 @@
-"""Answerer: runs the exposed methods for peers, each change at most once, in time or not at all, and makes the answers.
+"""Run exposed methods for peers, methods with side effects at most once per request, and send their answers.
 
-It knows no keys and no sockets: it is handed questions, and callables that send a message on a session.
+It has no access to keys or sockets: it receives decoded requests, and callables that send a message in a session.
 """
 
 from __future__ import annotations
@@ -40,19 +40,20 @@ from middleware.entangled.wire.method import Entry, Ledger, Method, failure_of
 from middleware.entangled.wire.session import MAX_PLAIN, Session
 
 MAX_CANCELLED = 1024
-# What one peer may ask in a second, and at once: several times what the busiest of a team does, a quarter of a core.
+# Requests that one peer may send per second, and in one burst: several times the rate of the busiest node of a team,
+# and about a quarter of a CPU core.
 QUESTIONS, QUESTIONS_AT_ONCE = 2000.0, 8192.0
 MAX_ASKING = 4096
-_BUSY = "this node holds as many open questions as it may; ask again later"
-_HASTY = "this peer asks more than this node can answer; ask again later, and less often"
-_FULL = "too much is on its way to you already; ask again later"
-_GONE = "the call ran, and its answer was too large to keep; ask what it changed"
+_BUSY = "this node has too many open requests; try again later"
+_RATE_LIMITED = "this node sends more requests per second than the peer accepts; send fewer, and try again later"
+_FULL = "too many bytes are already on their way to this node; try again later"
+_GONE = "the call ran, but its answer was too large to keep; read the state that it changed"
 
 
 class Answerer:
-    """What peers may ask of this node; ``send`` is called with a session and the bytes of a message.
+    """Dispatches requests of peers to exposed methods; ``send`` is called with a session and the bytes of a message.
 
-    ``may`` says whether a peer of that public key may call a method, ``refused`` is told of each that may not.
+    ``may`` returns whether a peer (its public key) may call a method; ``refused`` is called for each rejected call.
     """
 
     _log = Logger()
@@ -75,29 +76,29 @@ class Answerer:
         self._counters = counters
         self._ledger = Ledger()
         self._cancelled: dict[tuple[bytes, int], None] = {}
-        self._asking: dict[bytes, TokenBucket] = {}
+        self._rate_limits: dict[bytes, TokenBucket] = {}
 
     def clear(self) -> None:
-        """Forget what was asked; answers that are still being made go nowhere."""
+        """Forget all requests; the answers of running methods are discarded."""
         self._ledger.clear()
         self._cancelled.clear()
-        self._asking.clear()
+        self._rate_limits.clear()
 
     def evict(self, public: bytes) -> None:
-        """Forget what a peer asked, and stop the work on it."""
+        """Forget the requests of a peer and cancel the running ones."""
         for work in self._ledger.evict(public):
             work.cancel()
 
     def tidy(self, now: float) -> None:
-        """Forget how much those asked who ask so little that they may ask as much as anybody again."""
-        for public in [public for public, bucket in self._asking.items() if bucket.is_full(now)]:
-            del self._asking[public]
+        """Delete the rate limiters that are full again at the time ``now``."""
+        for public in [public for public, bucket in self._rate_limits.items() if bucket.is_full(now)]:
+            del self._rate_limits[public]
 
     def answer(self, question: Question, session: Session, is_bulky: bool = False) -> None:
-        """Answer a question of an established session, now or when the method is done.
+        """Answer a request of an established session, immediately or when its method is done.
 
-        ``is_bulky`` says that it came as a parcel.  Its answer then goes as one too, however short: a parcel is
-        repeated by us, and the asker need not send the whole question again because a short answer got lost.
+        ``is_bulky``: the request arrived in fragments.  Its answer is then sent in fragments too, however short: they
+        are retransmitted by the responder, and the requester need not send the whole request again for a lost answer.
         """
         public = session.contact.public
         if (public, question.id) in self._cancelled:
@@ -118,41 +119,42 @@ class Answerer:
             else:
                 if entry is not None:
                     entry.session = session
-                self._send(session, b"")  # a sign of life: the asker keeps waiting
+                self._send(session, b"")  # a keep-alive: the requester continues to wait
             return
         if not question.left_ms:
             self._counters["late"] += 1
             return
-        if not self._is_within(public):
-            self._reply(session, question.id, self._busy(question.id, _HASTY), is_bulky)
+        if not self._take_token(public):
+            self._reply(session, question.id, self._fail_busy(question.id, _RATE_LIMITED), is_bulky)
             return
         answer = self._run(question, session.contact, session, is_bulky)
         if answer is not None:
             self._reply(session, question.id, answer, is_bulky)
 
     def ride(self, question: Question, peer: Contact, room: int) -> bytes:
-        """The answer to a question that came with an INIT, or nothing where it must wait for the session.
+        """Return the encoded answer to a request in an INIT, or nothing if it has to wait for the session.
 
-        An INIT may be a recording, and its source address is not proved.  So only methods that were exposed as early
-        run, nothing is remembered of the question, and an answer that takes its time or more than ``room`` is dropped.
+        An INIT may be replayed, and its source address is not verified. Therefore only methods that were exposed with
+        ``early`` run, no state is kept, and an answer that is not available immediately or exceeds ``room`` bytes is
+        dropped.
         """
         method = self.methods.get(question.method)
         if method is None or not method.is_early or not question.left_ms:
             return b""
         if not self._may(peer.public, question.method) or self._ledger.entry(peer.public, question.id) is not None:
             return b""
-        result = self._called(method, peer, question.arguments, math.inf)
+        result = self._call_method(method, peer, question.arguments, math.inf)
         if isinstance(result, Deferred):
             result.addErrback(lambda trouble: None)
             result.cancel()
             return b""
-        answer = self._worded(method, question.id, result)
+        answer = self._encode_result(method, question.id, result)
         return answer if len(answer) <= room else b""
 
     def take(self, told: Told, peer: Contact) -> None:
-        """Run what a peer told us; it hears nothing back."""
+        """Run the method of a notification; nothing is sent back."""
         method = self.methods.get(told.method)
-        if not self._is_within(peer.public):
+        if not self._take_token(peer.public):
             self._counters["busy"] += 1
             return
         if method is None:
@@ -161,14 +163,14 @@ class Answerer:
         if not self._may(peer.public, told.method):
             self._refuse(peer, told.method)
             return
-        result = self._called(method, peer, told.arguments, math.inf)
+        result = self._call_method(method, peer, told.arguments, math.inf)
         if isinstance(result, Deferred):
-            result.addErrback(lambda trouble: self._told_no(method, trouble))
+            result.addErrback(lambda trouble: self._log_notification_error(method, trouble))
         elif isinstance(result, Trouble):
-            self._told_no(method, result)
+            self._log_notification_error(method, result)
 
     def cancel(self, message: Cancel, public: bytes) -> None:
-        """Stop the work on a question for which nobody waits any more, and do not begin it if it comes later."""
+        """Cancel the work on a request that its peer gave up; if it arrives later it does not run."""
         self._courier.drop(public, Key(True, message.id))
         self._courier.forget(public, Key(False, message.id))
         entry = self._ledger.entry(public, message.id)
@@ -179,7 +181,7 @@ class Answerer:
             self._stop(entry)
 
     def _run(self, question: Question, peer: Contact, session: Session, is_bulky: bool) -> bytes | None:
-        """Run a new question; the answer, or None where it comes later."""
+        """Run a new request; return its encoded answer, or None if the answer comes later."""
         method = self.methods.get(question.method)
         if method is None:
             return encoded(Failure(question.id, UNKNOWN_METHOD, f"{question.method}: no such method here"))
@@ -190,9 +192,9 @@ class Answerer:
         if method.is_once:
             entry = self._ledger.begin(public, question.id, session, now, is_bulky)
             if entry is None:
-                return self._busy(question.id)
+                return self._fail_busy(question.id)
         deadline = math.inf if question.left_ms == NO_LIMIT_MS else now + question.left_ms / 1000
-        result = self._called(method, peer, question.arguments, deadline)
+        result = self._call_method(method, peer, question.arguments, deadline)
         if isinstance(result, Deferred):
             early: list[object] = []
             is_late = False
@@ -210,40 +212,40 @@ class Answerer:
                     entry = self._ledger.begin(public, question.id, session, now, is_bulky)
                 if entry is None:
                     result.cancel()
-                    return self._busy(question.id)
+                    return self._fail_busy(question.id)
                 entry.work = result
                 if deadline < math.inf:
-                    entry.timer = self._clock.callLater(deadline - now, self._too_late, entry)
+                    entry.timer = self._clock.callLater(deadline - now, self._expire, entry)
                 return None
             result = early[0]
-        answer = self._worded(method, question.id, result)
+        answer = self._encode_result(method, question.id, result)
         if entry is not None:
-            self._ledger.end(public, question.id, _kept(question.id, answer), self._clock.seconds())
+            self._ledger.end(public, question.id, _answer_to_keep(question.id, answer), self._clock.seconds())
         return answer
 
     def _finish(self, result: object, method: Method, number: int, public: bytes, entry: Entry | None) -> None:
-        answer = self._worded(method, number, result)
+        answer = self._encode_result(method, number, result)
         if entry is None or self._ledger.entry(public, number) is not entry:
-            return  # it was turned away, or the node stopped meanwhile
+            return  # the peer was evicted, or the node stopped meanwhile
         session = entry.session
-        kept = _kept(number, answer) if method.is_once else None
+        kept = _answer_to_keep(number, answer) if method.is_once else None
         self._ledger.end(public, number, kept, self._clock.seconds())
         if session is not None:
             self._reply(session, number, answer, entry.is_bulky)
 
     def _reply(self, session: Session, number: int, answer: bytes, is_bulky: bool) -> None:
-        """Send an answer, as a parcel where it must be one."""
+        """Send an answer, in fragments if it needs them."""
         if len(answer) <= MAX_PLAIN and not is_bulky:
             self._send(session, answer)
         elif not self._courier.post(session.contact.public, Key(True, number), answer):
             self._send(session, encoded(Failure(number, BUSY, _FULL)))
 
-    def _too_late(self, entry: Entry) -> None:
+    def _expire(self, entry: Entry) -> None:
         self._counters["late"] += 1
         self._stop(entry)
 
     def _stop(self, entry: Entry) -> None:
-        """Cancel the work on a question; its outcome goes nowhere."""
+        """Cancel the work on a request and discard its result."""
         work, entry.session = entry.work, None
         if work is not None:
             work.cancel()
@@ -252,26 +254,26 @@ class Answerer:
         self._counters["refused"] += 1
         self._refused(peer, method)
 
-    def _busy(self, number: int, text: str = _BUSY) -> bytes:
+    def _fail_busy(self, number: int, text: str = _BUSY) -> bytes:
         self._counters["busy"] += 1
         return encoded(Failure(number, BUSY, text))
 
-    def _is_within(self, public: bytes) -> bool:
-        """Whether a peer may ask one thing more now."""
-        bucket = self._asking.get(public) or TokenBucket(QUESTIONS, QUESTIONS_AT_ONCE)
-        keep(self._asking, public, bucket, MAX_ASKING)
+    def _take_token(self, public: bytes) -> bool:
+        """Return whether a peer's rate limit allows one more request now."""
+        bucket = self._rate_limits.get(public) or TokenBucket(QUESTIONS, QUESTIONS_AT_ONCE)
+        keep(self._rate_limits, public, bucket, MAX_ASKING)
         return bucket.take(self._clock.seconds())
 
-    def _called(self, method: Method, peer: Contact, arguments: tuple[object, ...], deadline: float) -> object:
-        """What the method returned, a Deferred for a coroutine, or the trouble it raised."""
+    def _call_method(self, method: Method, peer: Contact, arguments: tuple[object, ...], deadline: float) -> object:
+        """Return the method's result, a Deferred for a coroutine, or a Failure for an exception."""
         try:
             result = method.run(peer, arguments, deadline)
-        except Exception:  # the method is the owner's code, not ours
+        except Exception:  # application code may raise anything
             return Trouble()
         return Deferred.fromCoroutine(result) if inspect.iscoroutine(result) else result
 
-    def _worded(self, method: Method, number: int, result: object) -> bytes:
-        """The bytes that tell the asker the result of a method, good or bad."""
+    def _encode_result(self, method: Method, number: int, result: object) -> bytes:
+        """Encode the result of a method, or the error that it raised, as an answer."""
         if isinstance(result, Trouble):
             known = failure_of(number, result)
             if known is not None:
@@ -281,20 +283,22 @@ class Answerer:
         try:
             answer = encoded(Answer(number, result))
         except (TypeError, ValueError, OverflowError) as error:
-            self._log.error("{method} returned what cannot be sent: {error}", method=method.name, error=error)
+            self._log.error(
+                "{method} returned a value that cannot be encoded: {error}", method=method.name, error=error
+            )
             return encoded(Failure(number, INTERNAL, "internal error"))
         if len(answer) > MAX_MESSAGE:
-            text = f"{method.name}: the answer has {len(answer)} bytes, {MAX_MESSAGE} can be sent; ask for less"
+            text = f"{method.name}: the answer has {len(answer)} bytes, the limit is {MAX_MESSAGE}; request less"
             return encoded(Failure(number, REFUSED, text))
         return answer
 
-    def _told_no(self, method: Method, trouble: Trouble) -> None:
+    def _log_notification_error(self, method: Method, trouble: Trouble) -> None:
         if failure_of(0, trouble) is not None:
             self._counters["refused"] += 1
         else:
             self._log.failure("{method} failed for a peer", failure=trouble, method=method.name)
 
 
-def _kept(number: int, answer: bytes) -> bytes:
-    """What is kept of an answer for those who ask again."""
+def _answer_to_keep(number: int, answer: bytes) -> bytes:
+    """Return the answer to keep for repeated requests: the answer itself, or a failure in place of a large one."""
     return answer if len(answer) <= MAX_PLAIN else encoded(Failure(number, GONE, _GONE))

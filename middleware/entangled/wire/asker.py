@@ -1,6 +1,6 @@
-"""Asker: our questions until they are answered, and what we tell.
+"""Keep the requests of this node until they are answered, and send notifications.
 
-It decides when to try again and when to give up.  It reads no datagrams: the endpoint tells it what arrived.
+It decides when to retransmit a request and when to give it up.  The endpoint calls it with each received answer.
 """
 
 from __future__ import annotations
@@ -39,23 +39,22 @@ PATIENCE = 1.5
 MAX_TELLS = 32
 SILENCE_S = 5.0
 MAX_IN_FLIGHT = 32
-"""Questions that may be on their way to one peer; what is more waits here, in order.  A quarter of what the usual
-receive buffer of 208 KiB holds, for others ask that peer, too."""
+"""Requests that may be under way to one peer; further ones wait in a queue. They take a quarter of the usual receive
+buffer of 208 KiB, because other nodes send requests to the same peer."""
 MAX_QUEUED = 8192
 LONGEST_QUEUED = 10.0
-_QUEUED = "it waited in vain for its turn; ask for less at once"
-_CROWDED = "too many handshakes are under way"
-_FULL = "too much is on its way already; ask again later"
+_QUEUED = "timed out in the queue; send fewer requests at the same time"
+_CROWDED = "too many handshakes are under way; try again later"
+_FULL = "too many requests or bytes are under way; try again later"
 
 
 @dataclass(slots=True, eq=False)
 class Inquiry:
-    """A question of ours that waits for its answer.
+    """A request that waits for its answer.
 
-    ``is_patient``: the caller gave a longer time-out than the usual one; ``is_bulky``: the question goes as a parcel;
-    ``is_light``: it is not worth a handshake.
-    ``grace`` is how long the answer may still come after the question had its turn, and after each sign of progress of
-    a parcel: none (0) where the caller gave a time-out.
+    ``is_patient``: the caller gave a longer timeout than the default; ``is_bulky``: the request is sent in fragments;
+    ``is_light``: the request does not justify a handshake. ``grace`` is the time in seconds that the answer has after
+    the request left the queue and after each acknowledged fragment; 0 if the caller gave a timeout.
     """
 
     number: int
@@ -78,12 +77,12 @@ class Inquiry:
 
     @property
     def is_counted(self) -> bool:
-        """Whether it takes one of the places for questions on their way: parcels have a window of their own."""
+        """Whether the request counts towards ``MAX_IN_FLIGHT``; fragments have their own congestion window."""
         return not (self.is_patient or self.is_bulky)
 
 
 class Asker:
-    """What an endpoint wants from others; ``send`` is called with a session and the bytes of a message."""
+    """The outgoing requests of an endpoint; ``send`` is called with a session and the bytes of a message."""
 
     def __init__(
         self,
@@ -101,9 +100,9 @@ class Asker:
         self._courier = courier
         self._inquiries: dict[int, Inquiry] = {}
         self._queued = 0
-        # Starting anywhere in 62 bits keeps the numbers of a restarted node apart from those it used before.
+        # A random start within 62 bits keeps the request ids of a restarted node apart from its earlier ones.
         self._next_number = rng.getrandbits(62)
-        peers.on_unheard.add(self._unheard)
+        peers.on_unheard.add(self._fail_unanswered)
 
     def ask(
         self,
@@ -114,12 +113,12 @@ class Asker:
         changes: bool,
         is_light: bool = False,
     ) -> Deferred[object]:
-        """Ask; see ``Endpoint.ask``."""
+        """Send a request; see ``Endpoint.ask``."""
         number = self._next_number
         try:
             peer = self._peers.peer(contact)
         except ValueError:
-            return defer.fail(NoAnswer(f"{contact.address}: the key of this contact is no key"))
+            return defer.fail(NoAnswer(f"{contact.address}: the public key of this contact is invalid"))
         try:
             message = encoded(Question(number, method, arguments, behind=number - peer.oldest(number)))
         except (TypeError, ValueError, OverflowError) as error:
@@ -151,7 +150,7 @@ class Asker:
             grace=PATIENCE if timeout is None else 0.0,
             deferred=deferred,
         )
-        is_open = self._peers.usable(peer) is not None  # before the question itself makes the session a wanted one
+        is_open = self._peers.usable(peer) is not None  # before the request itself marks the session as in use
         self._inquiries[number] = inquiry
         peer.began(number)
         if is_open and (peer.in_flight < MAX_IN_FLIGHT or not inquiry.is_counted):
@@ -165,7 +164,7 @@ class Asker:
         return deferred
 
     def tell(self, contact: Contact, method: str, arguments: tuple[object, ...]) -> None:
-        """Tell; see ``Endpoint.tell``."""
+        """Send a notification; see ``Endpoint.tell``."""
         message = encoded(Told(method, arguments))
         if len(message) > MAX_PLAIN:
             raise TooLarge(_too_large(method, message, MAX_PLAIN))
@@ -178,7 +177,7 @@ class Asker:
         if session is not None:
             self._send(session, message)
             if self._clock.seconds() - session.heard_at > SILENCE_S:
-                # Nobody answers a tell: without this a restarted peer would never be noticed.
+                # A notification has no answer: without this handshake a restart of the peer would go unnoticed.
                 self._peers.open(peer, contact.address)
         elif len(peer.tells) < MAX_TELLS and (peer.opening is not None or self._peers.open(peer, contact.address)):
             peer.tells += (message,)
@@ -186,35 +185,35 @@ class Asker:
             self._counters["untold"] += 1
 
     def stop(self, error: Exception) -> None:
-        """Cancel every timer and fail every question with ``error``."""
+        """Cancel every timer and fail every request with ``error``."""
         self._fail_all(list(self._inquiries.values()), lambda: error)
 
     def refused(self, peer: Peer, error: Callable[[], Exception]) -> None:
-        """Fail every question to a peer: one of us does not let the other in."""
+        """Fail every request to a peer, because one of the two nodes rejects the other."""
         self._counters["untold"] += len(peer.tells)
         peer.tells = ()
-        self._fail_all(self._of(peer), error)
+        self._fail_all(self._inquiries_of(peer), error)
 
     def is_asked(self, number: int, public: bytes) -> bool:
-        """Whether the question ``number`` waits for an answer of the peer with that key."""
+        """Return whether the request ``number`` waits for an answer from the peer with that key."""
         inquiry = self._inquiries.get(number)
         return inquiry is not None and inquiry.peer.public == public
 
     def progressed(self, number: int, public: bytes) -> None:
-        """Take note that a part of a question reached its peer, or a part of the answer us."""
+        """Record that the peer acknowledged a fragment of a request, or that a fragment of its answer arrived."""
         if self.is_asked(number, public):
             inquiry = self._inquiries[number]
             inquiry.progress_at = self._clock.seconds()
             inquiry.deadline = max(inquiry.deadline, inquiry.progress_at + inquiry.grace)
 
     def resolve(self, message: Answer | Failure, public: bytes) -> None:
-        """Hand an answer to the one who asked; an answer that nobody waits for is counted."""
+        """Pass an answer to its caller, or count an answer that no request waits for."""
         inquiry = self._inquiries.get(message.id)
         if inquiry is None or inquiry.peer.public != public:
             self._counters["unasked"] += 1
             return
         is_timed = inquiry.tries > 0 and inquiry.progress_at < 0 and not inquiry.is_bulky
-        if is_timed:  # else it is the time of the handshake, or of the transfer
+        if is_timed:  # otherwise the time includes the handshake or the transfer
             self._peers.answered(inquiry.peer, inquiry.tries, self._clock.seconds() - inquiry.sent_at)
         self._forget(inquiry)
         if isinstance(message, Answer):
@@ -223,14 +222,14 @@ class Asker:
             inquiry.deferred.errback(error_of(message))
 
     def established(self, peer: Peer, session: Session, is_owed: bool) -> None:
-        """Send what waited for a session; ``is_owed`` where the peer waits to hear from us."""
+        """Send the messages that waited for a session; ``is_owed``: the peer waits for a datagram in it."""
         sent = 0
         for message in peer.tells:
             self._send(session, message)
             sent += 1
         peer.tells = ()
-        if is_owed:  # of those that were tried, the peer may have lost the session
-            for inquiry in self._of(peer):
+        if is_owed:  # the peer may have lost the session in which these requests were sent
+            for inquiry in self._inquiries_of(peer):
                 if inquiry.tries:
                     self._try(inquiry)
                     sent += 1
@@ -239,7 +238,7 @@ class Asker:
             self._send(session, b"")
 
     def _try(self, inquiry: Inquiry) -> None:
-        """Send a question on the peer's newest session, and set its timer."""
+        """Send a request in the peer's newest session and set its timer."""
         session = inquiry.peer.sessions[-1]
         now = self._clock.seconds()
         inquiry.tries += 1
@@ -254,16 +253,17 @@ class Asker:
         within = inquiry.deadline - inquiry.asked_at
         wait = self._peers.spacing(inquiry.peer.round_trip, inquiry.tries, within)
         if inquiry.is_patient and inquiry.tries > 1:
-            # A method that takes its time: the later tries are there for an answer that got lost.
+            # A slow method: the later retransmissions are for an answer that was lost.
             wait = max(wait, (inquiry.deadline - now) / max(1, self._peers.tries + 1 - inquiry.tries))
         self._set_timer(inquiry, wait)
 
-    def _due(self, inquiry: Inquiry) -> None:
-        """Decide what to do about a question that has waited long enough."""
+    def _on_timer(self, inquiry: Inquiry) -> None:
+        """Retransmit a request, open a session for it, or fail it, when its timer fires."""
         now, peer = self._clock.seconds(), inquiry.peer
         left = inquiry.deadline - now
         if left <= 0 and inquiry.number in peer.queue and peer.session is not None:
-            # It waits for others that the peer is answering: that it is slow is no sign that it is gone.
+            # The request is queued behind others that the peer is answering; its delay does not mean that the peer
+            # failed.
             left = min(peer.session.heard_at, inquiry.asked_at + LONGEST_QUEUED) + inquiry.grace - now
             if left <= 0:
                 self._fail(inquiry, _QUEUED)
@@ -282,28 +282,28 @@ class Asker:
             else:
                 self._set_timer(inquiry, left)
         elif inquiry.is_bulky or inquiry.progress_at >= 0:
-            # Parcels are repeated by their sender; only a peer that forgot the session must be helped.
+            # The courier retransmits fragments; a handshake is needed only if the peer lost the session.
             if is_silent or now - session.heard_at > LONGEST:
                 self._open(inquiry)
             self._set_timer(inquiry, LONGEST)
         elif inquiry.tries >= self._peers.tries:
-            is_knocking = peer.opening is not None and not peer.opening.is_resting
-            if inquiry.is_patient or not is_silent or is_knocking or not peer.round_trip.is_measured:
+            is_opening = peer.opening is not None and not peer.opening.is_resting
+            if inquiry.is_patient or not is_silent or is_opening or not peer.round_trip.is_measured:
                 self._set_timer(inquiry, left)
             else:
                 self._fail(inquiry, f"no answer to {inquiry.tries} tries")
         else:
             if is_silent and not inquiry.is_light and inquiry.tries >= self._peers.doubtful(peer):
-                self._open(inquiry)  # perhaps it restarted and knows no session
+                self._open(inquiry)  # the peer may have restarted without the session
             self._try(inquiry)
 
     def _try_queued(self, peer: Peer) -> int:
-        """Send the next questions to a peer, as many as may be on their way; how many that were."""
+        """Send queued requests to a peer up to ``MAX_IN_FLIGHT``; return their number."""
         sent = 0
         while peer.queue and peer.in_flight < MAX_IN_FLIGHT and self._peers.usable(peer) is not None:
             inquiry = self._inquiries[next(iter(peer.queue))]
             self._leave_queue(inquiry)
-            # Where its caller gave no time-out, the time for the answer begins now.
+            # Without a timeout from the caller, the time for the answer starts now.
             inquiry.deadline = max(inquiry.deadline, self._clock.seconds() + inquiry.grace)
             self._try(inquiry)
             sent += 1
@@ -314,28 +314,28 @@ class Asker:
             inquiry.peer.taken_up(inquiry.number)
             self._queued -= 1
 
-    def _of(self, peer: Peer) -> list[Inquiry]:
+    def _inquiries_of(self, peer: Peer) -> list[Inquiry]:
         return [self._inquiries[number] for number in peer.inquiries]
 
     def _open(self, inquiry: Inquiry) -> bool:
-        """Open a session for a question, which rides in the INIT where it may; False where there are too many."""
+        """Open a session for a request, which the INIT carries if allowed; return False for too many handshakes."""
         left = inquiry.deadline - self._clock.seconds()
         rider = b"" if inquiry.changes else aged(inquiry.message, left)
         return self._peers.open(inquiry.peer, inquiry.address, rider, within=min(left, OPENING_S))
 
-    def _unheard(self, opening: Opening) -> None:
-        """Give up what waited for a handshake that nobody answered."""
+    def _fail_unanswered(self, opening: Opening) -> None:
+        """Fail the requests that waited for a handshake that got no answer."""
         peer = opening.peer
         self._counters["untold"] += len(peer.tells)
         peer.tells = ()
         if peer.sessions:
-            for inquiry in self._of(peer):
+            for inquiry in self._inquiries_of(peer):
                 if inquiry.tries >= self._peers.tries:  # it waited for this handshake only
-                    self._due(inquiry)
+                    self._on_timer(inquiry)
             return  # the others have their own timers
-        for inquiry in self._of(peer):
-            had_its_chance = inquiry.asked_at <= opening.started_at and inquiry.address == opening.address
-            if inquiry.is_patient or not had_its_chance:
+        for inquiry in self._inquiries_of(peer):
+            was_tried = inquiry.asked_at <= opening.started_at and inquiry.address == opening.address
+            if inquiry.is_patient or not was_tried:
                 if not self._open(inquiry):
                     self._fail(inquiry, _CROWDED)
             else:
@@ -344,7 +344,7 @@ class Asker:
     def _set_timer(self, inquiry: Inquiry, wait: float) -> None:
         cancel(inquiry.timer)
         wait = max(0.0, min(wait, inquiry.deadline - self._clock.seconds()))
-        inquiry.timer = self._clock.callLater(wait, self._due, inquiry)
+        inquiry.timer = self._clock.callLater(wait, self._on_timer, inquiry)
 
     def _fail_all(self, inquiries: list[Inquiry], error: Callable[[], Exception]) -> None:
         for inquiry in inquiries:
@@ -358,14 +358,14 @@ class Asker:
         inquiry.deferred.errback(kind(f"{inquiry.method} asked of {inquiry.address}: {why}"))
 
     def _cancel(self, inquiry: Inquiry) -> None:
-        """Forget a question because its asker does not wait any more, and say so to the peer."""
+        """Forget a request that its caller cancelled, and notify the peer."""
         self._forget(inquiry)
         session = self._peers.usable(inquiry.peer)
         if session is not None and inquiry.tries:
             self._send(session, encoded(Cancel(inquiry.number)))
 
     def _forget(self, inquiry: Inquiry) -> None:
-        """Let go of a question, and send the next one in its place."""
+        """Remove a request and send the next queued one."""
         self._drop(inquiry)
         self._try_queued(inquiry.peer)
 
@@ -385,4 +385,4 @@ class Asker:
 
 
 def _too_large(method: str, message: bytes, most: int) -> str:
-    return f"{method}: the message has {len(message)} bytes, {most} can be sent; split or shorten it"
+    return f"{method}: the message has {len(message)} bytes, the limit is {most}; split or shorten it"

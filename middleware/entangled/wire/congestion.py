@@ -1,4 +1,4 @@
-"""Congestion: how fast a path may be used: how long an answer is waited for, how often and how much is sent."""
+"""Estimate round trips and loss of a path, and control the sending rate."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 
 FIRST_GUESS = 0.1
 SHORTEST = 0.05
-# On an even path the deviation goes to zero; without this the time-out would come together with the answer.
+# On a path without jitter the deviation converges to zero; this minimum keeps the timeout longer than the round trip.
 GRAIN = 0.01
 LATE = 0.002
 LONGEST = 1.0
@@ -18,21 +18,23 @@ BASE_S = 10.0
 SAMPLE = 32
 ROUND_SAMPLES = 8
 FIRST_GAIN, GAIN = 1 / 16, 1 / 128
-"""The weight of the first datagram, as if 15 had arrived before, and of each from the hundredth on."""
+"""The weight of the first datagram, as if 15 had arrived before it, and of each one after the first hundred."""
 MOST_AT_ONCE = 4
-"""What a gap counts for at most: after a cut, or a frozen peer, one session tells of hundreds."""
+"""The most losses that one gap counts for: after a partition or a suspended peer, one session shows a gap of hundreds.
+"""
 LEAST = 0.01
-"""Less is none: the usual tries are there for that."""
+"""Smaller loss rates count as zero: the usual number of tries covers them."""
 RARE = 1e-4
-"""The share of exchanges that may fail though both sides live."""
+"""The tolerated rate of exchanges that fail although both sides are alive."""
 MOST_TRIES = 12
 
 
 class RoundTrip:
-    """The measured round trips of one peer, in seconds; ``wait`` is the time-out of the next first try.
+    """The measured round trips of one peer, in seconds; ``wait`` is the timeout of the next first try.
 
-    After Jacobson (1988) and RFC 6298, with shorter bounds: smoothed time plus four deviations; an answer after more
-    than one try measures nothing (Karn), it only keeps the longer wait until a first try is answered again.
+    After Jacobson (1988) and RFC 6298, with shorter bounds: smoothed time plus four deviations. An answer after more
+    than one try is not measured (Karn's algorithm); it only keeps the longer timeout until a first try is answered
+    again.
     """
 
     __slots__ = ("wait", "is_measured", "_smoothed", "_deviation", "_shortest")
@@ -45,7 +47,7 @@ class RoundTrip:
         self._shortest = shortest
 
     def measured(self, seconds: float) -> None:
-        """Learn from an answer to a first try."""
+        """Update the estimate with the round trip of a first try."""
         if self.is_measured:
             self._deviation += (abs(seconds - self._smoothed) - self._deviation) / 4
             self._smoothed += (seconds - self._smoothed) / 8
@@ -56,38 +58,39 @@ class RoundTrip:
 
     @property
     def mean(self) -> float | None:
-        """The smoothed round trip in seconds, or None where nothing was measured yet."""
+        """The smoothed round trip in seconds, or None before the first measurement."""
         return self._smoothed if self.is_measured else None
 
     @property
     def likely(self) -> float | None:
-        """Within how many seconds most answers come, or None where nothing was measured yet."""
+        """The time in seconds within which most answers arrive, or None before the first measurement."""
         return self._smoothed + max(LATE, 2 * self._deviation) if self.is_measured else None
 
     @property
     def usual(self) -> float:
-        """Within how many seconds nearly every answer comes; the first wait where nothing was measured yet."""
+        """The time in seconds within which nearly all answers arrive; at first the initial timeout."""
         if not self.is_measured:
             return self.wait
         return max(self._smoothed * 9 / 8, self._smoothed + max(LATE, 4 * self._deviation))
 
     def ambiguous(self, seconds: float) -> None:
-        """Learn from an answer to one of several tries, so long after the first: the wait was perhaps too short.
+        """Lengthen the timeout after an answer to a retransmitted request, ``seconds`` after its first try.
 
-        Where nothing is known, the way may be as long as that.
+        Before the first measurement ``seconds`` may be the length of the path.
         """
         longer = self.wait * BACK_OFF
         self.wait = min(LONGEST, longer if self.is_measured else max(longer, seconds))
 
 
 class Window:
-    """How many parts may be under way to one peer: slow start, then slow increase and multiplicative decrease.
+    """The congestion window: the number of fragments that may be under way to one peer.
 
-    Radio loses datagrams without being full, and halving the window at each of them would leave a window of five at 5 %
-    loss.  So a loss counts as congestion only with a queue behind it, as in TCP Veno (Fu and Liew, 2003), or when more
-    than one in six of at least ``SAMPLE`` parts is lost.  A queue is seen as in HyStart (Ha and Rhee, 2008; RFC 9406):
-    even the quickest of ``ROUND_SAMPLES`` round trips takes longer than the quickest of the last ``BASE_S`` seconds by
-    an eighth of that, by 4 ms, and by twice what round trips usually differ from one to the next: jitter is no queue.
+    It grows in slow start, then slowly, and decreases multiplicatively. Radio links lose datagrams without congestion,
+    and halving the window at each loss would leave a window of five at 5 % loss. Therefore a loss counts as congestion
+    only if a queue builds up, as in TCP Veno (Fu and Liew, 2003), or if more than one in six of at least ``SAMPLE``
+    fragments is lost. A queue is detected as in HyStart (Ha and Rhee, 2008; RFC 9406): the minimum of ``ROUND_SAMPLES``
+    round trips exceeds the minimum of the last ``BASE_S`` seconds by an eighth of it, by 4 ms, and by twice the usual
+    difference between successive round trips, because jitter is not a queue.
     """
 
     __slots__ = (
@@ -117,7 +120,7 @@ class Window:
         self._taken = self._lost = 0
 
     def taken(self, count: int, order: int, last_order: int, round_trip: float | None, now: float) -> None:
-        """Learn from a receipt for ``count`` parts, the newest being sent as number ``order`` of ``last_order``."""
+        """Process an acknowledgement of ``count`` fragments; the newest was number ``order`` of ``last_order`` sent."""
         if round_trip is not None:
             self._quickest = min(self._quickest, round_trip)
             self._samples += 1
@@ -133,25 +136,25 @@ class Window:
             self.size += count * max(1 / self.size, 1 / 32)
         self.size = min(self.size, MOST_WINDOW)
         if order >= self._round_end and self._samples >= ROUND_SAMPLES:
-            self._judge()
+            self._adjust_to_congestion()
             self._round_end = last_order + 1
             self._quickest = math.inf
             self._samples = 0
 
     def lost(self, count: int) -> None:
-        """Take note of parts that were lost."""
+        """Count lost fragments."""
         self._lost += count
 
     def collapse(self) -> None:
-        """Begin from little: a round trip and more has passed without any receipt."""
+        """Restart from the smallest window, after more than a round trip without any receipt."""
         self._threshold = max(LEAST_WINDOW, self.size / 2)
         self.size = LEAST_WINDOW
 
     def rested(self) -> None:
-        """Forget what was learned of a path that has not been used for a while."""
+        """Reduce the window to its initial size after the path was idle."""
         self.size = min(self.size, FIRST_WINDOW)
 
-    def _judge(self) -> None:
+    def _adjust_to_congestion(self) -> None:
         is_queueing = self._quickest > self._base + max(0.004, self._base / 8, 2 * self._jitter)
         is_known = self._lost + self._taken >= SAMPLE
         if (is_queueing and self._lost > 0) or (is_known and 6 * self._lost > self._lost + self._taken):
@@ -164,11 +167,10 @@ class Window:
 
 
 class Loss:
-    """``share`` is that of the datagrams sent to us, lately, that did not arrive.
+    """Measures the recent loss rate (``share``) of the datagrams to this node.
 
-    Each session counts what it sends, so a gap in the counters of what arrives is what was lost, as in RTP's reports
-    (RFC 3550, section 6.4.1).  Unlike the number of tries that answers took, it cannot mistake a slow answer for a lost
-    one.
+    Each session numbers the datagrams that it sends, so a gap in the received numbers is a loss, as in the reports of
+    RTP (RFC 3550, section 6.4.1).  Unlike a count of retransmissions, it does not mistake a slow answer for a lost one.
     """
 
     __slots__ = ("share", "_gain")
@@ -178,9 +180,9 @@ class Loss:
         self._gain = FIRST_GAIN
 
     def arrived(self, ahead: int) -> None:
-        """Learn from a datagram whose counter is so far ahead of the newest one before it in its session.
+        """Update the rate with a datagram, its counter being ``ahead`` of the newest one before it in its session.
 
-        One that was overtaken (0 or less) had been counted as lost.
+        A reordered datagram (0 or less) was counted as lost before.
         """
         for _ in range(1, min(ahead, MOST_AT_ONCE + 1)):
             self._learn(1.0)
@@ -190,13 +192,13 @@ class Loss:
             self.share = max(0.0, self.share - self._gain)
 
     def _learn(self, lost: float) -> None:
-        self._gain = max(GAIN, self._gain / (1 + self._gain))  # the mean of all, and later of the last ones
+        self._gain = max(GAIN, self._gain / (1 + self._gain))  # the mean of all, and later a moving average
         self.share += (lost - self.share) * self._gain
 
     @property
     def tries(self) -> int:
-        """In how many tries an exchange fails but rarely, where as much is lost on the way there as on the way back."""
+        """The number of tries after which an exchange rarely fails, if both directions lose the same share."""
         if self.share < LEAST:
             return 1
-        fails = 1 - (1 - self.share) ** 2
-        return min(MOST_TRIES, math.ceil(math.log(RARE) / math.log(fails)))
+        failure_rate = 1 - (1 - self.share) ** 2
+        return min(MOST_TRIES, math.ceil(math.log(RARE) / math.log(failure_rate)))

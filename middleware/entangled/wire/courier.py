@@ -1,7 +1,7 @@
-"""Courier: carries parcels: hands those that go out to flows, puts together those that come in, and keeps the bounds.
+"""Transfer messages that are larger than a datagram, in fragments.
 
-What waits here is bounded by peer and by node: a message that finds no room to go out is refused at once, and one that
-finds no room to come in waits at its sender.
+Outgoing messages go to the ``Flow`` of their peer; incoming fragments are reassembled here, within limits per peer and
+node: an outgoing message without room is rejected at once, an incoming one without room waits at its sender.
 """
 
 from __future__ import annotations
@@ -27,24 +27,24 @@ from middleware.entangled.wire.message import (
 )
 from middleware.entangled.wire.session import Session
 
-# Going out: eight of the largest to one peer, so that a burst of writes is not refused; 16 MiB in all.
+# Outgoing: eight of the largest messages to one peer, so that a burst of writes is accepted; 16 MiB in all.
 MAX_OUT_OF_PEER = 8 * MAX_MESSAGE
 MAX_OUT = 16 * MAX_MESSAGE
-# Coming in: four of the largest of one peer, 8 MiB in all: a fifth of an edge node's memory.
+# Incoming: four of the largest messages of one peer; 8 MiB in all, a fifth of the memory of an edge node.
 MAX_IN_OF_PEER = 4 * MAX_MESSAGE
 MAX_IN = 8 * MAX_MESSAGE
-# The parts that all senders together may have under way to us: what the usual receive buffer of 208 KiB holds.
+# Fragments that all senders together may have under way to this node: the usual receive buffer of 208 KiB.
 ROOM_PARTS = 128
 LEAST_ROOM = 4
 LONGEST_S = 60.0
-# Where there is no room for one more, parcels that are older than this and grow more slowly than so many parts (88
-# kbit/s) in a second are given up: else a few members could hold all the room with parcels that they never finish.
+# If the buffer is full, messages that are older than SETTLED_S seconds and grow by fewer than SLOW fragments per second
+# (88 kbit/s) are dropped: otherwise a few peers could fill the buffer with messages that they never finish.
 SETTLED_S, SLOW = 1.0, 8.0
 CLEARING_S = 0.5
-# Whose parcel was given up does not get this part of the room for a while; so it is there for others.
+# A peer that had a message dropped may not use this part of the buffer for TARDY_S seconds, so that others can.
 KEPT_FREE = 2 * MAX_MESSAGE
 TARDY_S, MAX_TARDY = 60.0, 1024
-# Of this many questions a receiver knows that it has had them; their repeated parts get a receipt and are dropped.
+# Completed incoming requests that are remembered; their repeated fragments are acknowledged and dropped.
 MAX_ENDED = 1024
 MAX_FLOWS = 64
 TELL_S = 0.1
@@ -52,7 +52,7 @@ TELL_S = 0.1
 
 @dataclass(slots=True)
 class Assembly:
-    """A parcel that arrives.  ``here`` has bit n set where part n has come."""
+    """A message that is being reassembled. Bit n of ``here`` is set if fragment n has arrived."""
 
     total: int
     begun_at: float
@@ -62,21 +62,21 @@ class Assembly:
 
     @classmethod
     def of(cls, total: int, now: float) -> Assembly:
-        """An empty one."""
+        """Return an empty assembly for a message of ``total`` bytes."""
         return cls(total, now, now, [b""] * part_count(total))
 
     @property
     def is_whole(self) -> bool:
-        """Whether every part is here."""
+        """Whether every fragment has arrived."""
         return self.here == (1 << len(self.parts)) - 1
 
     def is_slow(self, now: float) -> bool:
-        """Whether it has to give way to others where room is short."""
+        """Return whether the message may be dropped to make room for others."""
         age = now - self.begun_at
         return age > SETTLED_S and self.here.bit_count() < SLOW * age
 
     def add(self, part: Part, now: float) -> bool:
-        """Put a part into its place; whether to tell its sender at once, since it leaves a gap or is here twice."""
+        """Store a fragment; return whether to acknowledge it at once, because it leaves a gap or is a duplicate."""
         self.heard_at = now
         bit = 1 << part.number
         if self.here & bit:
@@ -87,17 +87,17 @@ class Assembly:
         return leaves_gap
 
     def message(self) -> bytes:
-        """What the parts make together."""
+        """Return the fragments joined in order."""
         return b"".join(self.parts)
 
 
 class Courier:
-    """Carries parcels for an endpoint.
+    """The message fragmenter of an endpoint.
 
-    ``send`` seals bytes for a peer, ``deliver`` is called with a session and each message that has arrived whole,
-    ``first_wait`` says how long to wait for a peer's first receipt, ``is_awaited`` whether anybody waits for the answer
-    of a peer to a question.  ``on_progress`` is called with the id of a question of ours and a peer whenever the peer
-    got a part of it, or we one of the answer.
+    ``send`` seals bytes for a peer; ``deliver`` is called with a session and each message that has arrived completely;
+    ``first_wait`` returns the time in seconds to wait for a peer's first receipt; ``is_awaited`` returns whether a
+    request to a peer still waits for its answer. ``on_progress`` is called with the id of a request of this node and a
+    peer, whenever the peer acknowledged a fragment of the request or a fragment of the answer arrived.
     """
 
     def __init__(
@@ -121,10 +121,10 @@ class Courier:
         self._bytes_out: Counter[bytes] = Counter()
         self._assemblies: dict[tuple[bytes, Key], Assembly] = {}
         self._bytes_in: Counter[bytes] = Counter()
-        self._ended: dict[tuple[bytes, Key], None] = {}
+        self._completed: dict[tuple[bytes, Key], None] = {}
         self._sweeper: IDelayedCall | None = None
         self._cleared_at = -CLEARING_S
-        self._tardy: dict[bytes, float] = {}
+        self._penalized_at: dict[bytes, float] = {}
 
     def stop(self) -> None:
         """Forget everything and cancel every timer."""
@@ -134,12 +134,12 @@ class Courier:
         self._flows.clear()
         self._assemblies.clear()
         self._bytes_in.clear()
-        self._ended.clear()
-        self._tardy.clear()
+        self._completed.clear()
+        self._penalized_at.clear()
         self._bytes_out.clear()
 
     def reserve(self, public: bytes, size: int) -> bool:
-        """Whether a message of ``size`` bytes may wait here for a peer; it counts until it is ``released``."""
+        """Reserve room for a message of ``size`` bytes to a peer until ``release``; return whether there was room."""
         if self._bytes_out[public] + size > MAX_OUT_OF_PEER or self._bytes_out.total() + size > MAX_OUT:
             self._counters["crowded"] += 1
             return False
@@ -147,43 +147,43 @@ class Courier:
         return True
 
     def release(self, public: bytes, size: int) -> None:
-        """Take note that a message for which there was room is not held any more."""
+        """Free the room of a message that is no longer buffered."""
         self._bytes_out[public] -= size
         if self._bytes_out[public] <= 0:
             del self._bytes_out[public]
 
     def post(self, public: bytes, key: Key, message: bytes) -> bool:
-        """Carry a message to a peer.  A question has its room already; False where an answer finds none."""
+        """Send a message to a peer; return False if an answer finds no room. A request has reserved its room before."""
         flow = self._flows.get(public)
         if flow is None:
             flow = self._new_flow(public)
-        self._flows[public] = self._flows.pop(public)  # whichever was used longest ago stands first
+        self._flows[public] = self._flows.pop(public)  # the flow that was unused for longest stands first
         if key in flow.parcels:
-            return True  # it is under way
+            return True  # it is already under way
         if key.is_answer and not self.reserve(public, len(message)):
             return False
         flow.post(key, message)
         return True
 
     def is_carrying(self, public: bytes, key: Key) -> bool:
-        """Whether a message is under way to a peer and not yet acknowledged whole."""
+        """Return whether a message is under way to a peer and not yet completely acknowledged."""
         flow = self._flows.get(public)
         return flow is not None and key in flow.parcels
 
     def drop(self, public: bytes, key: Key) -> None:
-        """Stop carrying a message to a peer."""
+        """Stop sending a message to a peer."""
         flow = self._flows.get(public)
         if flow is not None:
             flow.drop(key)
 
     def restart(self, public: bytes) -> None:
-        """Begin what goes to a peer anew: there is a new session, so perhaps the peer was restarted."""
+        """Restart the messages to a peer in its new session, because a restarted peer lost the earlier fragments."""
         flow = self._flows.get(public)
         if flow is not None and flow.parcels:
             flow.restart()
 
     def evict(self, public: bytes) -> None:
-        """Forget what goes to a peer and comes from it."""
+        """Forget all messages to and from a peer."""
         flow = self._flows.get(public)
         for key in list(flow.parcels) if flow is not None else ():
             self.drop(public, key)
@@ -191,13 +191,13 @@ class Courier:
             self.forget(*where)
 
     def let_go(self, public: bytes) -> None:
-        """Forget how fast the way to a peer is, where nothing goes there."""
+        """Forget the congestion state of the path to a peer, if no message is under way."""
         flow = self._flows.get(public)
         if flow is not None and not flow.parcels:
             del self._flows[public]
 
     def on_receipt(self, session: Session, plain: bytes) -> None:
-        """Take a RECEIPT."""
+        """Process a RECEIPT."""
         try:
             receipt = receipt_of(plain)
         except Malformed:
@@ -208,7 +208,7 @@ class Courier:
         if flow is not None and receipt.key in flow.parcels:
             now = self._clock.seconds()
             if now - flow.told_at >= TELL_S:
-                # Those that wait for their turn make progress, too.
+                # Requests that wait for their turn make progress, too.
                 flow.told_at = now
                 for key in flow.parcels:
                     if not key.is_answer:
@@ -216,7 +216,7 @@ class Courier:
             flow.take(receipt)
 
     def on_part(self, session: Session, plain: bytes) -> None:
-        """Take a PART."""
+        """Process a PART."""
         try:
             part = part_of(plain)
         except Malformed:
@@ -226,7 +226,7 @@ class Courier:
         where = (public, key)
         assembly = self._assemblies.get(where)
         if assembly is None:
-            is_over = not self._is_awaited(key.id, public) if key.is_answer else where in self._ended
+            is_over = not self._is_awaited(key.id, public) if key.is_answer else where in self._completed
             if is_over:
                 self._counters["unasked" if key.is_answer else "repeated"] += 1
                 if part.is_wanted:
@@ -248,7 +248,7 @@ class Courier:
         if assembly.is_whole:
             self.forget(public, key)
             if not key.is_answer:
-                keep(self._ended, where, None, MAX_ENDED)
+                keep(self._completed, where, None, MAX_ENDED)
             self._send(public, packed_receipt(key, True, 0, part.number, assembly.here))
             self._deliver(session, key, assembly.message())
             return
@@ -259,20 +259,20 @@ class Courier:
             self._on_progress(key.id, public)
 
     def _has_room(self, public: bytes, size: int, now: float) -> bool:
-        """Whether another parcel of a peer can come in; slow ones make room for it."""
+        """Return whether another message of a peer can be buffered; slow ones are dropped to make room."""
         if self._bytes_in[public] + size > MAX_IN_OF_PEER:
             return False
-        most = MAX_IN - KEPT_FREE if now - self._tardy.get(public, -TARDY_S) < TARDY_S else MAX_IN
+        most = MAX_IN - KEPT_FREE if now - self._penalized_at.get(public, -TARDY_S) < TARDY_S else MAX_IN
         if self._bytes_in.total() + size > MAX_IN and now - self._cleared_at >= CLEARING_S:
             self._cleared_at = now
             for where in [where for where, assembly in self._assemblies.items() if assembly.is_slow(now)]:
-                self._give_up(where, now)
+                self._drop_incoming(where, now)
         return self._bytes_in.total() + size <= most
 
-    def _give_up(self, where: tuple[bytes, Key], now: float) -> None:
+    def _drop_incoming(self, where: tuple[bytes, Key], now: float) -> None:
         self._counters["abandoned"] += 1
         self.forget(*where)
-        keep(self._tardy, where[0], now, MAX_TARDY)
+        keep(self._penalized_at, where[0], now, MAX_TARDY)
 
     def _new_flow(self, public: bytes) -> Flow:
         if len(self._flows) >= MAX_FLOWS:
@@ -280,16 +280,16 @@ class Courier:
             for other in idle[:1]:
                 del self._flows[other]
 
-        def carried(parcel: Parcel) -> None:
+        def on_ended(parcel: Parcel) -> None:
             if parcel.key.is_answer:
                 self.release(public, len(parcel.data))
 
-        flow = Flow(self._clock, lambda plain: self._send(public, plain), carried, self._first_wait(public))
+        flow = Flow(self._clock, lambda plain: self._send(public, plain), on_ended, self._first_wait(public))
         self._flows[public] = flow
         return flow
 
     def forget(self, public: bytes, key: Key) -> None:
-        """Forget what has come of a message from a peer."""
+        """Forget the fragments of a message from a peer."""
         assembly = self._assemblies.pop((public, key), None)
         if assembly is not None:
             self._bytes_in[public] -= assembly.total
@@ -299,10 +299,10 @@ class Courier:
                 cancel(self._sweeper)
 
     def _sweep(self) -> None:
-        """Forget what has not grown for ``IDLE_S``, or takes longer than ``LONGEST_S``."""
+        """Drop messages that received nothing for ``IDLE_S`` or took longer than ``LONGEST_S``."""
         now = self._clock.seconds()
         for where, assembly in list(self._assemblies.items()):
             if now - assembly.heard_at >= IDLE_S or now - assembly.begun_at >= LONGEST_S:
-                self._give_up(where, now)
+                self._drop_incoming(where, now)
         if self._assemblies:
             self._sweeper = self._clock.callLater(1.0, self._sweep)

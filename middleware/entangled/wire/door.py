@@ -1,14 +1,15 @@
-"""Door: whom a node lets in, and what it lets them do; the endpoint asks it, and it knows nothing of wires.
+"""Decide which nodes a team admits and which methods they may call, independently of the transport.
 
-An open team lets in whoever holds its key.  In a closed one each side shows a *pass* in the handshake, and its door
-judges the other's.  Which passes hold, and who has which role, is the affair of whoever makes the door; here are only
-the names of the refusals, with what to do about each.
+An open team admits every node that holds its key.  In a closed team each side shows a *pass* in the handshake, and the
+admission check (``Door``) of the other side judges it.  The implementation of ``Door`` decides which passes are valid
+and which roles they grant; this module defines only the refusal codes, with a remedy for each.
 
-A store that was copied makes two nodes with one identity.  So each life of an identity has a number that grows from
-start to start, and eight random bytes: of two lives the later one holds, and the other one is told.
+A copied store makes two nodes with one identity.  Therefore each incarnation (``Life``) of an identity has a number
+that grows from start to start, and eight random bytes: of two incarnations the later one is admitted, and the other is
+refused.
 
-Each INIT has a timestamp that grows within a life.  So a recorded INIT is older than the newest one of its sender, or
-equal to it, and is refused (after WireGuard, Donenfeld 2017, section 5.1; the life number takes the place of its wall
+Each INIT has a timestamp that grows within an incarnation.  A replayed INIT is older than the newest one of its sender,
+or equal to it, and is dropped (after WireGuard, Donenfeld 2017, section 5.1; the incarnation number replaces its wall
 clock, which a robot may not have).
 """
 
@@ -23,10 +24,10 @@ from middleware.entangled.token_bucket import TokenBucket
 
 NONCE = 8
 MAX_ROOM = 640
-"""Bytes of a pass at most: so a handshake has room for a question beside it."""
+"""The maximum length of a pass in bytes, which leaves room for a request in the handshake."""
 MAX_LIFE = 2**63 - 1
 MAX_LIVES = 4096
-"""Identities whose lives are remembered; the one that was heard longest ago goes first."""
+"""The number of identities with a remembered incarnation; the least recently met one is deleted first."""
 MAX_NOTED = 1024
 LINES = 20.0
 
@@ -34,24 +35,24 @@ EXPIRED, EARLY, REVOKED, FOREIGN = "expired", "early", "revoked", "foreign"
 DOUBLED, SUPERSEDED, ROLE, UNLISTED = "doubled", "superseded", "role", "unlisted"
 
 _REFUSALS = {
-    EXPIRED: "the certificate has expired, or one of the two clocks is wrong; look at both clocks (swarm doctor tells"
-    " which is off), else have the operator renew that node (swarm renew)",
-    EARLY: "the certificate is not valid yet, or one of the two clocks is wrong; look at both clocks (swarm doctor"
-    " tells which is off), else wait until it is",
-    REVOKED: "the operator revoked the certificate; only a new code lets that node in again (swarm invite, swarm join)",
-    FOREIGN: "the certificate is not one of this team; join with a code of this team's operator (swarm join CODE)",
-    DOUBLED: "another node runs with the same identity; stop one of them, for each needs a membership or store of"
-    " its own; if the files were stolen, have the operator revoke them (swarm revoke, swarm rotate)",
-    SUPERSEDED: "a node with the same identity was started later; stop one of them, for each needs a membership or"
-    " store of its own; if the files were stolen, have the operator revoke them (swarm revoke, swarm rotate)",
-    UNLISTED: "the membership list has no room for it, or its invitation or its gateway was used too often; have the"
-    " operator look at the list (swarm members) and revoke those who should not be there (swarm revoke)",
-    ROLE: "its role does not allow that; ask the operator for another role",
+    EXPIRED: "the certificate has expired, or one of the two clocks is wrong; check both clocks (swarm doctor shows"
+    " which is wrong), else have the operator renew that node's certificate (swarm renew)",
+    EARLY: "the certificate is not valid yet, or one of the two clocks is wrong; check both clocks (swarm doctor"
+    " shows which is wrong), else wait until it is valid",
+    REVOKED: "the operator revoked the certificate; admit the node again with a new code (swarm invite, swarm join)",
+    FOREIGN: "the certificate belongs to another team; join with a code of this team's operator (swarm join CODE)",
+    DOUBLED: "another node runs with the same identity; stop one of them, because each needs a separate membership or"
+    " store; if the files were stolen, have the operator revoke them (swarm revoke, swarm rotate)",
+    SUPERSEDED: "a node with the same identity was started later; stop one of them, because each needs a separate"
+    " membership or store; if the files were stolen, have the operator revoke them (swarm revoke, swarm rotate)",
+    UNLISTED: "the membership list is full, or the invitation or the gateway of the node was used too often; have the"
+    " operator check the list (swarm members) and revoke unwanted members (swarm revoke)",
+    ROLE: "the role of the node does not allow this call; ask the operator for another role",
 }
 
 
 class Life(NamedTuple):
-    """One life of an identity: ``number`` grows from start to start (0: nobody counts), ``nonce`` is random."""
+    """One incarnation of an identity: ``number`` grows from start to start (0: not counted), ``nonce`` is random."""
 
     number: int = 0
     nonce: bytes = bytes(NONCE)
@@ -61,9 +62,9 @@ UNCOUNTED = Life()
 
 
 class Authority(NamedTuple):
-    """Why the certificate of an owner of records does not hold at present (``refusal``); else its roles and its name.
+    """The roles and name of an owner of records, or the ``refusal`` that applies to its certificate at present.
 
-    ``FOREIGN`` stands for an owner whose certificate this node has not seen.
+    An owner has the refusal FOREIGN while this node has not seen its certificate.
     """
 
     refusal: str = ""
@@ -72,79 +73,79 @@ class Authority(NamedTuple):
 
     @property
     def is_final(self) -> bool:
-        """Whether no clock and no certificate that is yet to come can make the records good that it does not cover."""
+        """Whether neither time nor a later certificate can validate records that this authority does not cover."""
         return self.refusal in ("", REVOKED, ROLE)
 
 
 class Door(Protocol):
-    """Whom a team lets in; the endpoint asks again at each handshake, so what it answers may change.
+    """The admission check of a team; the endpoint repeats it at each handshake, so its results may change.
 
-    ``room`` is the number of bytes that a pass of this team may take, at most ``MAX_ROOM``, and the same for all its
-    members; 0 in an open team.  ``shown`` is this node's own pass, ``life`` the life that it lives.  ``fingerprint``
-    is what anybody may know of the team, 8 bytes (zero: it does not say).  The methods answer as an open team does.
+    ``room`` is the maximum length of a pass in this team, at most ``MAX_ROOM`` and equal for all members; 0 in an open
+    team.  ``shown`` is this node's pass, ``life`` its current incarnation.  ``fingerprint`` is the public identifier of
+    the team, 8 bytes (zero: none).  The default methods behave as in an open team.
     """
 
     @property
     def room(self) -> int:
-        """Bytes that a pass of this team may take."""
+        """The maximum length of a pass of this team in bytes."""
 
     @property
     def shown(self) -> bytes:
-        """This node's own pass."""
+        """This node's pass."""
 
     @property
     def life(self) -> Life:
-        """The life that this node lives."""
+        """The current incarnation of this node."""
 
     @property
     def fingerprint(self) -> bytes:
-        """Eight bytes by which strangers tell this team from others; zero where it does not say."""
+        """Eight bytes that distinguish this team from others without its key; zero if it has none."""
 
     def judge(self, public: bytes, shown: bytes) -> str:
-        """The name of the refusal of a node with this key that shows this pass; empty where it would be let in.
+        """Return the refusal code of a node with this key that shows this pass; empty if it would be admitted.
 
-        Changes nothing: what it judges may be a recording.
+        It changes no state, because the handshake may be a replay.
         """
         return ""
 
     def admit(self, public: bytes, shown: bytes) -> str:
-        """As ``judge``, of a node that has confirmed its session, so it may be remembered."""
+        """Like ``judge``, for a node that has confirmed its session and may be recorded."""
         return ""
 
     def may(self, public: bytes, method: str) -> bool:
-        """Whether ``public`` is the key of a present member that may call ``method``; no, where it is not known."""
+        """Return whether ``public`` is the key of a present member that may call ``method``; False if unknown."""
         return True
 
     def may_store(self, slot: Slot) -> bool:
-        """Whether the certificate of the owner of ``slot``, as it is at present, allows it to write there."""
+        """Return whether the current certificate of the owner of ``slot`` allows it to write there."""
         return True
 
     def may_stay(self, slot: Slot) -> bool:
-        """Whether what is held in ``slot``, written when its owner was allowed to, may be held on and shown."""
+        """Return whether a record in ``slot`` that was allowed when it was written may still be stored and returned."""
         return True
 
     def authority(self, owner: bytes) -> Authority:
-        """What ``may_store`` goes by for this owner; it changes when that does."""
+        """Return the authority of this owner, on which ``may_store`` is based."""
         return Authority()
 
     def roles_of(self, public: bytes) -> frozenset[str] | None:
-        """Return the roles that the holder of that key has now, none for a stranger or a revoked or expired member.
+        """Return the present roles of the holder of a key; empty for a stranger or a revoked or expired member.
 
-        None means that the team is open and restricts nobody.
+        None means that the team is open and restricts no node.
         """
         return None
 
     def certificate(self, owner: bytes) -> bytes:
-        """The certificate of an owner by which other nodes can judge its records; empty where it is unknown."""
+        """Return the certificate of an owner, by which other nodes can check its records; empty if it is unknown."""
         return b""
 
     def learn(self, owner: bytes, certificate: bytes) -> bool:
-        """Take in the certificate of an owner that another node showed; whether it holds."""
+        """Store the certificate of an owner that another node showed; return whether it is valid."""
         return False
 
 
 class OpenDoor(Door):
-    """The door of an open team: who holds the key is in, and may do everything."""
+    """The admission check of an open team: every node with the team key is admitted and may call everything."""
 
     room = 0
     shown = b""
@@ -154,48 +155,48 @@ class OpenDoor(Door):
 
 OPEN = OpenDoor()
 UNPROTECTED = (
-    "whoever knows its team_key is a member and may do everything, nobody can be put out, and who records the wire"
-    " and learns the key later can pretend to be any newcomer; docs/explanation/trust-model.md says more"
+    "every node that knows the team_key is a member with all rights, no member can be revoked, and an attacker who"
+    " records the traffic and learns the key later can impersonate any newcomer; see docs/explanation/trust-model.md"
 )
-"""What an open team does not protect."""
+"""The security limits of an open team."""
 
 
 def meaning(code: str) -> str:
-    """What a refusal means and what to do about it, in words; the code itself where nobody knows it."""
+    """Return the meaning and the remedy of a refusal code; the code itself if it is unknown."""
     return _REFUSALS.get(code, code)
 
 
 def is_refusal(code: str) -> bool:
-    """Whether ``code`` can be the name of a refusal: 1 to 32 printable ASCII characters."""
+    """Return whether ``code`` is a well-formed refusal code: 1 to 32 printable ASCII characters."""
     return 0 < len(code) <= 32 and code.isascii() and code.isprintable()
 
 
 def next_life(last: int, wall: float) -> int:
-    """The number of the life after ``last`` (0: none is known), begun at ``wall`` seconds.
+    """Return the number of the incarnation after ``last`` (0: unknown) that starts at ``wall`` seconds of Unix time.
 
-    It is a moment where that is later, so that a node that lost its store is not taken for an older copy of itself.
+    It is ``wall`` if that is higher, so that a node that lost its store does not appear as an older copy of itself.
     """
     return min(max(last + 1, int(wall)), MAX_LIFE)
 
 
 class Lives:
-    """Which life of each identity was met last; bounded, and empty after a restart."""
+    """The latest incarnation of each identity; bounded, and empty after a restart."""
 
     def __init__(self) -> None:
-        self._known: dict[bytes, tuple[Life, Life]] = {}  # the last one, and the one before it
+        self._known: dict[bytes, tuple[Life, Life]] = {}  # the latest one, and the one before it
 
     def __len__(self) -> int:
         return len(self._known)
 
     def judge(self, public: bytes, life: Life) -> str:
-        """The name of the refusal of this life, empty where it is the last one or a later one; remembers nothing."""
+        """Return the refusal code of this incarnation; empty if it is the latest or a later one.  Changes no state."""
         last, before = self._known.get(public, (life, life))
         if life == last or life.number > last.number or not life.number:
             return ""
         return SUPERSEDED if life == before else DOUBLED
 
     def met(self, public: bytes, life: Life) -> bool:
-        """Take note of a life that was proved and not refused; whether it follows another one."""
+        """Record an incarnation that was verified and admitted; return whether it replaces another one."""
         if not life.number:
             return False
         last, before = self._known.get(public, (life, life))
@@ -203,12 +204,12 @@ class Lives:
         return life != last
 
     def forget(self, public: bytes) -> None:
-        """Forget what is known of an identity."""
+        """Forget the incarnations of an identity."""
         self._known.pop(public, None)
 
 
 class Stamps:
-    """The newest INIT of each identity that was let in; bounded, and empty after a restart."""
+    """The newest INIT of each admitted identity; bounded, and empty after a restart."""
 
     def __init__(self) -> None:
         self._newest: dict[bytes, tuple[Life, int]] = {}
@@ -217,10 +218,10 @@ class Stamps:
         return len(self._newest)
 
     def take(self, public: bytes, life: Life, stamp: int) -> bool:
-        """Whether an INIT is newer than every one before it of its sender; it is the newest one then.
+        """Return whether an INIT is newer than every earlier one of its sender, and record it.
 
-        An INIT may be noted before its session is confirmed: a recording is never newer than what its sender sends
-        next.  Without a life or a timestamp it counts as new.
+        An INIT may be recorded before its session is confirmed: a replay is never newer than the next INIT of its
+        sender.  An INIT without an incarnation or a timestamp counts as new.
         """
         if not life.number or not stamp:
             return True
@@ -232,26 +233,26 @@ class Stamps:
 
 
 class Noted:
-    """Which refusals were logged, so that each is said once and not for each datagram; bounded.
+    """Refusals that were logged, so that each is logged once instead of for each datagram; bounded.
 
-    Who invents keys can have no more lines written than ``LINES`` at once and one a second.
+    A sender that invents keys causes at most ``LINES`` log lines at once and one per second.
     """
 
     def __init__(self) -> None:
-        self._said: dict[tuple[object, ...], None] = {}
-        self._lines = TokenBucket(1.0, LINES)
+        self._logged: dict[tuple[object, ...], None] = {}
+        self._rate_limit = TokenBucket(1.0, LINES)
 
     def is_new(self, now: float, *what: object) -> bool:
-        """Whether to log ``what``; noted it is then."""
-        is_new = what not in self._said
-        if is_new and not self._lines.take(now):
+        """Return whether to log ``what``, and record it then."""
+        is_new = what not in self._logged
+        if is_new and not self._rate_limit.take(now):
             return False
-        keep(self._said, what, None, MAX_NOTED)
+        keep(self._logged, what, None, MAX_NOTED)
         return is_new
 
 
 def checked_secrets(secrets: Sequence[bytes]) -> tuple[bytes, ...]:
-    """The secrets of a team, newest first; raises ``ValueError`` where there is none or one has not 32 bytes."""
+    """Return the secrets of a team, newest first; raise ``ValueError`` if there is none or one is not 32 bytes long."""
     if not secrets or any(len(secret) != 32 for secret in secrets):
         raise ValueError("a team has at least one secret, each of 32 bytes")
     return tuple(dict.fromkeys(secrets))

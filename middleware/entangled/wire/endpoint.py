@@ -1,7 +1,7 @@
-"""Endpoint: a node's end of the wire; asks, answers and tells in sealed datagrams.
+"""Send and answer requests of one node in encrypted datagrams.
 
-It sorts what arrives, keeps the table of sessions, and drops and counts what does not open.  How questions are repeated
-stands in ``asker``, how they are answered in ``answerer``; ``docs/reference/wire-protocol.md`` has every byte.
+The endpoint dispatches received datagrams, keeps the table of sessions, and drops and counts invalid datagrams.
+``asker`` retransmits requests, ``answerer`` answers them; ``docs/reference/wire-protocol.md`` specifies every byte.
 """
 
 from __future__ import annotations
@@ -77,24 +77,25 @@ _REFUSAL = bytes([REFUSAL])
 MAX_REFUSALS = 32
 
 Inside = Callable[[Session, bytes, Address], None]
-"""Takes what a DATA datagram brought: its session, the plaintext, and the address that it came from."""
+"""Takes the content of a DATA datagram: its session, the plaintext, and its source address."""
 
 
 class Endpoint:
-    """The wire of one node.
+    """The wire protocol of one node.
 
-    ``team_key`` (32 bytes) is the secret of the team: who lacks it can neither read nor be answered.  ``rng`` makes the
-    ephemeral keys, so outside of simulations it must be ``random.SystemRandom``, and in them no node may be given dice
-    that fall as those of its former life did.  ``door`` says who is let in, and what a peer may call.
+    ``team_key`` (32 bytes) is the secret of the team: a node without it can neither decrypt nor cause an answer.
+    ``rng`` generates the ephemeral keys, so outside of simulations it must be ``random.SystemRandom``; in simulations a
+    restarted node must not repeat the numbers of its earlier incarnations.  ``door`` decides which nodes are admitted,
+    and which methods a peer may call.
 
-    ``on_contact`` is called when a peer has proved its key and its address: it answered us, or confirmed the session
-    that it opened; ``on_seen`` with a peer and the address from which it sees us; ``on_refused`` when a peer said that
-    it does not let us in, and ``on_refusing`` when we surely do not let it in, each with the name of the refusal;
-    ``on_let_go`` with the key of a peer of which nothing is remembered any more, since it was silent for long.
+    ``on_contact`` is called when a peer has proved its key and its address, by an answer or by confirming a session
+    that it opened; ``on_seen`` with a peer and this node's address as the peer sees it; ``on_refused`` when a peer
+    rejects this node, and ``on_refusing`` when this node rejects an authenticated peer, each with the refusal code;
+    ``on_let_go`` with the key of a peer that was forgotten after a long silence.
 
-    ``counters`` counts every datagram that was dropped, by its reason: oversized, unknown, malformed, forged, replayed,
-    stale (no such session), repeated, misdirected, unasked, late, cancelled, abandoned (a parcel that stopped
-    half-way); what was put off or refused for want of room (crowded, busy); and who or what was not let in (refused).
+    ``counters`` counts dropped datagrams by reason: oversized, unknown, malformed, forged, replayed, stale (no such
+    session), repeated, misdirected, unasked, late, cancelled, abandoned (an incomplete fragmented message); requests
+    and messages rejected for lack of room (crowded, busy); and rejected nodes and calls (refused).
     """
 
     _log = Logger()
@@ -115,20 +116,20 @@ class Endpoint:
         self.on_refusing = Listeners[[Contact, str]]()
         self.on_let_go = Listeners[[bytes]]()
         self.refusals: dict[bytes, tuple[Contact, str]] = {}
-        """By key, the peers that said that they do not let this node in, and the name of the refusal; the last few."""
+        """Peers that reject this node, by key, with the refusal code; the latest ``MAX_REFUSALS``."""
         self.rebuffs = Rebuffs()
-        """Refusals of the last hour, on both sides."""
+        """Rejections of the last hour, in both directions."""
         self.counters: Counter[str] = Counter()
         self.is_running = False
         self._network = network
         self._clock = clock
         self._rng = rng
         self._identity = identity
-        self._own = Credentials.of(identity, team_key)
+        self._credentials = Credentials.of(identity, team_key)
         self._lives = Lives()
         self._stamps = Stamps()
         self._noted = Noted()
-        self._peers = Peers([self._own], clock, rng, network, self.counters, door)
+        self._peers = Peers([self._credentials], clock, rng, network, self.counters, door)
         self._courier = Courier(
             clock,
             self._send_to,
@@ -138,10 +139,10 @@ class Endpoint:
             lambda number, public: self._asker.progressed(number, public),
             self.counters,
         )
-        self._answerer = Answerer(clock, self._send, self._courier, self.counters, door.may, self._may_not)
+        self._answerer = Answerer(clock, self._send, self._courier, self.counters, door.may, self._refuse_call)
         self._asker = Asker(clock, rng, self._peers, self._courier, self._send, self.counters)
         self.greeter = Greeter(identity.public, self._peers, network, clock, rng, self.counters)
-        self._cookies = Cookies(self._own.cookie_key, rng)
+        self._cookies = Cookies(self._credentials.cookie_key, rng)
         self.echoer = Echoer(self.post, clock, lambda: door.fingerprint)
         self.hailer = Hailer(self.post, clock, rng)
         self._sessions = self._peers.sessions
@@ -160,17 +161,17 @@ class Endpoint:
 
     @property
     def address(self) -> Address:
-        """The address of the network underneath."""
+        """The address of the underlying network."""
         return self._network.address
 
     def start(self) -> None:
-        """Open the network; raises ``PortInUse``."""
+        """Open the network; raise ``PortInUse`` if the port is in use."""
         if not self.is_running:
             self._network.listen(self._received)
             self.is_running = True
 
     def stop(self) -> None:
-        """Close the network, forget every session, cancel every timer; what is pending fails with ``NotRunning``."""
+        """Close the network, forget every session, cancel every timer; pending requests fail with ``NotRunning``."""
         if not self.is_running:
             return
         self.is_running = False
@@ -185,35 +186,35 @@ class Endpoint:
         self._peers.stop()
 
     def rekey(self, newest: bytes, *older: bytes) -> None:
-        """Go by another secret of the team (32 bytes) from now on; sessions live on.
+        """Replace the secret of the team (32 bytes); existing sessions continue.
 
-        What this node begins is under the ``newest``; what others begin may be under one of the ``older`` ones too,
-        while not everybody has heard, and who does not answer to the one is asked under the next.  Raises
-        ``ValueError`` for what is no secret.
+        This node opens handshakes under the ``newest`` secret.  While not all members have it, handshakes under the
+        ``older`` ones are accepted too, and a peer that does not answer under one secret is retried under the next.
+        Raises ``ValueError`` for an invalid secret.
         """
         secrets = checked_secrets([newest, *older])
         self._peers.rekey([Credentials.of(self._identity, secret) for secret in secrets])
-        self._own = self._peers.ring[0]
+        self._credentials = self._peers.ring[0]
 
     def evict(self, public: bytes, code: str = REVOKED) -> None:
-        """Have nothing more to do with a peer: it is told ``code``, and what is asked of it fails with ``NotAdmitted``.
+        """Close the sessions with a peer: send it ``code``, and fail the requests to it with ``NotAdmitted``.
 
-        That it does not come in again is for the door to say.
+        The admission check must reject the peer from then on.
         """
         peer = self._peers.known(public)
         if peer is not None and peer.session is not None:
             self._refuse(peer.session, code)
         else:
-            self._part(public, f"{public.hex()[:16]} is not let in: {meaning(code)}", code)
+            self._disconnect(public, f"{public.hex()[:16]} is rejected: {meaning(code)}", code)
 
     def route(self, kind: int, receiver: Callable[[bytes, Address], None]) -> None:
-        """Hand datagrams with the first byte ``kind`` to ``receiver``; raises ``ValueError`` for one that is taken."""
+        """Pass datagrams with the first byte ``kind`` to ``receiver``; raise ``ValueError`` if the kind is taken."""
         if kind in self._receivers:
-            raise ValueError(f"datagrams of the kind {kind:#x} have their receiver")
+            raise ValueError(f"datagrams of kind {kind:#x} already have a receiver; use another kind")
         self._receivers[kind] = receiver
 
     def post(self, datagram: bytes, to: Address) -> None:
-        """Send a datagram of a routed kind as it is; without effect while the endpoint is not running."""
+        """Send a datagram of a routed kind unencrypted; no effect while the endpoint is not running."""
         if self.is_running:
             self._network.send(datagram, to)
 
@@ -227,37 +228,38 @@ class Endpoint:
     ) -> None:
         """Let peers call ``answer(peer, *arguments)`` under ``name``.
 
-        It returns something that msgpack can hold (``MAX_MESSAGE`` at most), a Deferred or a coroutine of it, or raises
-        ``Refused``: the asker gets it with its code and its text.
-        Arguments that do not fit the function's parameters and plain annotations are refused before it runs; other
-        exceptions are logged, and the asker gets ``Refused("internal error")``.  It runs only in an established
-        session, and with ``changes`` at most once for each question; a repeated one is given the answer of the first.
-        Say ``idempotent`` as well where a second run does no harm: then nothing need be kept of the first.
+        The function returns a value that msgpack can encode (at most ``MAX_MESSAGE`` bytes), a Deferred or a coroutine
+        of one, or raises ``Refused``, which the requester receives with its code and text.  Arguments that do not match
+        the function's parameters and plain annotations are rejected before it runs; other exceptions are logged, and
+        the requester receives ``Refused("internal error")``.  The function runs only in an established session.  With
+        ``changes`` it runs at most once per request, and a repeated request receives the first answer.  Also set
+        ``idempotent`` if a second run does no harm: then no answer is kept.
 
-        With ``early`` it may also run for a question that came with an INIT, which saves a round trip.  Anybody may
-        send a recorded INIT from a forged address, so an early method only reads, sends nothing, and returns its
-        result, not a Deferred; ``ValueError`` where it ``changes`` something.
+        With ``early`` it may also run for a request inside an INIT, which saves a round trip.  An attacker may send a
+        replayed INIT from a forged address, so an early method only reads, sends nothing, and returns its result, not a
+        Deferred; ``ValueError`` if it ``changes`` something.
 
-        When the asker gives up or its time is over, a Deferred or coroutine is cancelled.  A function with a
-        keyword-only parameter ``deadline`` gets that moment, in seconds of this node's clock (infinite where none).
+        A Deferred or coroutine is cancelled when the requester gives up or its timeout expires.  A function with a
+        keyword-only parameter ``deadline`` receives that time, in seconds of this node's clock (infinite if there is
+        none).
         """
         self._answerer.methods[name] = Method(name, answer, changes, idempotent, early)
 
     def route_inside(self, kind: int, receiver: Inside) -> None:
-        """Hand what peers send in confirmed sessions with this first byte to ``receiver``.
+        """Pass messages in confirmed sessions with this first byte to ``receiver``.
 
-        Such a datagram does not move its peer's address, for it may come by another way than the usual one.
+        They do not change the address of their peer, because they may arrive by a path other than the usual one.
         """
         self._inside[kind] = receiver
 
     def send_inside(self, session: Session, plain: bytes, to: Address | None = None) -> None:
-        """Seal ``plain`` for the peer of a session and send it where the peer is, or ``to`` another address of it."""
+        """Seal ``plain`` for the peer of a session and send it to the peer's address, or to its address ``to``."""
         if self.is_running:
             self._network.send(self._sealed(session, plain), to or session.contact.address)
 
     @property
     def peers(self) -> Peers:
-        """What is remembered of the others."""
+        """The state of the other nodes."""
         return self._peers
 
     def ask(
@@ -269,63 +271,63 @@ class Endpoint:
         changes: bool = False,
         is_light: bool = False,
     ) -> Deferred[Any]:
-        """Ask a peer, and try again until it answers, at most four times and for ``timeout`` seconds.
+        """Send a request to a peer, with four tries (more at a high loss rate) within ``timeout`` seconds.
 
-        Question and answer may have ``MAX_MESSAGE`` bytes; what does not fit into a datagram goes as a parcel.  Of many
-        questions to one peer the later ones wait for their turn.  Without ``timeout`` the answer has 1.5 s, counted
-        from that turn and anew at each sign that a parcel makes progress.  With a longer one the tries are spread over
-        it, for methods that take their time.  Say ``changes`` where the method changes
-        something: such a question waits for the session, others ride in the handshake.  For one that ``is_light`` no
-        session is opened beside the one that there is, however silent the peer.
+        Request and answer may have ``MAX_MESSAGE`` bytes; if larger than a datagram they are sent in fragments.  Of
+        many requests to one peer the later ones wait in a queue.  The default timeout is 1.5 s, counted from the moment
+        when the request leaves the queue and restarted by each acknowledged fragment.  With a longer ``timeout`` the
+        tries are distributed over it, for slow methods.  Set ``changes`` if the method has side effects: such a request
+        waits for the session, others ride in the handshake.  A request that ``is_light`` opens no new session while
+        there is an old one, even if the peer is silent.
 
         Fails with ``NoAnswer``, ``Refused`` (the peer's code and text), ``TooLarge``, ``Crowded``, ``NotAdmitted``,
-        ``NotRunning``, or with the ``TypeError`` of arguments that msgpack cannot hold.  When it is
-        cancelled, the peer is told and cancels its work.
+        ``NotRunning``, or with the ``TypeError`` of arguments that msgpack cannot encode.  Cancelling the Deferred also
+        cancels the work at the peer.
         """
         if not self.is_running:
             return defer.fail(NotRunning("the endpoint is not running; start it first"))
         return self._asker.ask(contact, method, arguments, timeout, changes, is_light)
 
     def tell(self, contact: Contact, method: str, *arguments: object) -> None:
-        """Call a peer's method once, without answer and without a second try; raises ``TooLarge`` and ``NotRunning``.
+        """Send a notification: call a peer's method once, without an answer or retransmission.
 
-        It must fit into one datagram.  Opens a session first where there is none.
+        It must fit into one datagram.  Opens a session if there is none.  Raises ``TooLarge`` and ``NotRunning``.
         """
         if not self.is_running:
             raise NotRunning("the endpoint is not running; start it first")
         self._asker.tell(contact, method, arguments)
 
     def is_met(self, contact: Contact) -> bool:
-        """Whether there is a session with ``contact``, so that a question needs one round trip and no handshake."""
+        """Return whether there is a session with ``contact``; then a request needs one round trip and no handshake."""
         peer = self._peers.known(contact.public)
         return peer is not None and self._peers.is_in_touch(peer)
 
     def round_trip(self, contact: Contact) -> float | None:
-        """How long an answer of ``contact`` takes, in seconds, or None where nobody was timed yet."""
+        """Return the smoothed round trip to ``contact`` in seconds, or None if it was not measured."""
         peer = self._peers.known(contact.public)
         return None if peer is None else peer.round_trip.mean
 
     @property
     def traffic(self) -> Mapping[str, int]:
-        """What the network underneath counts (``sent``, ``received``, ...); empty where it counts nothing."""
+        """The counters of the underlying network (``sent``, ``received``, ...); empty if it has none."""
         return dict(getattr(self._network, "counters", {}))
 
     def greet(self, address: Address, timeout: float = PATIENCE) -> Deferred[Contact]:
-        """Learn who listens at ``address``; fails with ``NoAnswer``.  The contact has not proved its key yet."""
+        """Discover the contact at ``address``; fails with ``NoAnswer``.  The contact has not proved its key yet."""
         if not self.is_running:
             return defer.fail(NotRunning("the endpoint is not running; start it first"))
         return self.greeter.greet(address, timeout)
 
     def overhear(self, datagram: bytes, source: Address) -> None:
-        """Take a datagram that came by another way than the node's own port; answers leave by that port."""
+        """Process a datagram that did not arrive at the node's own port; answers are sent from that port."""
         if self.is_running:
             self._received(datagram, source)
 
     def let_go(self, seconds: float) -> None:
-        """Forget the sessions on which nothing was heard for so long, where nobody waits for anything from the peer.
+        """Forget the peers that sent nothing for ``seconds``, unless a request to them is pending.
 
-        The other side does the same, or finds out by its next question in vain: either opens another one when it is
-        wanted.
+        The other side does the same, or discovers it with its next unanswered request; either side opens a new session
+        when it needs one.
         """
         now = self._clock.seconds()
         self._half_open.sweep(now)
@@ -335,12 +337,12 @@ class Endpoint:
             self.on_let_go(public)
 
     def reopen(self, contact: Contact) -> None:
-        """Open a session at the contact's address, though there may be one elsewhere; the newest one is used."""
+        """Open a session at the contact's address even if there is one elsewhere; the newest session is used."""
         if self.is_running:
             self._peers.open(self._peers.peer(contact), contact.address)
 
     def hail(self, address: Address, timeout: float = PATIENCE) -> Deferred[Echo]:
-        """Ask who is at ``address`` at all, of whatever team; fails with ``NoAnswer``.  Anybody may have said it."""
+        """Probe ``address`` for a node of any team; fails with ``NoAnswer``.  The reply is not authenticated."""
         if not self.is_running:
             return defer.fail(NotRunning("the endpoint is not running; start it first"))
         return self.hailer.hail(address, timeout)
@@ -378,7 +380,7 @@ class Endpoint:
         self._peers.loss.arrived(ahead)
         session.heard_at = self._clock.seconds()
         if data[:1] == _REFUSAL:
-            self._turned_away(session, data[1:])
+            self._on_refusal(session, data[1:])
             return
         if session.is_over:
             self._refuse(session, SUPERSEDED)
@@ -388,9 +390,9 @@ class Endpoint:
             session.contact = Contact(session.contact.public, source)
             self._peers.moved(session)
         if not session.is_confirmed:
-            code = self._judged(session.contact.public, session.shown, session.life, self.door.admit)
+            code = self._find_refusal(session.contact.public, session.shown, session.life, self.door.admit)
             session.shown = b""
-            if code:  # two of them knocked at once, or there is no room to remember it
+            if code:  # two nodes with one identity opened a session at once, or the membership list is full
                 self._refuse(session, code)
                 return
             self._half_open.confirm(session)
@@ -408,9 +410,9 @@ class Endpoint:
         elif data[0] == RECEIPT:
             self._courier.on_receipt(session, data)
         else:
-            self._read(data, session)
+            self._on_message(data, session)
 
-    def _read(self, data: bytes, session: Session) -> None:
+    def _on_message(self, data: bytes, session: Session) -> None:
         try:
             message = decoded(data)
         except Malformed:
@@ -426,7 +428,7 @@ class Endpoint:
             self._resolve(message, session.contact)
 
     def _on_parcel(self, session: Session, key: Key, data: bytes) -> None:
-        """Take a message that arrived in parts; it must be what its parcel said."""
+        """Process a message that arrived in fragments; reject one with a kind or id other than its fragments say."""
         try:
             message = decoded(data)
         except Malformed:
@@ -456,7 +458,7 @@ class Endpoint:
     def _on_init(self, datagram: bytes, source: Address) -> None:
         own = None
         if INIT_LEAST + self.door.room <= len(datagram) <= MAX_DATAGRAM:
-            for own in self._peers.ring:  # written out: this is all that a forged INIT shall cost
+            for own in self._peers.ring:  # inlined, because a forged INIT must cost no more than this
                 if is_init_of_team(own, datagram):
                     break
             else:
@@ -469,7 +471,7 @@ class Endpoint:
             self.counters["forged"] += 1
             return
         known = self._half_open.response(datagram, now)
-        if known is not None:  # the RESP was lost, or somebody plays a recording: neither costs a key exchange
+        if known is not None:  # the RESP was lost, or the INIT is a replay: neither costs a key exchange
             self.counters["repeated"] += 1
             self._network.send(known, source)
             return
@@ -482,20 +484,20 @@ class Endpoint:
         except Forged:
             self.counters["forged"] += 1
             return
-        response = self._admitted(acceptance, source, now)
+        response = self._response_to(acceptance, source, now)
         if response and self.is_running:
             self._half_open.answered(datagram, response, now)
             self._network.send(response, source)
 
-    def _admitted(self, acceptance: Acceptance, source: Address, now: float) -> bytes:
-        """The RESP for who proved its key by an INIT; nothing where that is a recording, or its message malformed."""
+    def _response_to(self, acceptance: Acceptance, source: Address, now: float) -> bytes:
+        """Return the RESP for an INIT that proved its sender's key; nothing for a replay or a malformed message."""
         contact, hello = self._peers.contact(acceptance.public, source), self._peers.hello
-        code = self._judged(contact.public, acceptance.shown, acceptance.life, self.door.judge)
-        if code:  # that is all that comes of it: it may be a recording, with a pass that was succeeded since
+        code = self._find_refusal(contact.public, acceptance.shown, acceptance.life, self.door.judge)
+        if code:  # no further effects: the INIT may be a replay, with a pass that was replaced since
             self.counters["refused"] += 1
-            self._say_refusing(contact, code)
-            if code not in (DOUBLED, SUPERSEDED):  # who plays a recording shall not make people look for a copy
-                self._met("we", contact, code)
+            self._log_refusal(contact, code)
+            if code not in (DOUBLED, SUPERSEDED):  # a replay must not make operators look for a copied identity
+                self._record_rejection("we", contact, code)
             return acceptance.refuse(code, source, hello.life)
         if not self._stamps.take(contact.public, acceptance.life, acceptance.stamp):
             self.counters["replayed"] += 1
@@ -509,7 +511,7 @@ class Endpoint:
         if isinstance(rider, Question):
             answer = self._answerer.ride(rider, contact, acceptance.answer_room(hello))
         if not self.is_running:
-            return b""  # the method stopped us
+            return b""  # the method stopped the endpoint
         index = self._peers.new_index()
         response, keys = acceptance.accept(index, answer, source, hello)
         session = Session(contact, index, acceptance.remote_index, keys, now, is_confirmed=False, life=acceptance.life)
@@ -537,12 +539,12 @@ class Endpoint:
         index = opening.invitation.local_index
         self._peers.accepted(opening)
         if reply.refusal:
-            self._refused_by(contact, reply.refusal)
+            self._record_refusal(contact, reply.refusal)
             return
         session = Session(
             contact, index, reply.remote_index, reply.keys, self._clock.seconds(), is_confirmed=True, life=reply.life
         )
-        code = self._judged(contact.public, reply.shown, reply.life, self.door.admit)
+        code = self._find_refusal(contact.public, reply.shown, reply.life, self.door.admit)
         if code:
             self._refuse(session, code)
             return
@@ -561,47 +563,47 @@ class Endpoint:
         if self.is_running:
             self._established(session, is_owed=True)
 
-    # -- who is let in ----------------------------------------------------------------------------------------------
+    # -- admission --------------------------------------------------------------------------------------------------
 
-    def _judged(self, public: bytes, shown: bytes, life: Life, judge: Callable[[bytes, bytes], str]) -> str:
+    def _find_refusal(self, public: bytes, shown: bytes, life: Life, judge: Callable[[bytes, bytes], str]) -> str:
         if len(shown) > self.door.room:
             return FOREIGN
         return self._lives.judge(public, life) or judge(public, shown)
 
     def _refuse(self, session: Session, code: str) -> None:
-        """Tell a peer on ``session`` that it is not let in, and have nothing more to do with it."""
+        """Notify a peer on ``session`` that it is rejected, and close its sessions."""
         contact = session.contact
         self._send(session, _REFUSAL + code.encode("ascii"))
         self.counters["refused"] += 1
-        self._say_refusing(contact, code)
-        self._met("we", contact, code)
+        self._log_refusal(contact, code)
+        self._record_rejection("we", contact, code)
         self.on_refusing(contact, code)
         self._half_open.forget(session)
         self._peers.drop(session)
         peer = self._peers.known(contact.public)
         if code not in (DOUBLED, SUPERSEDED) or peer is None or not peer.sessions:
-            self._part(contact.public, f"{contact.address} is not let in: {meaning(code)}", code)
+            self._disconnect(contact.public, f"{contact.address} is rejected: {meaning(code)}", code)
 
-    def _turned_away(self, session: Session, said: bytes) -> None:
-        """Take it from a peer that it does not let us in."""
+    def _on_refusal(self, session: Session, said: bytes) -> None:
+        """Process the notification of a peer that it rejects this node."""
         code = said.decode("ascii", errors="replace")
         if not is_refusal(code):
             self.counters["malformed"] += 1
             return
         self._peers.drop(session)
-        self._refused_by(session.contact, code)
+        self._record_refusal(session.contact, code)
 
-    def _refused_by(self, contact: Contact, code: str) -> None:
-        text = f"{contact.address} does not let this node in: {meaning(code)}"
-        self._met("they", contact, code)
-        if self._is_news(contact.public, code, True):
+    def _record_refusal(self, contact: Contact, code: str) -> None:
+        text = f"{contact.address} rejects this node: {meaning(code)}"
+        self._record_rejection("they", contact, code)
+        if self._is_new_to_log(contact.public, code, True):
             self._log.warn("{text}", text=text, code=code)
-        self._part(contact.public, text, code)
+        self._disconnect(contact.public, text, code)
         keep(self.refusals, contact.public, (contact, code), MAX_REFUSALS)
         self.on_refused(contact, code)
 
-    def _part(self, public: bytes, text: str, code: str) -> None:
-        """Forget everything that is under way with a peer; what is asked of it fails."""
+    def _disconnect(self, public: bytes, text: str, code: str) -> None:
+        """Forget the sessions and messages of a peer, and fail the requests to it."""
         self._half_open.drop(public)
         self._answerer.evict(public)
         peer = self._peers.known(public)
@@ -610,20 +612,20 @@ class Endpoint:
             self._asker.refused(peer, lambda: NotAdmitted(text, code))
         self._courier.evict(public)
 
-    def _met(self, side: Side, contact: Contact, code: str) -> None:
+    def _record_rejection(self, side: Side, contact: Contact, code: str) -> None:
         self.rebuffs.met(contact.public, str(contact.address), side, code, meaning(code), self._clock.seconds())
 
-    def _say_refusing(self, contact: Contact, code: str) -> None:
-        if self._is_news(contact.public, code):
+    def _log_refusal(self, contact: Contact, code: str) -> None:
+        if self._is_new_to_log(contact.public, code):
             who, why = contact.public.hex()[:16], meaning(code)
-            self._log.warn("{who} at {at} is not let in: {why}", who=who, at=contact.address, why=why, code=code)
+            self._log.warn("{who} at {at} is rejected: {why}", who=who, at=contact.address, why=why, code=code)
 
-    def _is_news(self, *what: object) -> bool:
+    def _is_new_to_log(self, *what: object) -> bool:
         return self._noted.is_new(self._clock.seconds(), *what)
 
-    def _may_not(self, peer: Contact, method: str) -> None:
-        self._met("call", peer, ROLE)
-        if self._is_news(peer.public, ROLE):
+    def _refuse_call(self, peer: Contact, method: str) -> None:
+        self._record_rejection("call", peer, ROLE)
+        if self._is_new_to_log(peer.public, ROLE):
             who, why = peer.public.hex()[:16], meaning(ROLE)
             self._log.warn(
                 "{who} at {at} may not call {method}: {why}",
@@ -645,7 +647,7 @@ class Endpoint:
         return session.seal(message)
 
     def _send_to(self, public: bytes, message: bytes) -> None:
-        """Send on the newest session with a peer; where there is none the message is lost, as datagrams may be."""
+        """Send in the newest session with a peer; without a session the message is lost, as any datagram may be."""
         peer = self._peers.known(public)
         if peer is not None and peer.session is not None:
             self._send(peer.session, message)

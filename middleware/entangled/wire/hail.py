@@ -1,7 +1,8 @@
-"""Hail: HAIL and ECHO, by which anybody learns who is there at all; neither is sealed, and nothing secret is in them.
+"""Probe an address for a node of any team, with HAIL and ECHO; neither is encrypted or contains a secret.
 
-Who finds no team, or not its own, learns so whether an address is reached, which team is there, which version it
-speaks, by how much the clocks differ, and from where it is seen.  An ECHO is as long as its HAIL, and there are few.
+A node that finds no team, or not its own, learns from it whether an address is reachable, which team is there, the
+protocol version, the clock difference, and its own external address.  HAIL and ECHO have the same length, and ECHOs are
+rate-limited.
 """
 
 from __future__ import annotations
@@ -26,16 +27,16 @@ VERSION = 1
 TOKEN = 16
 FINGERPRINT = 8
 RATE = 20.0
-"""Echoes in a second: enough for every doctor of a team, and 8 kbit/s at most."""
+"""ECHOs per second: enough for the diagnostics of a whole team, and 8 kbit/s at most."""
 _HEAD = 1 + TOKEN
 HAIL_BYTES = _HEAD + 1 + FINGERPRINT + 8 + ADDRESS
 
 
 class Echo(NamedTuple):
-    """Who is there.
+    """The content of an ECHO.
 
-    ``fingerprint`` tells its team from others (zero: an open team, which does not say), ``wall`` is what its clock
-    shows, in unix seconds (0: it does not say), ``seen`` from where the HAIL came.
+    ``fingerprint`` identifies the team (zero: an open team), ``wall`` is the clock of its node in Unix seconds (0:
+    unknown), ``seen`` is the source address of the HAIL.
     """
 
     token: bytes
@@ -46,22 +47,22 @@ class Echo(NamedTuple):
 
 
 def hail(token: bytes) -> bytes:
-    """The question of anybody; ``token`` (16 bytes) comes back."""
+    """Return a HAIL; ``token`` (16 bytes) is returned in the ECHO."""
     return (bytes([HAIL]) + token).ljust(HAIL_BYTES, b"\0")
 
 
 def echo(asked: bytes, fingerprint: bytes, wall: float, source: Address) -> bytes:
-    """The answer to the HAIL ``asked``, which came from ``source``; raises ``Malformed`` where it is none."""
+    """Return the ECHO for the HAIL ``asked`` from ``source``; raise ``Malformed`` if it is no HAIL."""
     if len(asked) != HAIL_BYTES or asked[0] != HAIL:
-        raise Malformed("a HAIL of a wrong length")
+        raise Malformed("the HAIL has the wrong length")
     moment = max(0, int(1000 * wall)).to_bytes(8, "little")
     return bytes([ECHO]) + asked[1:_HEAD] + bytes([VERSION]) + fingerprint + moment + packed_address(source)
 
 
 def echo_of(datagram: bytes) -> Echo:
-    """What an ECHO says; raises ``Malformed``."""
+    """Decode an ECHO; raise ``Malformed``."""
     if len(datagram) != HAIL_BYTES or datagram[0] != ECHO:
-        raise Malformed("an ECHO of a wrong length")
+        raise Malformed("the ECHO has the wrong length")
     rest = datagram[_HEAD:]
     fingerprint, moment = rest[1 : 1 + FINGERPRINT], rest[1 + FINGERPRINT : -ADDRESS]
     wall = int.from_bytes(moment, "little") / 1000
@@ -69,7 +70,7 @@ def echo_of(datagram: bytes) -> Echo:
 
 
 class Echoer:
-    """Answers HAILs, ``RATE`` of them in a second; ``send`` sends a datagram, ``wall`` gives unix seconds."""
+    """Answers up to ``RATE`` HAILs per second; ``send`` sends a datagram, ``wall`` returns Unix seconds."""
 
     def __init__(
         self, send: Callable[[bytes, Address], None], clock: IReactorTime, fingerprint: Callable[[], bytes]
@@ -81,7 +82,7 @@ class Echoer:
         self._bucket = TokenBucket(RATE)
 
     def on_hail(self, datagram: bytes, source: Address) -> str:
-        """Answer one; why it was not, in one word."""
+        """Answer a HAIL; return the reason in one word if it was dropped."""
         try:
             answer = echo(datagram, self._fingerprint(), self.wall(), source)
         except Malformed:
@@ -94,7 +95,7 @@ class Echoer:
 
 @dataclass(slots=True, eq=False)
 class Probe(Generic[T]):
-    """A question to an address; ``datagrams`` are sent in turn."""
+    """A request to an address without a session; ``datagrams`` are sent in turn."""
 
     address: Address
     datagrams: Sequence[bytes]
@@ -106,9 +107,9 @@ class Probe(Generic[T]):
 
 
 class Probes(Generic[T]):
-    """Sends each question again until it is answered or its time is up; ``send`` sends a datagram."""
+    """Resends each probe until it is answered or its timeout expires; ``send`` sends a datagram."""
 
-    silence = "nobody answers"
+    silence = "no answer"
 
     def __init__(self, send: Callable[[bytes, Address], None], clock: IReactorTime) -> None:
         self._send = send
@@ -116,7 +117,7 @@ class Probes(Generic[T]):
         self._pending: dict[bytes, Probe[T]] = {}
 
     def stop(self, error: Exception) -> None:
-        """Fail what is pending with ``error``."""
+        """Fail the pending probes with ``error``."""
         for token in list(self._pending):
             probe = self._forget(token)
             if probe is not None:
@@ -151,19 +152,19 @@ class Probes(Generic[T]):
 
 
 class Hailer(Probes[Echo]):
-    """Hails addresses until one answers or the time is up; ``send`` sends a datagram."""
+    """Sends HAILs to addresses; ``send`` sends a datagram."""
 
     def __init__(self, send: Callable[[bytes, Address], None], clock: IReactorTime, rng: random.Random) -> None:
         super().__init__(send, clock)
         self._rng = rng
 
     def hail(self, address: Address, timeout: float = 1.5) -> Deferred[Echo]:
-        """Who is at ``address``; fails with ``NoAnswer`` after ``timeout`` seconds."""
+        """Probe ``address``; fails with ``NoAnswer`` after ``timeout`` seconds."""
         token = self._rng.randbytes(TOKEN)
         return self._begin(token, address, [hail(token)], timeout)
 
     def on_echo(self, datagram: bytes, source: Address) -> str:
-        """Take an answer; why it was dropped, in one word."""
+        """Process an ECHO; return the reason in one word if it was dropped."""
         try:
             answer = echo_of(datagram)
         except Malformed:

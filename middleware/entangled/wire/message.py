@@ -1,15 +1,15 @@
-"""Message: what travels inside sealed datagrams: messages as strict msgpack, parts of large ones, receipts for these.
+"""Encode and decode the content of sealed datagrams: messages as strict msgpack, fragments, and receipts for fragments.
 
-``decoded``, ``part_of`` and ``receipt_of`` are total: they give what they promise or raise ``Malformed``, whatever the
-bytes.  Moments never travel.  A part and a receipt each fill one datagram::
+``decoded``, ``part_of`` and ``receipt_of`` accept any bytes: they return a value or raise ``Malformed``.  Absolute
+times are never transmitted.  A fragment (PART) and a receipt each fill one datagram::
 
-    PART     0x01  flags 1  id 8  total bytes 4  number 2  the bytes of this part
+    PART     0x01  flags 1  id 8  total bytes 4  number 2  the bytes of this fragment
     RECEIPT  0x02  flags 1  id 8  next 2  room 2  cause 2  bitmap
 
-All parts but the last have ``PART_BYTES``, so a part has one place where it fits, and parts never overlap.  ``next`` is
-the first part that is missing, bit n of the bitmap (least significant first) says that part ``next + 1 + n`` is here,
-and ``room`` is how many parts from ``next`` on the receiver takes.  ``cause`` is the part that called for the receipt:
-it alone tells the round trip, since earlier receipts for the others may have been lost.
+All fragments but the last have ``PART_BYTES``, so each fragment has one place and fragments never overlap.  ``next`` is
+the first missing fragment, bit n of the bitmap (least significant first) is set if fragment ``next + 1 + n`` has
+arrived, and ``room`` is the number of fragments from ``next`` on that the receiver accepts.  ``cause`` is the fragment
+that triggered the receipt: only its round trip is measured, because earlier receipts for the others may have been lost.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from middleware.entangled.errors import Malformed
 from middleware.entangled.network.network import MAX_DATAGRAM
 from middleware.entangled.wire.session import MAX_PLAIN
 
-# A record of 1 MiB, and room for its other fields and for those of the question around it.
+# A record of 1 MiB, and room for its other fields and for the fields of the request that carries it.
 MAX_MESSAGE = 2**20 + 4096
 MAX_METHOD = 64
 MAX_CODE = 64
 MAX_TEXT = 300
 MAX_DEPTH = 16
-# A byte on the wire can become a list of 56 bytes in memory: so large messages are bounded by what is in them, too.
+# A byte on the wire can become a list of 56 bytes in memory, so the number of items in large messages is limited too.
 MAX_ITEMS = 2**17
 NO_LIMIT_MS = 2**32 - 1
 REFUSED, UNKNOWN_METHOD, BAD_ARGUMENTS = "refused", "unknown-method", "bad-arguments"
@@ -39,10 +39,10 @@ _UINT32 = b"\xce"
 
 PART, RECEIPT = 0x01, 0x02
 REFUSAL = 0x04
-"""Followed by the name of it: who sends this does not let the other in, and forgets the session."""
-OF_ANSWER = 0x01  # flag of both: the parcel is the answer to the question with this id, else the question itself
+"""Followed by the refusal code: the sender rejects the peer and forgets the session."""
+OF_ANSWER = 0x01  # flag of both: the message is the answer to the request with this id, otherwise the request
 WANTED = 0x02  # flag of PART: the sender wants a receipt now
-DONE = 0x02  # flag of RECEIPT: send no more; everything is here, or nobody waits for it
+DONE = 0x02  # flag of RECEIPT: stop sending; all fragments are here, or the message is no longer needed
 _PART_HEAD = 16
 _RECEIPT_HEAD = 16
 PART_BYTES = MAX_PLAIN - _PART_HEAD
@@ -52,10 +52,10 @@ MAX_BITMAP = -(-MAX_PARTS // 8)
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """Asks for ``method``; ``id`` (64 bits) is the asker's and tells a repeated question from a new one.
+    """Calls ``method``; the requester's ``id`` (64 bits) distinguishes a repeated request from a new one.
 
-    The asker waits for nothing any more that it asked this peer more than ``behind`` numbers before this one.
-    ``left_ms`` is how long the asker will still wait, in milliseconds.
+    The requester no longer waits for its requests to this peer with ids of more than ``behind`` below this one.
+    ``left_ms`` is the time that the requester will still wait, in milliseconds.
     """
 
     id: int
@@ -67,7 +67,7 @@ class Question:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What the method returned."""
+    """The result of a method."""
 
     id: int
     value: object
@@ -75,7 +75,7 @@ class Answer:
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """Why there is no value; ``code`` names the kind of error, ``text`` says it in words."""
+    """The error of a request; ``code`` is its kind, ``text`` describes it."""
 
     id: int
     code: str
@@ -84,7 +84,7 @@ class Failure:
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """Calls ``method`` without an answer."""
+    """A notification: calls ``method`` without an answer."""
 
     method: str
     arguments: tuple[object, ...]
@@ -92,7 +92,7 @@ class Told:
 
 @dataclass(frozen=True, slots=True)
 class Cancel:
-    """Says that nobody waits any more for the answer to the question ``id``."""
+    """Tells the responder that the answer to the request ``id`` is no longer needed."""
 
     id: int
 
@@ -101,10 +101,10 @@ Message = Question | Answer | Failure | Told | Cancel
 
 
 def encoded(message: Message) -> bytes:
-    """The bytes of ``message``; raises ``TypeError``, ``ValueError`` or ``OverflowError`` for what cannot be packed."""
+    """Encode ``message``; raise ``TypeError``, ``ValueError`` or ``OverflowError`` if it cannot be packed."""
     match message:
         case Question(id=number, method=method, arguments=arguments, left_ms=left_ms, behind=behind):
-            # The time that is left stands last and always has four bytes, so that ``aged`` can write another one.
+            # The remaining time is last and always has four bytes, so that ``aged`` can replace it.
             head = bytes(msgpack.packb([_QUESTION, number, behind, method, arguments]))
             return b"\x96" + head[1:] + _UINT32 + left_ms.to_bytes(4, "big")
         case Answer(id=number, value=value):
@@ -119,13 +119,13 @@ def encoded(message: Message) -> bytes:
 
 
 def aged(question: bytes, seconds: float) -> bytes:
-    """An encoded question with other ``seconds`` left."""
+    """Return an encoded request with another remaining time of ``seconds``."""
     left_ms = min(NO_LIMIT_MS, max(0, round(seconds * 1000)))
     return question[:-4] + left_ms.to_bytes(4, "big")
 
 
 def decoded(data: bytes) -> Message:
-    """The message that the bytes hold; raises ``Malformed`` and nothing else."""
+    """Decode a message; raise ``Malformed`` and nothing else."""
     is_large = len(data) > MAX_DATAGRAM
     longest = MAX_MESSAGE if is_large else MAX_DATAGRAM
     budget = _Budget() if is_large else None
@@ -142,10 +142,10 @@ def decoded(data: bytes) -> Message:
             max_map_len=min(longest, MAX_ITEMS),
             max_ext_len=0,
         )
-    except Exception as error:  # foreign code on foreign bytes; more kinds than its manual names have been seen
+    except Exception as error:  # untrusted input: msgpack raises more types than it documents
         raise Malformed(f"not msgpack: {type(error).__name__}") from None
     if type(fields) is not list or not fields or type(fields[0]) is not int:  # True and 1.0 are equal to 1, too
-        raise Malformed("no message starts like this")
+        raise Malformed("the message does not start with a list and its kind")
     kind, size = fields[0], len(fields)
     if kind == _QUESTION and size == 6:
         _, id_, behind, method, arguments, left = fields
@@ -167,16 +167,16 @@ def decoded(data: bytes) -> Message:
             return Told(method, tuple(arguments))
     elif kind == _CANCEL and size == 2 and _is_id(fields[1]):
         return Cancel(fields[1])
-    raise Malformed("no message has this shape")
+    raise Malformed("the fields do not match any kind of message")
 
 
 def is_code(value: object) -> bool:
-    """Whether ``value`` may name a kind of error."""
+    """Return whether ``value`` is a well-formed error code."""
     return isinstance(value, str) and 0 < len(value) <= MAX_CODE and value.isascii() and value.isprintable()
 
 
 class _Budget:
-    """Counts what the lists and maps of one message hold, while they are made."""
+    """Counts the items of the lists and maps of one message while they are decoded."""
 
     def __init__(self) -> None:
         self._left = MAX_ITEMS
@@ -185,7 +185,7 @@ class _Budget:
         assert isinstance(items, list | dict)
         self._left -= 1 + len(items)
         if self._left < 0:
-            raise Malformed("a message with too many things in it")
+            raise Malformed(f"the message has more than {MAX_ITEMS} items")
         return items
 
 
@@ -202,8 +202,8 @@ def _is_method(value: object) -> bool:
 
 
 def _is_flat(value: object) -> bool:
-    """Whether nothing is nested deeper than ``MAX_DEPTH``, and nothing is a type that we do not send."""
-    # The unpacker makes nothing but these very types, so none of a derived class can slip through.
+    """Return whether nothing is nested deeper than ``MAX_DEPTH``, and all types are part of the protocol."""
+    # The unpacker creates exactly these types and no subclasses.
     level: list[object] = [value]
     for _ in range(MAX_DEPTH):
         below: list[object] = []
@@ -222,14 +222,14 @@ def _is_flat(value: object) -> bool:
 
 
 class Key(NamedTuple):
-    """Which parcel of a peer: the question ``id``, or the answer to it."""
+    """Identifies a fragmented message of a peer: the request ``id``, or the answer to it."""
 
     is_answer: bool
     id: int
 
 
 class Part(NamedTuple):
-    """What a PART says."""
+    """The content of a PART."""
 
     key: Key
     is_wanted: bool
@@ -239,7 +239,7 @@ class Part(NamedTuple):
 
 
 class Receipt(NamedTuple):
-    """What a RECEIPT says; ``here`` has bit n set where part n is with the receiver."""
+    """The content of a RECEIPT; bit n of ``here`` is set if the receiver has fragment n."""
 
     key: Key
     is_done: bool
@@ -250,25 +250,25 @@ class Receipt(NamedTuple):
 
 
 def part_count(total: int) -> int:
-    """How many parts a message of ``total`` bytes has."""
+    """Return the number of fragments of a message of ``total`` bytes."""
     return -(-total // PART_BYTES)
 
 
 def part_of(plain: bytes) -> Part:
-    """The PART in what a datagram carried; raises ``Malformed``."""
+    """Decode a PART; raise ``Malformed``."""
     flags, total = plain[1] if len(plain) > _PART_HEAD else 0xFF, int.from_bytes(plain[10:14], "little")
     number, data = int.from_bytes(plain[14:16], "little"), plain[_PART_HEAD:]
     if flags & ~(OF_ANSWER | WANTED) or not 0 < total <= MAX_MESSAGE or number >= part_count(total):
-        raise Malformed("a part of no parcel that can be")
+        raise Malformed("a fragment with unknown flags, size or number")
     if len(data) != min(PART_BYTES, total - number * PART_BYTES):
-        raise Malformed("a part that does not fit its place")
+        raise Malformed("a fragment of the wrong length for its number")
     return Part(_key(plain), bool(flags & WANTED), total, number, data)
 
 
 def receipt_of(plain: bytes) -> Receipt:
-    """The RECEIPT in what a datagram carried; raises ``Malformed``."""
+    """Decode a RECEIPT; raise ``Malformed``."""
     if not _RECEIPT_HEAD <= len(plain) <= _RECEIPT_HEAD + MAX_BITMAP or plain[1] & ~(OF_ANSWER | DONE):
-        raise Malformed("a receipt of a wrong length, or with unknown flags")
+        raise Malformed("a receipt of the wrong length, or with unknown flags")
     first = int.from_bytes(plain[10:12], "little")
     room, cause = int.from_bytes(plain[12:14], "little"), int.from_bytes(plain[14:16], "little")
     here = int.from_bytes(plain[_RECEIPT_HEAD:], "little") << (first + 1) | (1 << first) - 1
@@ -276,7 +276,7 @@ def receipt_of(plain: bytes) -> Receipt:
 
 
 def packed_receipt(key: Key, is_done: bool, room: int, cause: int, here: int) -> bytes:
-    """The RECEIPT for a parcel of which the parts in ``here`` have come, the part ``cause`` just now."""
+    """Return the RECEIPT for a message of which the fragments in ``here`` have arrived, ``cause`` being the latest."""
     first = ((here + 1) & ~here).bit_length() - 1  # the lowest bit that is not set
     bitmap = here >> (first + 1)
     head = bytes([RECEIPT, key.is_answer * OF_ANSWER | is_done * DONE]) + key.id.to_bytes(8, "little")

@@ -1,6 +1,6 @@
-"""Method: what peers may call, with arguments checked before it runs; which calls ran; and how errors are named.
+"""Check arguments and run exposed methods, remember the calls that ran, and convert errors to failures and back.
 
-``Ledger`` keeps a repeated question from running twice.  An error crosses the wire as ``Refused``, with its code and
+``Ledger`` prevents a repeated request from running twice.  An error crosses the wire as ``Refused``, with its code and
 its text.
 """
 
@@ -29,25 +29,25 @@ from middleware.entangled.wire.session import Session
 KEPT_S = 30.0
 MAX_PER_PEER = 4096
 LIFE_BITS = 32
-"""Bits of a question's number that an asker counts on in; those above are dice, another throw for each of its lives."""
+"""The low bits of a request id, which a requester increments; the bits above are random and new after each restart."""
 MAX_LIVES = 4
-"""Lives of one peer within ``KEPT_S`` of which is known how far they had come."""
+"""The number of restarts of one peer within ``KEPT_S`` for which ``settled`` is kept."""
 MAX_ENTRIES = 16384
 MAX_ACCOUNTS = 4096
 _PLAIN = (int, float, bool, str, bytes, list, dict, type(None))
 _BY_NAME: dict[str, tuple[type, ...]] = {kind.__name__: (kind,) for kind in _PLAIN}
 _BY_NAME |= {"None": (type(None),), "float": (float, int)}
-_INSIDE = re.compile(r"\[[^\[\]]*\]")
+_TYPE_ARGUMENTS = re.compile(r"\[[^\[\]]*\]")
 
 
 class BadArguments(Refused):
-    """The number or the kinds of the arguments do not fit the method."""
+    """The number or the types of the arguments do not match the method."""
 
     code = BAD_ARGUMENTS
 
 
 class _Form(NamedTuple):
-    """What a function takes beside the peer: how many arguments, of which kinds (None: any), and a deadline."""
+    """The parameters of a function besides the peer: their number, their types (None: any), and a deadline."""
 
     least: int
     most: float
@@ -56,19 +56,19 @@ class _Form(NamedTuple):
 
 
 _FORMS: WeakKeyDictionary[Callable[..., object], _Form] = WeakKeyDictionary()
-"""What the functions of classes take: the same for all nodes of a process."""
+"""The parameters of methods of classes: the same for all nodes of a process."""
 
 
 @dataclass(frozen=True, slots=True)
 class Method:
     """An exposed function.
 
-    ``changes`` says that it runs once for each question; ``is_idempotent`` that a second run does no harm, so that
-    nobody need remember the first one.  ``is_early`` says that it only reads and answers at once, so that it may run
-    before its peer has confirmed the session; every other method runs in an established session only.
+    ``changes``: it runs once per request.  ``is_idempotent``: a second run does no harm, so the first one need not be
+    remembered.  ``is_early``: it only reads and returns immediately, so it may run before its peer has confirmed the
+    session; every other method runs only in an established session.
 
-    A function with a keyword-only parameter ``deadline`` gets there the moment, on the clock of the node, after which
-    nobody waits for its answer.
+    A function with a keyword-only parameter ``deadline`` receives there the time on the node's clock after which its
+    answer is useless.
     """
 
     name: str
@@ -76,7 +76,7 @@ class Method:
     changes: bool = False
     is_idempotent: bool = False
     is_early: bool = False
-    _known: _Form | None = field(default=None, init=False, repr=False, compare=False)
+    _cached_form: _Form | None = field(default=None, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if self.is_early and self.changes:
@@ -84,20 +84,20 @@ class Method:
 
     @property
     def _form(self) -> _Form:
-        """Found out at the first call: to look into all methods would be half of what it takes to make a node."""
-        form = self._known
+        """The parameters, inspected at the first call: inspecting all methods takes half the time to create a node."""
+        form = self._cached_form
         if form is None:
             answer = inspect.unwrap(self.answer)
             function = answer.__func__ if isinstance(answer, types.MethodType) else None
             form = _FORMS.get(function) if function is not None else None
             if form is None:
-                form = self._looked_into()
+                form = self._inspect()
                 if function is not None:
                     _FORMS[function] = form
-            object.__setattr__(self, "_known", form)
+            object.__setattr__(self, "_cached_form", form)
         return form
 
-    def _looked_into(self) -> _Form:
+    def _inspect(self) -> _Form:
         signature = inspect.signature(self.answer)
         positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
         parameters = [parameter for parameter in signature.parameters.values() if parameter.kind in positional]
@@ -112,48 +112,48 @@ class Method:
         )
 
     def _kinds(self, parameters: list[inspect.Parameter]) -> tuple[tuple[type, ...] | None, ...]:
-        """What the annotations admit; most are plain names, which need not be compiled to be understood."""
-        named = [_named(parameter.annotation) for parameter in parameters]
+        """Return the types that the annotations allow; most are plain names, which need not be compiled."""
+        named = [_types_in_annotation(parameter.annotation) for parameter in parameters]
         if all(named):
             return tuple(named)
         try:
             hints = typing.get_type_hints(self.answer)
-        except Exception:  # hints are foreign code too: names imported for type checkers only, partials, callables
+        except Exception:  # annotations may raise anything: names imported for type checkers only, partials, callables
             hints = {}
         return tuple(_kinds(hints.get(parameter.name)) for parameter in parameters)
 
     @property
     def is_once(self) -> bool:
-        """Whether it may run only once for each question."""
+        """Whether it may run only once per request."""
         return self.changes and not self.is_idempotent
 
     def run(self, peer: Contact, arguments: tuple[object, ...], deadline: float = math.inf) -> object:
-        """Call the function; raises ``BadArguments`` where they do not fit, or what the function raises."""
+        """Call the function; raise ``BadArguments`` if the arguments do not match, or the function's exception."""
         least, most, all_kinds, wants_deadline = self._form
         if not least <= len(arguments) <= most:
             count = f"{least}" if least == most else f"{least} to {most}"
-            raise BadArguments(f"{self.name}: takes {count} arguments, was given {len(arguments)}")
+            raise BadArguments(f"{self.name}: takes {count} arguments, got {len(arguments)}")
         for place, (kinds, argument) in enumerate(zip(all_kinds, arguments, strict=False), start=1):
             if kinds is not None and type(argument) not in kinds:
                 wanted = " or ".join("None" if kind is type(None) else kind.__name__ for kind in kinds)
-                raise BadArguments(f"{self.name}: argument {place} must be {wanted}, is {type(argument).__name__}")
+                raise BadArguments(f"{self.name}: argument {place} must be {wanted}, not {type(argument).__name__}")
         if wants_deadline:
             return self.answer(peer, *arguments, deadline=deadline)
         return self.answer(peer, *arguments)
 
 
-def _named(annotation: object) -> tuple[type, ...]:
-    """The plain types that are named in an annotation; none where it is no text, or names anything else."""
+def _types_in_annotation(annotation: object) -> tuple[type, ...]:
+    """Return the plain types named in an annotation; none if it is not a string or names any other type."""
     if not isinstance(annotation, str):
         return ()
-    while (bare := _INSIDE.sub("", annotation)) != annotation:
+    while (bare := _TYPE_ARGUMENTS.sub("", annotation)) != annotation:
         annotation = bare
     kinds = [_BY_NAME.get(name.strip(), ()) for name in annotation.split("|")]
     return sum(kinds, ()) if all(kinds) else ()
 
 
 def _kinds(hint: object) -> tuple[type, ...] | None:
-    """The plain types that a hint admits, or None where it says more than plain types can."""
+    """Return the plain types that a type hint allows, or None if plain types cannot express it."""
     origin = typing.get_origin(hint)
     if origin in (typing.Union, types.UnionType):
         kinds: list[type] = []
@@ -170,7 +170,7 @@ def _kinds(hint: object) -> tuple[type, ...] | None:
 
 
 def failure_of(number: int, trouble: Trouble) -> Failure | None:
-    """What the asker of question ``number`` is told of an error; None where it is not meant for others."""
+    """Return the failure that reports an error to the requester of ``number``; None for an internal error."""
     error = trouble.value
     if isinstance(error, Refused):
         return Failure(number, error.code if is_code(error.code) else Refused.code, str(error))
@@ -180,13 +180,13 @@ def failure_of(number: int, trouble: Trouble) -> Failure | None:
 
 
 def error_of(failure: Failure) -> Refused:
-    """The exception that a failure stands for."""
+    """Return the exception that a failure represents."""
     return BadArguments(failure.text) if failure.code == BAD_ARGUMENTS else Refused(failure.text, failure.code)
 
 
 @dataclass(slots=True)
 class Entry:
-    """One question; ``answer`` is None while it runs, ``session`` is where the answer goes (None: nowhere yet)."""
+    """One request; ``answer`` is None while it runs, the answer is sent in ``session`` (None: discarded)."""
 
     session: Session | None
     is_bulky: bool = False
@@ -198,7 +198,7 @@ class Entry:
 
 @dataclass(slots=True)
 class _Account:
-    """The questions of one peer; ``settled`` has, for each of its lives, the number below which none is open."""
+    """The requests of one peer; ``settled`` has, for each incarnation of the peer, the id below which none is open."""
 
     running: dict[int, Entry] = field(default_factory=dict)
     ended: dict[int, Entry] = field(default_factory=dict)
@@ -207,11 +207,11 @@ class _Account:
 
 
 class Ledger:
-    """The questions that run, and those that ended in the last ``KEPT_S`` seconds, by public key and question id.
+    """The running requests, and the ones that ended in the last ``KEPT_S`` seconds, by public key and request id.
 
-    An asker says with each question which is the oldest one that it still waits for: what is older is forgotten at
-    once, and does not run if it comes late.  When the ledger is full all the same new questions are turned away:
-    forgetting an old one early could run a change twice.
+    A requester includes in each request the oldest one that it still waits for: older ones are forgotten at once, and
+    do not run if they arrive late.  A full ledger rejects new requests: forgetting an old one early could run a method
+    with side effects twice.
     """
 
     def __init__(self) -> None:
@@ -222,20 +222,20 @@ class Ledger:
         return self._count
 
     def entry(self, public: bytes, question: int) -> Entry | None:
-        """What is known of a question."""
+        """Return the entry of a request."""
         account = self._accounts.get(public)
         return None if account is None else account.running.get(question) or account.ended.get(question)
 
     def is_settled(self, public: bytes, question: int) -> bool:
-        """Whether the asker has said that it does not wait for this question any more."""
+        """Return whether the requester no longer waits for this request."""
         account = self._accounts.get(public)
         return account is not None and question < account.settled.get(question >> LIFE_BITS, 0)
 
     def settle(self, public: bytes, oldest: int, now: float) -> None:
-        """Forget what ended of the questions of a peer before ``oldest``: it has those answers, or gave them up."""
+        """Forget the ended requests of a peer before ``oldest``: it has those answers, or gave them up."""
         account = self._account(public, now)
         if account is None:
-            return  # it is turned away in a moment
+            return  # ``begin`` will reject the request
         life = oldest >> LIFE_BITS
         before = account.settled.get(life)
         if before is None and len(account.settled) >= MAX_LIVES:
@@ -248,7 +248,7 @@ class Ledger:
             self._count -= len(had)
 
     def begin(self, public: bytes, question: int, session: Session | None, now: float, is_bulky: bool) -> Entry | None:
-        """Enter a question that is about to run; None where there is no room."""
+        """Add a request that is about to run; return None if there is no room."""
         account = self._account(public, now)
         if account is None or self._count >= MAX_ENTRIES or len(account.running) + len(account.ended) >= MAX_PER_PEER:
             return None
@@ -257,7 +257,7 @@ class Ledger:
         return entry
 
     def end(self, public: bytes, question: int, answer: bytes | None, now: float) -> None:
-        """Keep the ``answer`` of a question that ran, or forget the question where it is None and may run again."""
+        """Store the ``answer`` of a request that ran, or forget the request if it is None and may run again."""
         account = self._accounts.get(public)
         entry = account.running.pop(question, None) if account is not None else None
         if account is None or entry is None:
@@ -271,7 +271,7 @@ class Ledger:
             account.ended[question] = entry
 
     def evict(self, public: bytes) -> list[Deferred[object]]:
-        """Forget the questions of a peer; the work on those that run is for the caller to cancel."""
+        """Forget the requests of a peer; return the running work, which the caller cancels."""
         account = self._accounts.pop(public, None)
         if account is None:
             return []
@@ -281,15 +281,15 @@ class Ledger:
         return [entry.work for entry in account.running.values() if entry.work is not None]
 
     def clear(self) -> None:
-        """Forget everything, and cancel the timers."""
+        """Forget all requests and cancel the timers."""
         for account in self._accounts.values():
             for entry in account.running.values():
                 cancel(entry.timer)
         self._accounts.clear()
         self._count = 0
 
-    def _has_place(self) -> bool:
-        """Whether there is room for one more peer; who has nothing here makes it, the most silent first."""
+    def _make_room(self) -> bool:
+        """Return whether there is room for one more peer, after deleting a peer without requests if necessary."""
         if len(self._accounts) < MAX_ACCOUNTS:
             return True
         idle = (public for public, account in self._accounts.items() if not (account.running or account.ended))
@@ -299,16 +299,16 @@ class Ledger:
         return found is not None
 
     def _account(self, public: bytes, now: float) -> _Account | None:
-        """The account of a peer, without what is over; None where there is no room for another one.
+        """Return the account of a peer without its expired requests; None if there is no room for another one.
 
-        The one that was silent for longest goes, if that is long.
+        The account that was unused for longest is deleted if it has no requests and is older than ``KEPT_S``.
         """
         account = self._accounts.pop(public, None)
         if account is None:
-            if not self._has_place():
+            if not self._make_room():
                 return None
             account = _Account()
-        self._accounts[public] = account  # whoever was silent for longest stands first
+        self._accounts[public] = account  # the peer that was silent for longest stands first
         account.heard_at = now
         self._expire(account, now)
         oldest_public, oldest = next(iter(self._accounts.items()))

@@ -1,8 +1,8 @@
-"""Noise: the handshake ``IK`` of the Noise Protocol Framework, with and without a pre-shared key.
+"""Implement the handshake pattern ``IK`` of the Noise Protocol Framework, with and without a pre-shared key.
 
-Implements ``Noise_IK_25519_ChaChaPoly_BLAKE2s`` and ``Noise_IKpsk1_25519_ChaChaPoly_BLAKE2s`` after the specification
-(noiseprotocol.org, revision 34; section numbers below are its).  With the pre-shared key mixed in at the end of the
-first message's tokens, who lacks the key cannot even read the first payload.  Knows neither datagrams nor sessions.
+The protocols are ``Noise_IK_25519_ChaChaPoly_BLAKE2s`` and ``Noise_IKpsk1_25519_ChaChaPoly_BLAKE2s`` after the
+specification (noiseprotocol.org, revision 34; the section numbers below refer to it).  The pre-shared key is mixed in
+at the end of the first message's tokens, so a node without it cannot decrypt even the first payload.
 """
 
 from __future__ import annotations
@@ -40,12 +40,12 @@ class KeyPair(NamedTuple):
 
 
 def key_pair(secret: bytes) -> KeyPair:
-    """The pair that belongs to 32 secret bytes."""
+    """Return the key pair of 32 secret bytes."""
     return KeyPair(secret, bindings.crypto_scalarmult_base(secret))
 
 
 class TransportKeys(NamedTuple):
-    """What a finished handshake leaves: a key for each direction (32 bytes), and the hash of all that was said."""
+    """The result of a handshake: a key for each direction (32 bytes), and the hash of the transcript."""
 
     sending: bytes
     receiving: bytes
@@ -53,13 +53,13 @@ class TransportKeys(NamedTuple):
 
 
 def sealed(key: bytes, counter: int, plaintext: bytes, ad: bytes) -> bytes:
-    """``plaintext`` under ChaCha20-Poly1305 with Noise's nonce (section 12); 16 bytes longer.
+    """Encrypt ``plaintext`` with ChaCha20-Poly1305 and Noise's nonce (section 12); the result is 16 bytes longer.
 
-    Calls libsodium itself: PyNaCl's wrapper checks six arguments by name each time, which takes three quarters of it.
-    The one check that memory safety needs is that of the key.
+    It calls libsodium directly: the argument checks of PyNaCl's wrapper take three quarters of the time.  The check of
+    the key length is the only one that memory safety requires.
     """
     if len(key) != KEY:
-        raise ValueError(f"a key has {KEY} bytes, this one {len(key)}")
+        raise ValueError(f"a key must have {KEY} bytes, not {len(key)}")
     size = len(plaintext) + TAG
     out = _new(_BYTES, size)
     nonce = _ZERO4 + counter.to_bytes(8, "little")
@@ -69,29 +69,29 @@ def sealed(key: bytes, counter: int, plaintext: bytes, ad: bytes) -> bytes:
 
 
 def opened(key: bytes, counter: int, ciphertext: bytes, ad: bytes) -> bytes:
-    """What ``sealed`` hid; raises ``Forged`` where anything was changed."""
+    """Decrypt the result of ``sealed``; raise ``Forged`` if anything was changed."""
     if len(key) != KEY:
-        raise ValueError(f"a key has {KEY} bytes, this one {len(key)}")
+        raise ValueError(f"a key must have {KEY} bytes, not {len(key)}")
     size = len(ciphertext) - TAG
     if size < 0:
-        raise Forged("a sealed part that is too short")
+        raise Forged("the ciphertext is too short")
     out = _new(_BYTES, size or 1)
     nonce = _ZERO4 + counter.to_bytes(8, "little")
     if _decrypt(out, _NULL, _NULL, ciphertext, len(ciphertext), ad, len(ad), nonce, key):
-        raise Forged("a sealed part does not open")
+        raise Forged("the ciphertext is not authentic")
     result: bytes = _buffer(out, size)[:]
     return result
 
 
-def _shared(secret: bytes, public: bytes) -> bytes:
+def _exchange(secret: bytes, public: bytes) -> bytes:
     try:
         return bindings.crypto_scalarmult(secret, public)
-    except (CryptoError, RuntimeError) as error:  # a point of small order, whose product anybody could foretell
-        raise Forged("a key of small order") from error
+    except (CryptoError, RuntimeError) as error:  # a point of small order, which makes the product predictable
+        raise Forged("the public key has a small order") from error
 
 
-def _derived(chaining_key: bytes, material: bytes, count: int) -> list[bytes]:
-    """The key derivation of section 4.3: ``count`` outputs of 32 bytes."""
+def _derive(chaining_key: bytes, material: bytes, count: int) -> list[bytes]:
+    """Derive ``count`` outputs of 32 bytes (section 4.3)."""
     secret = _hmac(chaining_key, material)
     outputs = [_hmac(secret, b"\x01")]
     for number in range(2, count + 1):
@@ -100,14 +100,14 @@ def _derived(chaining_key: bytes, material: bytes, count: int) -> list[bytes]:
 
 
 def _hmac(key: bytes, data: bytes) -> bytes:
-    """HMAC (RFC 2104) with BLAKE2s; a handshake has fifty, and the ``hmac`` module takes twice as long for each."""
+    """Compute HMAC (RFC 2104) with BLAKE2s; a handshake needs fifty, and the ``hmac`` module takes twice as long."""
     padded = key.ljust(_BLOCK, b"\0")
     inner = hashlib.blake2s(padded.translate(_INNER) + data).digest()
     return hashlib.blake2s(padded.translate(_OUTER) + inner).digest()
 
 
 class _Transcript:
-    """The symmetric state of section 5.2: what both sides know so far."""
+    """The symmetric state of section 5.2."""
 
     def __init__(self, name: bytes, prologue: bytes) -> None:
         self.hash = name.ljust(32, b"\0") if len(name) <= 32 else hashlib.blake2s(name).digest()
@@ -120,11 +120,11 @@ class _Transcript:
         self.hash = hashlib.blake2s(self.hash + data).digest()
 
     def mix_key(self, material: bytes) -> None:
-        self.chaining_key, self.key = _derived(self.chaining_key, material, 2)
+        self.chaining_key, self.key = _derive(self.chaining_key, material, 2)
         self.counter = 0
 
     def mix_key_and_hash(self, material: bytes) -> None:
-        self.chaining_key, hashed, self.key = _derived(self.chaining_key, material, 3)
+        self.chaining_key, hashed, self.key = _derive(self.chaining_key, material, 3)
         self.mix_hash(hashed)
         self.counter = 0
 
@@ -141,15 +141,15 @@ class _Transcript:
         return plaintext
 
     def split(self) -> tuple[bytes, bytes]:
-        first, second = _derived(self.chaining_key, b"", 2)
+        first, second = _derive(self.chaining_key, b"", 2)
         return first, second
 
 
 class _Side:
-    """What both sides of ``IK`` share.
+    """The common part of both roles of ``IK``.
 
-    ``psk`` is the pre-shared key of 32 bytes, or None for plain ``IK``.  The ephemeral secret is given, so that a run
-    can be replayed; it must never serve twice.
+    ``psk`` is the pre-shared key of 32 bytes, or None for plain ``IK``.  The ephemeral secret is a parameter, so that
+    runs are reproducible; it must never be used twice.
     """
 
     def __init__(self, static: KeyPair, ephemeral_secret: bytes, prologue: bytes, psk: bytes | None) -> None:
@@ -160,14 +160,14 @@ class _Side:
         self._psk = psk
 
     def copy(self) -> Self:
-        """This side as it stands, so that reading a forged message need not spoil it."""
+        """Return a copy of the handshake state, so that reading a forged message does not corrupt it."""
         twin = copy.copy(self)
         twin._transcript = copy.copy(self._transcript)
         return twin
 
     def _mix_ephemeral(self, public: bytes) -> None:
         self._transcript.mix_hash(public)
-        if self._psk is not None:  # section 9.2: ephemeral keys randomise what the pre-shared key encrypts
+        if self._psk is not None:  # section 9.2: ephemeral keys randomise the encryption under the pre-shared key
             self._transcript.mix_key(public)
 
     def _mix_psk(self) -> None:
@@ -176,7 +176,7 @@ class _Side:
 
 
 class Initiator(_Side):
-    """The side that knows the other's static key and speaks first."""
+    """The role that knows the other's static key and sends the first message."""
 
     def __init__(
         self,
@@ -191,32 +191,32 @@ class Initiator(_Side):
         self._transcript.mix_hash(remote_static)
 
     def write(self, payload: bytes) -> bytes:
-        """The first message (tokens e, es, s, ss and psk): 96 bytes longer than ``payload``."""
+        """Return the first message (tokens e, es, s, ss and psk): 96 bytes longer than ``payload``."""
         ephemeral = key_pair(self._ephemeral_secret)
         transcript = self._transcript
         self._mix_ephemeral(ephemeral.public)
-        transcript.mix_key(_shared(ephemeral.secret, self._remote_static))
+        transcript.mix_key(_exchange(ephemeral.secret, self._remote_static))
         static = transcript.seal(self._static.public)
-        transcript.mix_key(_shared(self._static.secret, self._remote_static))
+        transcript.mix_key(_exchange(self._static.secret, self._remote_static))
         self._mix_psk()
         return ephemeral.public + static + transcript.seal(payload)
 
     def read(self, message: bytes) -> tuple[bytes, TransportKeys]:
-        """The payload of the second message (tokens e, ee, se), and the keys; raises ``Forged``."""
+        """Return the payload of the second message (tokens e, ee, se), and the keys; raise ``Forged``."""
         if len(message) < SECOND_OVERHEAD:
-            raise Forged("a second message that is too short")
+            raise Forged("the second message is too short")
         transcript = self._transcript
         ephemeral = message[:KEY]
         self._mix_ephemeral(ephemeral)
-        transcript.mix_key(_shared(self._ephemeral_secret, ephemeral))
-        transcript.mix_key(_shared(self._static.secret, ephemeral))
+        transcript.mix_key(_exchange(self._ephemeral_secret, ephemeral))
+        transcript.mix_key(_exchange(self._static.secret, ephemeral))
         payload = transcript.open(message[KEY:])
         sending, receiving = transcript.split()
         return payload, TransportKeys(sending, receiving, transcript.hash)
 
 
 class Responder(_Side):
-    """The side that is spoken to."""
+    """The role that receives the first message."""
 
     def __init__(
         self, static: KeyPair, ephemeral_secret: bytes, prologue: bytes = b"", psk: bytes | None = None
@@ -227,25 +227,25 @@ class Responder(_Side):
         self._remote_ephemeral = b""
 
     def read(self, message: bytes) -> tuple[bytes, bytes]:
-        """The payload of the first message and the static key that its sender proved to hold; raises ``Forged``."""
+        """Return the payload of the first message and the verified static key of its sender; raise ``Forged``."""
         if len(message) < FIRST_OVERHEAD:
-            raise Forged("a first message that is too short")
+            raise Forged("the first message is too short")
         transcript = self._transcript
         self._remote_ephemeral = message[:KEY]
         self._mix_ephemeral(self._remote_ephemeral)
-        transcript.mix_key(_shared(self._static.secret, self._remote_ephemeral))
+        transcript.mix_key(_exchange(self._static.secret, self._remote_ephemeral))
         self._remote_static = transcript.open(message[KEY : KEY + KEY + TAG])
-        transcript.mix_key(_shared(self._static.secret, self._remote_static))
+        transcript.mix_key(_exchange(self._static.secret, self._remote_static))
         self._mix_psk()
         return transcript.open(message[KEY + KEY + TAG :]), self._remote_static
 
     def write(self, payload: bytes) -> tuple[bytes, TransportKeys]:
-        """The second message, 48 bytes longer than ``payload``, and the keys."""
+        """Return the second message, 48 bytes longer than ``payload``, and the keys."""
         ephemeral = key_pair(self._ephemeral_secret)
         transcript = self._transcript
         self._mix_ephemeral(ephemeral.public)
-        transcript.mix_key(_shared(ephemeral.secret, self._remote_ephemeral))
-        transcript.mix_key(_shared(ephemeral.secret, self._remote_static))
+        transcript.mix_key(_exchange(ephemeral.secret, self._remote_ephemeral))
+        transcript.mix_key(_exchange(ephemeral.secret, self._remote_static))
         message = ephemeral.public + transcript.seal(payload)
         receiving, sending = transcript.split()
         return message, TransportKeys(sending, receiving, transcript.hash)

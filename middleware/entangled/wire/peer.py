@@ -1,6 +1,6 @@
-"""Peer: what an endpoint remembers of the others: sessions, round trips, handshakes under way, what is asked of them.
+"""Keep the state of the other nodes: sessions, round trips, handshakes under way, and pending requests.
 
-``Peers`` opens sessions and says when to open another one; what is sent on them is not its affair.
+``Peers`` opens sessions and decides when to renew them; it does not know the messages that are sent in them.
 """
 
 from __future__ import annotations
@@ -26,46 +26,46 @@ from middleware.entangled.wire.session import INDEX_BYTES, Credentials, Hello, I
 STRANGER_WAIT = 0.3
 MAX_TRIES = 4
 DOUBTS = 2
-"""How often, at least, an INIT goes to a peer that may have forgotten our session."""
+"""The minimum number of INITs to a peer that may have lost its session with this node."""
 MAX_PEERS = 4096
 MAX_OPENINGS = 1024
 MAX_SESSIONS = 3
 OPENING_S = 1.5
 MAX_DOORS = 12
-"""Addresses at which one handshake knocks."""
+"""The number of addresses to which one handshake sends its INIT."""
 MOST_GUESSED = 0.5
-"""Seconds that a stranger is waited for at most, before it is asked again."""
+"""The maximum timeout of the first try to an unknown peer, in seconds."""
 HELP_S = 0.2
-"""Seconds without an answer after which others are asked how a far peer is reached."""
+"""Seconds without an answer after which other nodes are asked for a path to a distant peer."""
 KNOCK_S, KNOCKS = 0.1, 16
-"""Seconds between knocks where others help, and for how many of them; then they become rarer."""
+"""The seconds between INITs during hole punching, and the number of them after which the interval grows."""
 LIVELY_S = 3.0
 IN_TOUCH = 105.0
-"""Seconds of silence up to which the other side of a session surely has its end yet, in a wide network: less than those
-after which it lets go of it, by more than can lie between what either of us heard last."""
+"""Seconds of silence up to which the other side of a session still has it, in a wide network.  It is shorter than the
+time after which a session is forgotten; the margin covers the difference between the last datagrams of both sides."""
 SESSION_LIFE_S = 120.0
-"""Age from which a session is succeeded by another one, when something is sent on it."""
+"""The age in seconds at which a session is replaced when something is sent in it."""
 SECOND_S = 30.0
-"""Seconds by which the one of two peers that has the higher key leaves that to the other one."""
+"""The seconds by which the peer with the higher key delays, so that the other one replaces the session."""
 SESSION_END_S = 180.0
-"""Age at which the keys of a session are forgotten."""
+"""The age in seconds at which the keys of a session are deleted."""
 SWEEP_S = 1.0
-# Far below what ChaCha20-Poly1305 allows under one key (2**62 datagrams of this size).
+# Far below the limit of ChaCha20-Poly1305 under one key (2**62 datagrams of this size).
 SESSION_DATAGRAMS = 2**32
 
 
 NONE: Mapping[int, None] = MappingProxyType({})
-"""No questions: hardly any peer is asked something at any moment, so what has none shares this."""
+"""An empty table, shared by all peers without pending requests, which are the majority."""
 
 
-def _with(numbers: Mapping[int, None], number: int) -> Mapping[int, None]:
+def _add_number(numbers: Mapping[int, None], number: int) -> Mapping[int, None]:
     if not isinstance(numbers, dict):
         return {number: None}
     numbers[number] = None
     return numbers
 
 
-def _without(numbers: Mapping[int, None], number: int) -> Mapping[int, None]:
+def _remove_number(numbers: Mapping[int, None], number: int) -> Mapping[int, None]:
     if isinstance(numbers, dict):
         numbers.pop(number, None)
     return numbers or NONE
@@ -73,12 +73,13 @@ def _without(numbers: Mapping[int, None], number: int) -> Mapping[int, None]:
 
 @dataclass(slots=True, eq=False)
 class Opening:
-    """A handshake of ours that waits for its RESP.
+    """A handshake of this node that waits for its RESP.
 
-    ``address`` is where it was begun, ``doors`` has every address at which it knocks with the cookie that was asked for
-    there, ``within`` in how many seconds it should succeed.  Up to ``held_until`` others help, and it goes on whatever
-    the number of its tries.  With ``is_wanted`` somebody here waits for it; else it was begun to let the peer in, or to
-    find a better way.  While it ``is_resting`` it only waits for a late RESP.
+    It was begun at ``address``.  ``doors`` maps every address to which the INIT is sent to the cookie that was
+    requested there.  The session is needed ``within`` that many seconds.  Until ``held_until`` other nodes help with
+    hole punching, and the handshake continues regardless of its tries.  ``is_wanted``: a request waits for it;
+    otherwise it was begun to admit the peer or to find a better path.  While it ``is_resting`` it sends nothing and
+    waits for a late RESP.
     """
 
     invitation: Invitation
@@ -98,9 +99,9 @@ class Opening:
 
 @dataclass(slots=True, eq=False)
 class Peer:
-    """One peer, known by its public key; ``contact`` says where it was asked last.
+    """One peer, identified by its public key; ``contact`` has the address of the latest request to it.
 
-    ``own`` is under which of the team's secrets it is to be met, where that is not the newest one.
+    ``own`` are the credentials under the team secret that it uses, if that is not the newest one.
     """
 
     contact: Contact
@@ -108,14 +109,14 @@ class Peer:
     opening: Opening | None = None
     round_trip: RoundTrip = field(default_factory=RoundTrip)
     tells: tuple[bytes, ...] = ()
-    inquiries: Mapping[int, None] = field(default_factory=lambda: NONE)  # the numbers of what is asked of it, in order
-    queue: Mapping[int, None] = field(default_factory=lambda: NONE)  # those of them that have not been sent yet
+    inquiries: Mapping[int, None] = field(default_factory=lambda: NONE)  # the ids of pending requests to it, in order
+    queue: Mapping[int, None] = field(default_factory=lambda: NONE)  # the pending requests that have not been sent yet
     in_flight: int = 0
     own: Credentials | None = None
 
     @property
     def public(self) -> bytes:
-        """The key by which it is known."""
+        """The public key that identifies it."""
         return self.contact.public
 
     @property
@@ -125,46 +126,47 @@ class Peer:
 
     @property
     def direct_session(self) -> Session | None:
-        """The newest session that no other node carries."""
+        """The newest session that is not relayed."""
         return next((session for session in reversed(self.sessions) if not is_relayed(session.contact.address)), None)
 
     def oldest(self, number: int) -> int:
-        """The oldest question that is asked of it; ``number`` where there is none."""
+        """Return the id of its oldest pending request, or ``number`` if there is none."""
         return next(iter(self.inquiries), number)
 
     def began(self, number: int) -> None:
-        """Take note that a question is asked of it."""
-        self.inquiries = _with(self.inquiries, number)
+        """Record a request to it."""
+        self.inquiries = _add_number(self.inquiries, number)
 
     def ended(self, number: int) -> None:
-        """Take note that nobody waits for an answer to a question any more."""
-        self.inquiries = _without(self.inquiries, number)
+        """Record that no caller waits for the answer to a request any longer."""
+        self.inquiries = _remove_number(self.inquiries, number)
 
     def put_off(self, number: int) -> None:
-        """Take note that a question waits for its turn."""
-        self.queue = _with(self.queue, number)
+        """Record that a request waits in the queue."""
+        self.queue = _add_number(self.queue, number)
 
     def taken_up(self, number: int) -> None:
-        """Take note that a question waits for its turn no more."""
-        self.queue = _without(self.queue, number)
+        """Record that a request left the queue."""
+        self.queue = _remove_number(self.queue, number)
 
     @property
     def is_idle(self) -> bool:
-        """Whether nobody waits for anything from this peer."""
+        """Whether no request or handshake with this peer is pending."""
         return self.opening is None and not self.inquiries
 
 
 class Peers:
-    """All peers of an endpoint, ``sessions`` by their index, and the handshakes that we began.
+    """All peers of an endpoint, ``sessions`` by their index, and the handshakes of this node.
 
-    ``ring`` are the credentials under the team's secrets, newest first; ``door`` says what is shown to others.
-    ``on_unheard`` is called with a handshake of ours that got no answer to any of its tries.  ``is_far`` says of which
-    addresses others may know more; ``on_silence`` is called with a handshake that such a one does not answer at first,
-    ``on_established`` with each session that is used from now on, and ``on_moved`` with one whose peer writes from
-    elsewhere.
+    ``ring`` are the credentials under the team's secrets, newest first; ``door`` supplies the pass that is shown to
+    others.  ``on_unheard`` is called with a handshake that got no answer to any of its tries.  ``is_far`` returns
+    whether other nodes may know a path to an address; ``on_silence`` is called with a handshake to such an address that
+    gets no early answer, ``on_established`` with each new session, and ``on_moved`` with a session that received from a
+    new address.
 
-    ``usual`` is how long anybody takes.  In a network that ``is_wide`` strangers are thought to take as long: there
-    are so many that what is asked twice for nothing counts.  ``loss`` is what gets lost of what anybody sends us.
+    ``usual`` is the round trip to all peers together.  In a network that ``is_wide`` it is also the estimate for
+    unknown peers, because there are so many that needless retransmissions matter.  ``loss`` is the loss rate of
+    incoming datagrams.
     """
 
     def __init__(
@@ -198,34 +200,35 @@ class Peers:
         self._by_mac: dict[bytes, Opening] = {}
 
     def known(self, public: bytes) -> Peer | None:
-        """The peer of that key, if anything is remembered of it."""
+        """Return the peer with that key, if it is known."""
         return self._peers.get(public)
 
     def contact(self, public: bytes, address: Address) -> Contact:
-        """The contact of that key at that address; where it is known already no second one is made of it."""
+        """Return the contact with that key and address, reusing an existing object."""
         peer = self._peers.get(public)
         if peer is not None and peer.contact.address == address:
             return peer.contact
         return Contact(public, address)
 
     def session(self, public: bytes) -> Session | None:
-        """The newest session with the peer of that key."""
+        """Return the newest session with the peer of that key."""
         peer = self._peers.get(public)
         return peer.session if peer is not None else None
 
     def direct_session(self, public: bytes) -> Session | None:
-        """The newest session with the peer of that key that no other node carries."""
+        """Return the newest session with the peer of that key that is not relayed."""
         peer = self._peers.get(public)
         return peer.direct_session if peer is not None else None
 
     def peer(self, contact: Contact) -> Peer:
-        """The peer of that contact, remembered from now on; raises ``ValueError`` where its key is none."""
+        """Return the peer of that contact, creating it if needed; raise ``ValueError`` if its public key is invalid."""
         peer = self._peers.get(contact.public)
         if peer is not None:
-            self._peers[contact.public] = self._peers.pop(contact.public)  # whoever is wanted least stands first
+            # the peer that was unused for longest stands first
+            self._peers[contact.public] = self._peers.pop(contact.public)
             peer.contact = contact
             return peer
-        exchange_key(contact.public)  # or it is none
+        exchange_key(contact.public)  # raises ValueError for an invalid key
         peer = self._peers[contact.public] = Peer(contact)
         if self.is_wide:
             peer.round_trip = RoundTrip(self.guess)
@@ -238,34 +241,35 @@ class Peers:
 
     @property
     def guess(self) -> float:
-        """How long to wait for the first answer of a stranger, in seconds, as far as others tell."""
+        """The timeout of the first request to an unknown peer in seconds, estimated from all peers."""
         return max(FIRST_GUESS, min(self.usual.wait, MOST_GUESSED))
 
     def wait_for(self, public: bytes) -> float:
-        """How long to wait for a sign of a peer before trying again, in seconds."""
+        """Return the retransmission timeout of a peer in seconds."""
         peer = self._peers.get(public)
         return peer.round_trip.wait if peer is not None and peer.round_trip.is_measured else STRANGER_WAIT
 
     @property
     def tries(self) -> int:
-        """How often anything is tried before it is given up, the usual number at least."""
+        """The number of tries of a request or handshake: the usual number, or more if the loss rate is high."""
         return max(MAX_TRIES, self.loss.tries)
 
     def spacing(self, round_trip: RoundTrip, tries: int, within: float) -> float:
-        """Seconds between a try, the ``tries``-th, and the next one of what should succeed ``within`` some seconds.
+        """Return the seconds between the try number ``tries`` and the next one.
 
-        Each waits longer than the one before, up to the usual number.  Where much gets lost, they are as close to each
-        other as they must be to have as many as it takes; but none comes before most answers would.  Of strangers, who
-        may be near or far, nothing is known but how long anybody takes.
+        ``within`` is the time in seconds in which the request should succeed.  Each interval is longer than the one
+        before, up to the usual number of tries.  At a high loss rate the tries are as close together as necessary to
+        fit the required number, but none is sent before most answers would have arrived.  The estimate for an unknown
+        peer, which may be near or far, is the mean over all peers.
         """
         wait = round_trip.wait * BACK_OFF ** (min(tries, MAX_TRIES) - 1)
         likely = round_trip.likely if round_trip.is_measured else self.usual.mean
         return wait if likely is None else min(wait, max(likely, within / self.loss.tries))
 
     def usable(self, peer: Peer) -> Session | None:
-        """The session to send on.
+        """Return the session to send in, after dropping the peer's sessions at their datagram limit.
 
-        A worn one is dropped, and one that the other side may have let go of, unless something waits for it.
+        The sessions with an idle peer that may have forgotten them are dropped too.
         """
         session = peer.session
         if session is None:
@@ -277,7 +281,7 @@ class Peers:
         return session
 
     def renew(self, session: Session) -> None:
-        """Open a successor of a session on which something is about to be sent, if it is old or worn.
+        """Open a successor of a session before something is sent in it, if it is old or near its datagram limit.
 
         Of two peers the one with the lower key does so first, so that there are not two successors.
         """
@@ -290,35 +294,36 @@ class Peers:
             self.open(peer, session.contact.address)
 
     def is_in_touch(self, peer: Peer) -> bool:
-        """Whether there is a session of which the other side, if it lives, surely has its end yet.
+        """Return whether there is a session that the other side, if it is alive, still has.
 
-        In a wide network each lets go of the sessions with a peer that is silent for long, at a moment of its own and
-        without a word; what the other one sends on them from then on is lost.
+        In a wide network each node forgets the sessions with a silent peer without notification, at a time that the
+        peer does not know; datagrams that the peer sends in them afterwards are lost.
         """
         since = self._clock.seconds() - IN_TOUCH if self.is_wide else float("-inf")
         return any(session.heard_at >= since for session in peer.sessions)
 
     def established(self, session: Session) -> Peer:
-        """Use a session for sending from now on; gives its peer."""
+        """Use a session for sending from now on; return its peer."""
         peer = self.peer(session.contact)
         is_carried = is_relayed(session.contact.address)
         newest = peer.session
         if is_carried and newest is not None and self._is_lively_and_direct(newest):
-            peer.sessions = (*peer.sessions[:-1], session, newest)  # one that others carry gives way to one as good
+            # a relayed session does not replace a live direct one
+            peer.sessions = (*peer.sessions[:-1], session, newest)
         else:
             peer.sessions = (*peer.sessions, session)
         if len(peer.sessions) > MAX_SESSIONS:
             self._end(peer.sessions[:1])
             peer.sessions = peer.sessions[1:]
         if peer.opening is not None and peer.opening.knocks and not is_carried:
-            self.close(peer.opening)  # the peer, which was told to knock too, came first
+            self.close(peer.opening)  # the peer's own handshake of the hole punching succeeded first
         if self._sweeper is None:
             self._sweep()
         self.on_established(session)
         return peer
 
     def _sweep(self) -> None:
-        """Forget the sessions that have come to their end, and look again when the next one does."""
+        """Delete the sessions that reached their maximum age, and schedule the next sweep."""
         self._sweeper, now = None, self._clock.seconds()
         while self.sessions:  # in the order in which they were opened
             oldest = next(iter(self.sessions.values()))
@@ -329,16 +334,16 @@ class Peers:
             self.drop(oldest)
 
     def confirmed(self, session: Session) -> None:
-        """Learn how far away a peer is that opened a session, and has just confirmed it: one round trip after our RESP.
+        """Measure the round trip of a peer that confirmed its session: one round trip after the RESP.
 
-        Without that, who was asked first would ask back too soon, and take a long way for a peer that restarted.
+        Otherwise the first request to it would be retransmitted too soon, and a long path be mistaken for a restart.
         """
         peer = self.peer(session.contact)
         if not peer.round_trip.is_measured:
             self.answered(peer, 1, self._clock.seconds() - session.opened_at)
 
     def answered(self, peer: Peer, tries: int, seconds: float) -> None:
-        """Learn from an answer to the last of so many tries, so many seconds after the first."""
+        """Update the estimates with an answer to the last of ``tries`` tries, ``seconds`` after the first."""
         for round_trip in (peer.round_trip, self.usual):
             if tries == 1:
                 round_trip.measured(seconds)
@@ -346,14 +351,14 @@ class Peers:
                 round_trip.ambiguous(seconds)
 
     def doubtful(self, peer: Peer) -> int:
-        """After how many tries that got no answer a peer may have forgotten our session.
+        """Return the number of unanswered tries after which a peer may have lost the session.
 
-        Where it is not known how far away it is, or much gets lost, one says nothing.
+        With an unknown round trip or a high loss rate a single unanswered try is no evidence.
         """
         return 1 if peer.round_trip.is_measured and self.loss.tries == 1 else 2
 
     def moved(self, session: Session) -> None:
-        """Take note that a peer's newest datagram came from another address."""
+        """Record that a peer's newest datagram came from another address."""
         peer = self._peers.get(session.contact.public)
         if peer is not None:
             for other in peer.sessions:
@@ -361,19 +366,19 @@ class Peers:
             self.on_moved(session)
 
     def rekey(self, ring: Sequence[Credentials]) -> None:
-        """Begin handshakes under the first of ``ring`` from now on."""
+        """Open handshakes under the first of ``ring`` from now on."""
         self.ring = ring
         for peer in self._peers.values():
             peer.own = None
 
     def met_under(self, contact: Contact, own: Credentials) -> None:
-        """Take note under which of several secrets ``contact`` goes by."""
+        """Record under which of several secrets ``contact`` answered."""
         if len(self.ring) > 1:
-            with suppress(ValueError):  # what it said to be its key is none
+            with suppress(ValueError):  # the key that it sent is invalid
                 self.peer(contact).own = own
 
     def evict(self, peer: Peer) -> None:
-        """Forget the sessions with a peer, and a handshake with it."""
+        """Forget the sessions and the handshake with a peer."""
         if peer.opening is not None:
             self.close(peer.opening)
         self._end(peer.sessions)
@@ -381,7 +386,7 @@ class Peers:
         peer.tells = ()
 
     def let_go(self, before: float) -> list[bytes]:
-        """Forget the peers that were last heard before that moment, and from whom nobody waits for anything."""
+        """Forget the idle peers from which nothing was received since ``before``; return their keys."""
         silent = [
             peer
             for peer in self._peers.values()
@@ -401,12 +406,12 @@ class Peers:
 
     @property
     def hello(self) -> Hello:
-        """What this node says of itself in a handshake."""
+        """The handshake fields of this node."""
         door = self.door
         return Hello(door.life, door.shown, door.room)
 
     def new_index(self) -> int:
-        """A free index for a session; 0 is none."""
+        """Return an unused session index; never 0."""
         while True:
             index = self._rng.getrandbits(8 * INDEX_BYTES)
             if index and index not in self.sessions and index not in self._openings:
@@ -424,15 +429,15 @@ class Peers:
         self._peers.clear()
         self.sessions.clear()
 
-    # -- handshakes of ours -----------------------------------------------------------------------------------------
+    # -- outgoing handshakes ----------------------------------------------------------------------------------------
 
     def open(
         self, peer: Peer, address: Address, rider: bytes = b"", is_wanted: bool = True, within: float = OPENING_S
     ) -> bool:
-        """Open a session, unless that is under way; False where there are too many handshakes.
+        """Open a session, unless a handshake is under way; return False if there are too many handshakes.
 
-        ``rider`` is a message for its INIT; one that does not fit stays behind.  ``within`` is in how many seconds
-        whoever wants it needs it.
+        ``rider`` is a message for the INIT; it is omitted if it does not fit.  ``within`` is the time in seconds in
+        which the session is needed.
         """
         if peer.opening is not None:
             if is_wanted and not peer.opening.is_wanted:
@@ -441,7 +446,7 @@ class Peers:
                 self._prepare_help(peer.opening, address)
             if peer.opening.is_resting and not peer.sessions:
                 cancel(peer.opening.timer)
-                self._knock(peer.opening, is_asked=True)
+                self._send_init(peer.opening, is_asked=True)
             return True
         if len(self._openings) >= MAX_OPENINGS:
             self._counters["crowded"] += 1
@@ -457,16 +462,16 @@ class Peers:
         opening.is_wanted = is_wanted
         if is_wanted:
             self._prepare_help(opening, address)
-        self._knock(opening)
+        self._send_init(opening)
         return True
 
     def hold(self, opening: Opening, until: float) -> None:
-        """Go on with a handshake up to a moment, since others help; an earlier one than now: no longer than usual."""
+        """Continue a handshake until a time, because other nodes help; a time in the past restores the usual limit."""
         if opening.peer.opening is opening:
             opening.held_until = until
 
     def knock_at(self, opening: Opening, addresses: Iterable[Address]) -> None:
-        """Knock at further addresses, at once and often from now on."""
+        """Send the INIT to further addresses too, immediately and at short intervals (hole punching)."""
         if opening.peer.opening is not opening:
             return
         for address in addresses:
@@ -474,47 +479,47 @@ class Peers:
                 opening.doors.setdefault(address, b"")
         opening.knocks = 1
         cancel(opening.timer)
-        self._knock(opening)
+        self._send_init(opening)
 
     def opening(self, index: int) -> Opening | None:
-        """The handshake of ours that has this session index."""
+        """Return the outgoing handshake with this session index."""
         return self._openings.get(index)
 
     def opening_of(self, mac: bytes) -> Opening | None:
-        """The handshake of ours whose INIT has this hash."""
+        """Return the outgoing handshake with this hash in its INIT."""
         return self._by_mac.get(mac)
 
     def paid(self, opening: Opening, cookie: bytes, source: Address) -> None:
-        """Send the INIT again at once, with the cookie that the responder asked for at that address."""
+        """Resend the INIT immediately with the cookie that the responder requested at that address."""
         if opening.doors.get(source) != cookie:
             opening.doors[source] = cookie
             self._network.send(opening.invitation.datagram(cookie), source)
 
     def accepted(self, opening: Opening) -> None:
-        """Take note that a handshake of ours got its RESP."""
+        """Close an outgoing handshake that got its RESP, and measure its round trip."""
         self.close(opening)
-        if not opening.knocks:  # else the way had to be opened first, which says nothing of its length
-            tries = opening.tries + any(opening.doors.values())  # who asked for a cookie was asked twice
+        if not opening.knocks:  # otherwise the time includes hole punching
+            tries = opening.tries + any(opening.doors.values())  # a responder that requested a cookie got two INITs
             self.answered(opening.peer, tries, self._clock.seconds() - opening.started_at)
 
-    def _knock(self, opening: Opening, is_asked: bool = False) -> None:
-        """Send an INIT, again if need be, until the tries are used up, or as long as somebody waits.
+    def _send_init(self, opening: Opening, is_asked: bool = False) -> None:
+        """Send an INIT and schedule the next one, until the tries are used up or while a request waits.
 
-        ``is_asked``: somebody does, from now on.
+        ``is_asked``: a new request waits for the session.
         """
         left = opening.started_at + OPENING_S - self._clock.seconds()
         opening.is_resting = not is_asked and opening.tries > 0 and self._is_enough(opening)
         is_over = left <= 0 if opening.is_resting else opening.tries >= self.tries
         if is_over and self._clock.seconds() >= opening.held_until:
             self.close(opening)
-            if len(self.ring) > 1:  # it may not have heard of the newest secret, or of nothing older any more
+            if len(self.ring) > 1:  # the peer may not have the newest secret yet, or no longer have an older one
                 ring = list(self.ring)
                 tried = ring.index(opening.invitation.own) if opening.invitation.own in ring else -1
                 opening.peer.own = ring[(tried + 1) % len(ring)]
             self.on_unheard(opening)
             return
         if opening.is_resting:
-            opening.timer = self._clock.callLater(left, self._knock, opening)
+            opening.timer = self._clock.callLater(left, self._send_init, opening)
             return
         opening.tries += 1
         for address, cookie in opening.doors.items():
@@ -524,14 +529,14 @@ class Peers:
             wait = min(KNOCK_S * BACK_OFF ** max(0, opening.knocks - KNOCKS), LONGEST)
         else:
             wait = self._wait(opening)
-        opening.timer = self._clock.callLater(wait, self._knock, opening)
+        opening.timer = self._clock.callLater(wait, self._send_init, opening)
 
     def _is_enough(self, opening: Opening) -> bool:
-        """Whether its INIT, the dearest of all datagrams, was sent as often as is worth while.
+        """Return whether enough INITs, the most expensive datagrams, were sent.
 
-        If it was begun for questions, until nobody waits for their answers any more.  Beside a session that stands it
-        only asks whether the peer forgot that one, or succeeds it: what is asked goes out on the session as well, and
-        the next question would ask anew.
+        A handshake for requests is repeated until none waits.  A handshake next to an existing session only checks
+        whether the peer lost the session, or replaces it: the requests are sent in the session as well, and the next
+        one would retry the handshake.
         """
         peer = opening.peer
         if not opening.is_wanted or opening.knocks or opening.held_until:
@@ -544,7 +549,7 @@ class Peers:
         round_trip = opening.peer.round_trip
         wait = self.spacing(round_trip, opening.tries, opening.within)
         if opening.tries == self.tries and not round_trip.is_measured:
-            # Nothing is known of this peer: it may be far away rather than gone.
+            # Nothing is known of this peer: it may be distant instead of gone.
             wait = max(wait, opening.started_at + OPENING_S - self._clock.seconds())
         return wait
 
@@ -558,7 +563,7 @@ class Peers:
         return is_lively and not is_relayed(session.contact.address)
 
     def close(self, opening: Opening) -> None:
-        """Forget a handshake of ours."""
+        """Forget an outgoing handshake."""
         cancel(opening.timer)
         cancel(opening.helper)
         self._openings.pop(opening.invitation.local_index, None)

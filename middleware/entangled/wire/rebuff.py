@@ -1,4 +1,4 @@
-"""Rebuff: who was not let in lately, by whom and why, for people who look; pure, and bounded."""
+"""Remember recent rejections for diagnostics, with their side and reason; bounded."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Literal
 from middleware.entangled.bounded import keep
 
 MAX_REBUFFS = 64
-"""Rebuffs that are remembered; the one that happened longest ago goes first."""
+"""The number of rejections that are remembered; the oldest one is deleted first."""
 HOUR = 3600.0
 
 Side = Literal["they", "we", "call", "code"]
@@ -17,11 +17,11 @@ SIDES: tuple[Side, ...] = ("they", "we", "call", "code")
 
 @dataclass(frozen=True)
 class Rebuff:
-    """One refusal, however often it happened; moments are seconds of the node's clock.
+    """One rejection and the number of its occurrences; times are seconds of the node's clock.
 
-    ``who`` is the public key of the other one, empty where it showed none.  ``side`` says what happened: ``they`` do
-    not let this node in, ``we`` do not let them in, we do not answer their ``call``, or the ``code`` of a newcomer is
-    no good.  ``reason`` is for people: why, and after a semicolon what to do.
+    ``who`` is the public key of the other node, empty if it showed none.  ``side`` is the direction: ``they`` reject
+    this node, ``we`` reject them, this node refuses their ``call``, or the join ``code`` of a newcomer is invalid.
+    ``reason`` is for operators: the cause, and after a semicolon the remedy.
     """
 
     who: bytes
@@ -35,7 +35,7 @@ class Rebuff:
 
 
 class Rebuffs:
-    """The refusals that one node met; each pair of key and code is one."""
+    """The rejections of one node, merged by key, side and code."""
 
     def __init__(self) -> None:
         self._known: dict[tuple[bytes, Side, str], Rebuff] = {}
@@ -44,7 +44,7 @@ class Rebuffs:
         return len(self._known)
 
     def met(self, who: bytes, address: str, side: Side, code: str, reason: str, now: float) -> None:
-        """Take note of a refusal."""
+        """Record a rejection."""
         known = self._known.get((who, side, code), None)
         if known is None or now - known.last_at > HOUR:
             met = Rebuff(who, address, side, code, reason, now, now)
@@ -53,5 +53,5 @@ class Rebuffs:
         keep(self._known, (who, side, code), met, MAX_REBUFFS)
 
     def newest(self, now: float, span: float = HOUR) -> list[Rebuff]:
-        """Those of the last ``span`` seconds, the newest first."""
+        """Return the rejections of the last ``span`` seconds, the newest first."""
         return [each for each in reversed(self._known.values()) if now - each.last_at <= span]

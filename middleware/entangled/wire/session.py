@@ -1,12 +1,12 @@
-"""Session: the datagrams that open one (INIT, RESP) and those that it carries (DATA).
+"""Build and read the datagrams that open a session (INIT, RESP) and the DATA datagrams that it carries.
 
-Each of the first two carries a message, the sender's pass, which the ``door`` of the other side judges, and the life
-that it lives.  INIT is padded so that RESP need never be larger; RESP says from where the INIT came, or that it is
-refused.  A keyed hash near the end of INIT lets a node drop what outsiders make up for a microsecond instead of four
-key exchanges; a second one, made with a cookie that the responder gave, is asked for when too many come (``greeting``).
+INIT and RESP each carry a message, the sender's pass, which the admission check of the other side judges, and the
+sender's incarnation.  INIT is padded so that RESP is never larger; RESP contains the source address of the INIT, or a
+refusal.  A keyed hash near the end of INIT lets a node drop forged datagrams in a microsecond instead of four key
+exchanges; a second hash, made with a cookie from the responder, is required under load (``greeting``).
 
 A DATA datagram is: type (1), the receiver's index of the session (4), counter (8), then the sealed message with its tag
-(16): 29 bytes more than the message.  The 13 bytes in front are authenticated too.
+(16): 29 bytes more than the message.  The 13 header bytes are authenticated too.
 """
 
 from __future__ import annotations
@@ -45,37 +45,37 @@ MAC = 16
 ANSWER_ROOM = 512
 _LIFE = 8 + NONCE
 STAMP = 8
-_ASKED = INDEX_BYTES + KEY + _LIFE  # before the pass of an INIT
-_GIVEN = INDEX_BYTES + _LIFE + ADDRESS  # before that of a RESP
-_PAYLOAD = _ASKED + 2 + 2 + STAMP
+_INIT_PASS_AT = INDEX_BYTES + KEY + _LIFE  # before the pass of an INIT
+_RESP_PASS_AT = INDEX_BYTES + _LIFE + ADDRESS  # before the pass of a RESP
+_PAYLOAD = _INIT_PASS_AT + 2 + 2 + STAMP
 _INIT_BARE = 1 + FIRST_OVERHEAD + _PAYLOAD + 2 * MAC
-_RESP_BARE = 1 + INDEX_BYTES + SECOND_OVERHEAD + _GIVEN + 2
+_RESP_BARE = 1 + INDEX_BYTES + SECOND_OVERHEAD + _RESP_PASS_AT + 2
 RESP_LEAST = _RESP_BARE
 INIT_LEAST = _RESP_BARE + ANSWER_ROOM
 MAX_RIDER = MAX_DATAGRAM - _INIT_BARE
 
 _HEADER = 1 + INDEX_BYTES + 8
 OVERHEAD = _HEADER + TAG
-MAX_PLAIN = MAX_DATAGRAM - OVERHEAD  # what one datagram carries; longer messages go as parcels
+MAX_PLAIN = MAX_DATAGRAM - OVERHEAD  # the capacity of one datagram; longer messages are sent in fragments
 WINDOW = 1024
 MAX_UNCONFIRMED = 512
 UNCONFIRMED_S = 10.0
 MAX_RESPONSES = 512
 RESPONSES_S = 30.0
-_NO_LIFE = bytes(_LIFE)
+_PACKED_UNCOUNTED = bytes(_LIFE)
 _WINDOW_MASK = (1 << WINDOW) - 1
 _pack = struct.Struct("<BIQ").pack
 """The header of a DATA datagram: its kind, the receiver's index, the counter."""
 
 
 def derived_key(team_key: bytes, purpose: bytes) -> bytes:
-    """The team's key for one purpose (32 bytes)."""
+    """Derive the team's key for one purpose (32 bytes)."""
     return hashlib.blake2s(PROLOGUE + b" " + purpose, key=team_key).digest()
 
 
 @dataclass(frozen=True)
 class Credentials:
-    """What a node needs to open and to accept sessions under one secret of its team; what shows it shows no secret."""
+    """The keys to open and accept sessions under one secret of the team; their ``repr`` hides the secrets."""
 
     public: bytes
     static: KeyPair = field(repr=False)
@@ -86,16 +86,16 @@ class Credentials:
 
     @classmethod
     def of(cls, identity: Identity, team_key: bytes) -> Credentials:
-        """The credentials of ``identity`` in the team that holds ``team_key`` (32 bytes)."""
+        """Return the credentials of ``identity`` in the team with ``team_key`` (32 bytes)."""
         purposes = (b"psk", b"mac", b"greet", b"cookie")
         keys = [derived_key(team_key, purpose) for purpose in purposes]
         return cls(identity.public, key_pair(identity.exchange_secret), *keys)
 
 
 class Hello(NamedTuple):
-    """What a node says of itself in a handshake: its life and its pass.
+    """A node's fields of a handshake: its incarnation and its pass.
 
-    ``room`` is what the pass of the other side may take.
+    ``room`` is the maximum length of the other side's pass.
     """
 
     life: Life = UNCOUNTED
@@ -104,12 +104,12 @@ class Hello(NamedTuple):
 
     @property
     def rider_room(self) -> int:
-        """The bytes of a message that an INIT may carry beside the pass."""
+        """The maximum length of a message in an INIT with this pass, in bytes."""
         return MAX_RIDER - len(self.shown)
 
     @property
     def init_least(self) -> int:
-        """The length of the shortest INIT that is answered with a pass and a message of ``ANSWER_ROOM``."""
+        """The length of the shortest INIT that may be answered with a pass and a message of ``ANSWER_ROOM`` bytes."""
         return INIT_LEAST + self.room
 
 
@@ -117,10 +117,10 @@ OF_OPEN_TEAM = Hello()
 
 
 class Reply(NamedTuple):
-    """What a RESP says: ``remote_index``, the responder's index, its life, pass and message.
+    """The content of a RESP: ``remote_index``, the responder's index, its incarnation, pass and message.
 
-    ``seen`` is where the INIT came from, as the responder saw it (None: it cannot say).  ``refusal`` names why it lets
-    us not in; then nothing else counts.
+    ``seen`` is the source address of the INIT as the responder saw it (None: unknown).  With a ``refusal`` code the
+    responder rejects this node, and the other fields are void.
     """
 
     remote_index: int
@@ -135,7 +135,7 @@ class Reply(NamedTuple):
 class Invitation:
     """The initiator's half of a handshake; ``mac`` is the first of the two hashes in its INIT.
 
-    ``stamp`` is the timestamp of the INIT: higher than that of every INIT before it of this life.
+    ``stamp`` is the timestamp of the INIT: higher than in every earlier INIT of this incarnation.
     """
 
     def __init__(
@@ -152,41 +152,40 @@ class Invitation:
         self._noise = Initiator(own.static, remote_static, ephemeral_secret, PROLOGUE, own.psk)
         self.local_index = local_index
         index = local_index.to_bytes(INDEX_BYTES, "little")
-        payload = index + own.public + _packed_life(hello.life) + _counted(hello.shown) + _counted(rider)
+        payload = index + own.public + _pack_life(hello.life) + _with_length(hello.shown) + _with_length(rider)
         payload += stamp.to_bytes(STAMP, "little")
         payload = payload.ljust(_PAYLOAD + hello.init_least - _INIT_BARE, b"\0")
         bare = bytes([INIT]) + self._noise.write(payload)
-        self.mac = _hashed(own.mac_key, bare)
-        self._proven = bare + self.mac
+        self.mac = _keyed_hash(own.mac_key, bare)
+        self._init_without_cookie = bare + self.mac
 
     def datagram(self, cookie: bytes = b"") -> bytes:
-        """The INIT, which may be sent again unchanged, or with a ``cookie`` that the responder asked for."""
-        return self._proven + (_hashed(cookie, self._proven) if cookie else bytes(MAC))
+        """Return the INIT, which may be resent unchanged, or with a ``cookie`` that the responder requested."""
+        return self._init_without_cookie + (_keyed_hash(cookie, self._init_without_cookie) if cookie else bytes(MAC))
 
     def accepted(self, datagram: bytes) -> Reply:
-        """What a RESP says, with the keys of the session; raises ``Forged``.
+        """Read a RESP and return it with the keys of the session; raise ``Forged``.
 
-        A failed reading spoils the state only if the datagram was forged by somebody who saw the INIT; so each reading
-        works on a copy.
+        Each reading works on a copy of the handshake state, because a forged RESP would corrupt the state.
         """
         payload, keys = self._noise.copy().read(datagram[1 + INDEX_BYTES :])
         index = int.from_bytes(payload[:INDEX_BYTES], "little")
-        life = _life(payload[INDEX_BYTES : INDEX_BYTES + _LIFE])
-        seen = address_of(payload[INDEX_BYTES + _LIFE : _GIVEN])
-        shown, message = _taken(payload, _GIVEN)
+        life = _unpack_life(payload[INDEX_BYTES : INDEX_BYTES + _LIFE])
+        seen = address_of(payload[INDEX_BYTES + _LIFE : _RESP_PASS_AT])
+        shown, message = _split_counted(payload, _RESP_PASS_AT)
         if index:
             return Reply(index, life, seen, shown, message, "", keys)
         refusal = message.decode("ascii", errors="replace")
         if not is_refusal(refusal):
-            raise Forged("a RESP with neither a session nor a refusal")
+            raise Forged("the RESP has neither a session nor a refusal")
         return Reply(0, life, seen, b"", b"", refusal, keys)
 
 
 class Acceptance:
-    """The responder's half: reads an INIT, then makes its RESP.
+    """The responder's half of a handshake: reads an INIT, then builds its RESP.
 
-    ``public`` is the initiator's Ed25519 key, proved; ``life`` and ``shown`` what it says of itself, ``rider`` its
-    message, ``stamp`` its timestamp.  Raises ``Forged`` where anything is not as it must be.
+    ``public`` is the initiator's verified Ed25519 key; ``life`` and ``shown`` are its incarnation and pass, ``rider``
+    its message, ``stamp`` its timestamp.  Raises ``Forged`` for an invalid INIT.
     """
 
     def __init__(self, own: Credentials, datagram: bytes, ephemeral_secret: bytes) -> None:
@@ -194,91 +193,91 @@ class Acceptance:
         payload, static = self._noise.read(datagram[1 : -2 * MAC])
         self.remote_index = int.from_bytes(payload[:INDEX_BYTES], "little")
         self.public = payload[INDEX_BYTES : INDEX_BYTES + KEY]
-        self.life = _life(payload[INDEX_BYTES + KEY : _ASKED])
+        self.life = _unpack_life(payload[INDEX_BYTES + KEY : _INIT_PASS_AT])
         try:
             proved = exchange_key(self.public) == static
         except (ValueError, RuntimeError, TypeError):
             proved = False
         if not proved:
-            raise Forged("an INIT whose key is not its sender's")
-        self.shown, rest = _taken(payload, _ASKED)
-        self.rider, rest = _taken(rest, 0)
+            raise Forged("the key in the INIT does not match its static key")
+        self.shown, rest = _split_counted(payload, _INIT_PASS_AT)
+        self.rider, rest = _split_counted(rest, 0)
         self.stamp = int.from_bytes(rest[:STAMP], "little")
         self._room = len(datagram) - _RESP_BARE
 
     def answer_room(self, hello: Hello) -> int:
-        """The bytes of a message that the RESP may carry beside the pass."""
+        """Return the maximum length of a message in the RESP next to the pass, in bytes."""
         return self._room - len(hello.shown)
 
     def accept(
         self, local_index: int, answer: bytes, seen: Address, hello: Hello = OF_OPEN_TEAM
     ) -> tuple[bytes, TransportKeys]:
-        """The RESP datagram that carries ``answer`` (at most ``answer_room`` bytes), and the keys."""
+        """Return the RESP with ``answer`` (at most ``answer_room`` bytes), and the keys."""
         index = local_index.to_bytes(INDEX_BYTES, "little")
-        payload = index + _packed_life(hello.life) + packed_address(seen) + _counted(hello.shown) + answer
+        payload = index + _pack_life(hello.life) + packed_address(seen) + _with_length(hello.shown) + answer
         message, keys = self._noise.write(payload)
         return bytes([RESP]) + self.remote_index.to_bytes(INDEX_BYTES, "little") + message, keys
 
     def refuse(self, code: str, seen: Address, life: Life) -> bytes:
-        """The RESP datagram that says why its sender is not let in."""
+        """Return the RESP that rejects the initiator."""
         return self.accept(0, code.encode("ascii"), seen, Hello(life))[0]
 
 
 def is_init_of_team(own: Credentials, datagram: bytes) -> bool:
-    """Whether an INIT of a lawful size was made by somebody who holds the secret that ``own`` goes by."""
-    return hmac.compare_digest(_hashed(own.mac_key, datagram[: -2 * MAC]), mac_of(datagram))
+    """Return whether the sender of an INIT of valid size holds the team secret of ``own``."""
+    return hmac.compare_digest(_keyed_hash(own.mac_key, datagram[: -2 * MAC]), mac_of(datagram))
 
 
 def mac_of(init: bytes) -> bytes:
-    """The hash in an INIT that shows the team's key."""
+    """Return the hash in an INIT that was made with the team's key."""
     return init[-2 * MAC : -MAC]
 
 
 def has_cookie(init: bytes, cookie: bytes) -> bool:
-    """Whether the INIT was made with ``cookie``."""
-    return hmac.compare_digest(_hashed(cookie, init[:-MAC]), init[-MAC:])
+    """Return whether the INIT was made with ``cookie``."""
+    return hmac.compare_digest(_keyed_hash(cookie, init[:-MAC]), init[-MAC:])
 
 
 def ephemeral_of(init: bytes) -> bytes:
-    """The initiator's ephemeral key, by which a repeated INIT is known."""
+    """Return the initiator's ephemeral key, which identifies a repeated INIT."""
     return init[1 : 1 + KEY]
 
 
-def _hashed(key: bytes, data: bytes) -> bytes:
+def _keyed_hash(key: bytes, data: bytes) -> bytes:
     return hashlib.blake2s(data, key=key, digest_size=MAC).digest()
 
 
-def _packed_life(life: Life) -> bytes:
+def _pack_life(life: Life) -> bytes:
     return life.number.to_bytes(8, "little") + life.nonce
 
 
-def _life(packed: bytes) -> Life:
-    if packed == _NO_LIFE:
+def _unpack_life(packed: bytes) -> Life:
+    if packed == _PACKED_UNCOUNTED:
         return UNCOUNTED
     return Life(int.from_bytes(packed[:8], "little"), packed[8:])
 
 
-def _counted(data: bytes) -> bytes:
+def _with_length(data: bytes) -> bytes:
     return len(data).to_bytes(2, "little") + data
 
 
-def _taken(payload: bytes, start: int) -> tuple[bytes, bytes]:
-    """The bytes whose count stands at ``start``, and what follows them; raises ``Forged`` where they are cut short."""
+def _split_counted(payload: bytes, start: int) -> tuple[bytes, bytes]:
+    """Return the length-prefixed bytes at ``start`` and the bytes after them; raise ``Forged`` if truncated."""
     begin = start + 2
     end = begin + int.from_bytes(payload[start:begin], "little")
     if len(payload) < end or len(payload) < begin:
-        raise Forged("a handshake that is cut short")
+        raise Forged("the handshake is truncated")
     return payload[begin:end], payload[end:]
 
 
 class Session:
-    """One agreed pair of keys with one peer.
+    """The keys and the state of one session with one peer.
 
-    ``local_index`` is the number under which we find the session, ``remote_index`` the one under which the peer does.
-    ``contact`` is the peer with the address from which its newest datagram came.  ``is_confirmed`` says that the peer
-    has shown to hold the keys at that address; until then nothing may be sent.  Moments are seconds of the endpoint's
-    clock.  ``life`` is the one that the peer lives in it; with ``is_over`` a later one has taken its place.  ``shown``
-    is the pass in its INIT, until the session is confirmed.
+    ``local_index`` identifies the session at this node, ``remote_index`` at the peer.  ``contact`` is the peer with the
+    source address of its newest datagram.  ``is_confirmed``: the peer has proved at that address that it holds the
+    keys; before that nothing may be sent.  Times are seconds of the endpoint's clock.  ``life`` is the incarnation of
+    the peer; ``is_over``: a later incarnation has replaced it.  ``shown`` is the pass in its INIT, until the session is
+    confirmed.
     """
 
     __slots__ = (
@@ -321,10 +320,10 @@ class Session:
         self._receiving = keys.receiving
         self._sent = 0
         self._highest = -1
-        self._seen = 0  # bit n: the counter n below the highest has been here
+        self._seen = 0  # bit n: the counter n below the highest was received
 
     def seal(self, message: bytes) -> bytes:
-        """The next DATA datagram, with ``message`` of at most ``MAX_PLAIN`` bytes inside."""
+        """Return the next DATA datagram, with ``message`` of at most ``MAX_PLAIN`` bytes."""
         counter = self._sent
         self._sent = counter + 1
         header = _pack(DATA, self.remote_index, counter)
@@ -332,27 +331,27 @@ class Session:
 
     @property
     def sent(self) -> int:
-        """How many datagrams were sealed."""
+        """The number of datagrams that were sealed."""
         return self._sent
 
     def is_replay(self, datagram: bytes) -> bool:
-        """Whether the counter of a DATA datagram has been here, or is too old to tell; costs no decryption."""
+        """Return, without decryption, whether a DATA datagram's counter was received before or is below the window."""
         behind = self._highest - int.from_bytes(datagram[5:_HEADER], "little")
         return behind >= 0 and (behind >= WINDOW or bool(self._seen >> behind & 1))
 
     def open(self, datagram: bytes) -> tuple[bytes, int]:
-        """The message inside a DATA datagram, and how far its counter is ahead of the newest one before it.
+        """Decrypt a DATA datagram; return its message, and the distance of its counter from the newest one before it.
 
-        Raises ``Forged`` where the datagram does not open or was here before; the session is then as it was.
+        Raises ``Forged`` if the datagram is not authentic or a replay; the session is then unchanged.
         """
         if len(datagram) < OVERHEAD or self.is_replay(datagram):
-            raise Forged("a datagram that was here before, or is too short")
+            raise Forged("the datagram is a replay, or too short")
         header = datagram[:_HEADER]
         counter = int.from_bytes(header[5:], "little")
         message = opened(self._receiving, counter, datagram[_HEADER:], header)
         ahead = counter - self._highest
         if ahead > 0:
-            # A counter may leap by up to 2**64: shifting by more than the window would only cost memory.
+            # A counter may advance by up to 2**64: shifting by more than the window would only waste memory.
             self._seen = ((self._seen << ahead) & _WINDOW_MASK if ahead < WINDOW else 0) | 1
             self._highest = counter
         else:
@@ -361,14 +360,14 @@ class Session:
 
 
 def index_of(datagram: bytes) -> int:
-    """The receiver's session index in a DATA or RESP datagram."""
+    """Return the receiver's session index in a DATA or RESP datagram."""
     return int.from_bytes(datagram[1 : 1 + INDEX_BYTES], "little")
 
 
 class HalfOpen:
-    """The sessions whose initiators have not confirmed them, and the RESPs of the last ``RESPONSES_S`` seconds.
+    """Sessions that their initiators have not confirmed, and the RESPs of the last ``RESPONSES_S`` seconds.
 
-    ``sessions`` is the endpoint's table, in which the former stand too.
+    ``sessions`` is the endpoint's table, which also contains the unconfirmed sessions.
     """
 
     def __init__(self, sessions: dict[int, Session]) -> None:
@@ -377,23 +376,23 @@ class HalfOpen:
         self._responses: dict[bytes, tuple[float, bytes]] = {}
 
     def response(self, init: bytes, now: float) -> bytes | None:
-        """The RESP that this INIT got already."""
+        """Return the RESP that was sent for this INIT."""
         made_at, response = self._responses.get(ephemeral_of(init), (-RESPONSES_S, None))
         return response if made_at > now - RESPONSES_S else None
 
     def add(self, session: Session, now: float) -> None:
-        """Keep a new session, and let go of what is too much or too old."""
+        """Add a new session, and delete surplus or expired entries."""
         self._sessions[session.local_index] = self._unconfirmed[session.local_index] = session
         self.sweep(now)
 
     def answered(self, init: bytes, response: bytes, now: float) -> None:
-        """Keep the RESP of an INIT, and let go of what is too much or too old."""
+        """Store the RESP of an INIT, and delete surplus or expired entries."""
         self._responses.pop(ephemeral_of(init), None)
         self._responses[ephemeral_of(init)] = (now, response)
         self.sweep(now)
 
     def sweep(self, now: float) -> None:
-        """Let go of what is too much or too old."""
+        """Delete surplus and expired entries."""
         unconfirmed, responses = self._unconfirmed, self._responses
         while unconfirmed:
             index, oldest = next(iter(unconfirmed.items()))
@@ -408,22 +407,22 @@ class HalfOpen:
             del responses[ephemeral]
 
     def confirm(self, session: Session) -> None:
-        """Take note that the initiator holds the keys, at the address that it wrote from."""
+        """Record that the initiator proved at its address that it holds the keys."""
         session.is_confirmed = True
         self._unconfirmed.pop(session.local_index, None)
 
     def forget(self, session: Session) -> None:
-        """Forget a session that was not let in."""
+        """Delete a session that was rejected."""
         if self._unconfirmed.pop(session.local_index, None) is not None:
             self._sessions.pop(session.local_index, None)
 
     def drop(self, public: bytes) -> None:
-        """Forget the sessions of one initiator."""
+        """Delete the sessions of one initiator."""
         for index in [index for index, session in self._unconfirmed.items() if session.contact.public == public]:
             del self._unconfirmed[index]
             self._sessions.pop(index, None)
 
     def clear(self) -> None:
-        """Forget everything."""
+        """Delete all entries."""
         self._unconfirmed.clear()
         self._responses.clear()

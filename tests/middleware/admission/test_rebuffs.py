@@ -26,7 +26,7 @@ class RebuffTests(VillageCase):
         self.assertEqual((ours.who, ours.code), (dog.public, "revoked"))
         self.assertEqual((theirs.who, theirs.code), (village.houses[0].public, "revoked"))
         for each in (ours, theirs):
-            self.assertIn("; only a new code lets that node in again", each.reason)
+            self.assertIn("; admit the node again with a new code", each.reason)
 
     def test_newcomers(self) -> None:
         """A used code stands with its holder's key; codes that nobody knows are one, however many there were."""

@@ -201,8 +201,8 @@ class StrangersTests(VillageCase):
             for _ in range(5):
                 self.assertEqual(self.refusal(village, spy.node.call, village.houses[0]), "foreign")
         lines = [formatEvent(event) for event in said]
-        for words in ("is not let in: ", "does not let this node in: "):
-            self.assertEqual(sum(f"{words}the certificate is not one of this team" in line for line in lines), 1)
+        for words in ("is rejected: ", "rejects this node: "):
+            self.assertEqual(sum(f"{words}the certificate belongs to another team" in line for line in lines), 1)
         self.assertEqual(village.members(), ["vaio"])
 
     def test_stranger_is_told_where_to_look(self) -> None:

@@ -170,7 +170,7 @@ class WeatherTests(GroundCase):
         self.assertIn(port, a.reach._ports)
         a.reach.outside.saw(peer.session.contact, Address(ground.routers["a"].host, 3), is_told=True)
         self.assertEqual(len(a.endpoint.peers._openings), 0)
-        a.reach._lead(peer, [at_b], 0)
+        a.reach._assign_port(peer, [at_b], 0)
         self.assertEqual(ground.networks["a2"].local(at_b).port, port)
 
     def test_direct_before_carried(self) -> None:
