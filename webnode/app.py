@@ -1,7 +1,7 @@
-"""The Flask side: the page, and every route of the table, over a state and a board that are handed in.
+"""Serve the page and every route of the table with Flask.
 
-Handlers run on worker threads.  They read a finished state and check what came; the answer itself is called on the
-reactor's thread, and what it waits for is waited for here, for a bounded time.
+Handlers run on worker threads.  They read a finished state and check the request.  The route's answer runs on the
+reactor's thread; the worker thread waits for it for a bounded time.
 """
 
 from __future__ import annotations
@@ -48,17 +48,17 @@ def create_app(
     hosts: Collection[str] = (),
     wall: Callable[[], float] = lambda: 0.0,
 ) -> Flask:
-    """The application.
+    """Return the Flask application.
 
-    ``read`` returns the newest state and may be called from any thread; ``on_reactor(f, *arguments)`` calls ``f``
-    on the reactor's thread and returns what it returns (``server.caller`` makes one; the default calls at once, for
-    tests); ``hosts`` are names of this machine beside its addresses and local names; ``wall`` is unix time.
+    ``read`` returns the newest state and may be called from any thread.  ``on_reactor(f, *arguments)`` calls ``f`` on
+    the reactor's thread and returns its result (``server.caller`` makes one; the default calls directly, for tests).
+    ``hosts`` are names of this machine in addition to its addresses and local names.  ``wall`` returns unix time.
     """
     app = Flask("webnode", static_folder=None)
     app.config["MAX_CONTENT_LENGTH"] = MAX_BODY
     app.json.sort_keys = False  # type: ignore[attr-defined]
 
-    # A phone whose page is being closed can still send a last word, but no header with it.
+    # navigator.sendBeacon, which a phone uses when its page is closed, cannot set headers.
     unmarked = {(str(route.method), _rule(route.path)) for route in TABLE if route.role == "phone"}
     lets_in = partial(on_reactor, board.fallbacks.lets_in)
     _guard(app, lets_in, hosts, lambda: (request.method, str(request.url_rule)) not in unmarked)
@@ -88,7 +88,7 @@ def create_app(
 
 
 def _guard(app: Flask, lets_in: LetsIn, hosts: Collection[str], needs_mark: Callable[[], bool]) -> None:
-    """Let in who comes by a name of this machine and from a page of the team, and send the headers that keep it so."""
+    """Check ``Host`` and ``Origin`` of each request, and set the security headers of each response."""
 
     @app.before_request
     def admit() -> Response | None:
@@ -99,7 +99,7 @@ def _guard(app: Flask, lets_in: LetsIn, hosts: Collection[str], needs_mark: Call
         problem = refusal(request.method, host, origin, marked, hosts, lambda _: is_let_in)
         if problem is not None:
             raise problem
-        # A browser asks first before it lets a page of another node give an order.
+        # OPTIONS is the preflight request (CORS) for a page of another web node.
         return app.response_class(status=204) if request.method == "OPTIONS" else None
 
     @app.after_request
@@ -110,7 +110,7 @@ def _guard(app: Flask, lets_in: LetsIn, hosts: Collection[str], needs_mark: Call
 
 
 def _explain(app: Flask) -> None:
-    """Answer whatever goes wrong with what, where, and what to do."""
+    """Answer every error as JSON with field, problem and remedy."""
 
     @app.errorhandler(Refusal)
     def refused(error: Refusal) -> tuple[Response, int]:
@@ -119,7 +119,7 @@ def _explain(app: Flask) -> None:
     @app.errorhandler(HTTPException)
     def unlawful(error: HTTPException) -> tuple[Response, int]:
         code = error.code or 500
-        remedy = "send less" if code == 413 else "look at docs/reference/http-api.md for what can be asked"
+        remedy = "send a smaller body" if code == 413 else "see docs/reference/http-api.md for the routes and methods"
         response = jsonify(Refusal(request.path, error.name.lower(), remedy).fields)
         allowed = getattr(error, "valid_methods", None)
         if allowed:
@@ -129,7 +129,7 @@ def _explain(app: Flask) -> None:
     @app.errorhandler(Exception)
     def broken(error: Exception) -> tuple[Response, int]:
         app.logger.error("%s %s failed", request.method, request.path, exc_info=error)
-        return jsonify(Refusal(request.path, "the web node failed", "try again; its log says why").fields), 500
+        return jsonify(Refusal(request.path, "internal error", "try again; the node's log has the cause").fields), 500
 
 
 def _serve_page(app: Flask, read: Callable[[], State]) -> None:
@@ -153,7 +153,7 @@ def _token() -> str:
 def _id() -> str:
     words = request.headers.get("Idempotency-Key", "")
     if len(words) > MAX_ID or not words.isprintable():
-        raise Refusal("Idempotency-Key", "it is no name for an order", f"give at most {MAX_ID} characters")
+        raise Refusal("Idempotency-Key", "invalid value", f"send at most {MAX_ID} printable characters")
     return words
 
 

@@ -1,4 +1,4 @@
-"""Cameras: the newest picture of a device, and who waits for the next one; streams exist while somebody looks."""
+"""Serve the newest picture of each device by long polling; an upstream is open only while a browser watches."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ Question = tuple[Request, bytes, IDelayedCall]
 
 
 class Camera:
-    """The newest picture of one device, and who waits for the next; ends itself two seconds after the last question.
+    """The newest picture of one device, and the requests that wait for the next one.
 
-    ``watch`` opens the upstream (and may raise ``Refusal``).  An upstream that is silent for ``POLL_S`` is opened anew:
-    its device may have come back at another address.
+    ``watch`` opens the upstream and may raise ``Refusal``.  An upstream that is silent for ``POLL_S`` is reopened, as
+    the device may have a new address.  A camera ends two seconds after its last request.
     """
 
     def __init__(self, clock: IReactorTime, watch: Callable[[OnFrame], Callable[[], None]], on_end: Callable[[], None]):
@@ -40,7 +40,7 @@ class Camera:
         self._stop_upstream = watch(self.on_frame)
 
     def wait(self, request: Request) -> None:
-        """Answer ``request`` with the first picture that is news to it."""
+        """Answer ``request`` with the first picture that its viewer has not seen."""
         viewer = argument(request, b"viewer")
         for entry in [entry for entry in self.waiting if viewer and entry[1] == viewer]:
             self._release(entry)
@@ -56,7 +56,7 @@ class Camera:
         request.notifyFinish().addErrback(lambda _: self._forget(entry))
 
     def on_frame(self, seq: int, jpeg: bytes, age: float) -> None:
-        """Take the next picture, taken ``age`` seconds ago; a late or far too large one, or no JPEG, is dropped."""
+        """Take a picture that is ``age`` seconds old; drop it if it is late, too large or no JPEG."""
         if self._ended or len(jpeg) > MAX_FRAME or size_of(jpeg) is None:
             return
         now = self._clock.seconds()
@@ -68,7 +68,7 @@ class Camera:
         self._rest()
 
     def close(self) -> None:
-        """Answer whoever waits with 204 and end the upstream now."""
+        """Answer waiting requests with 204 and end the upstream."""
         for entry in list(self.waiting):
             self._release(entry)
         if self._linger is not None:

@@ -1,7 +1,8 @@
-"""Channel: one connection to the page, and what it keeps to before anybody is asked; it knows no routes.
+"""One HTTP connection with deadlines and limits per address; it knows nothing of routes.
 
-Twisted ends a connection that is idle, and a client that sends a byte now and then never is.  So each part of a request
-has a time in which it is complete, an address may have so many that are not, and who reads nothing is let go.
+Twisted's idle timeout does not end a connection that sends a byte now and then (Slowloris).  So each part of a request
+has a deadline, an address has a limit of incomplete requests, and a client that does not read its response is
+disconnected.
 """
 
 from __future__ import annotations
@@ -21,27 +22,27 @@ from webnode.limits import AddressLimits, Kept
 from webnode.visitor import Visitor
 
 HEAD_S = 10.0
-"""A request's lines are complete so long after its first byte, or after the connection was made."""
+"""Deadline for a request's headers, after its first byte or after the connection was made."""
 KEEP_S = 15.0
-"""A connection waits so long for its next request."""
+"""Time that an idle connection stays open for its next request."""
 GRACE_S, PACE = 2.0, 1000.0
-"""After so long a body has come with at least so many bytes a second."""
+"""Grace period of a request body, and the minimum rate afterwards in bytes per second."""
 STALL_S = 30.0
-"""An answer of which nothing is taken for so long is given up."""
+"""Time after which a response that the client does not read is aborted."""
 CLOSE_S = 2.0
-"""A refused client has so long to read why."""
+"""Time for a refused client to read the reason."""
 STATUS = {400: "Bad Request", 408: "Request Timeout", 413: "Content Too Large", 503: "Service Unavailable"}
 
 TOO_LARGE = Refusal("body", "it is too large", "send at most 64 KiB", 413)
-UNREADABLE = Refusal("request", "it is no HTTP that can be read", "send HTTP/1.1, with at most 16 KiB of headers", 400)
-LATE_HEAD = Refusal("request", "it was not complete in time", f"send its head within {HEAD_S:g} s", 408)
-LATE_BODY = Refusal("body", "it comes too slowly", f"send at least {PACE:g} bytes a second", 408)
-TOO_MANY = Refusal("request", "too many from this address are unfinished", "finish those first", 503)
-TOO_BUSY = Refusal("request", "too many from this address are being answered", "close some, then try again", 503)
+UNREADABLE = Refusal("request", "it is not valid HTTP", "send HTTP/1.1, with at most 16 KiB of headers", 400)
+LATE_HEAD = Refusal("request", "headers not complete in time", f"send all headers within {HEAD_S:g} s", 408)
+LATE_BODY = Refusal("body", "it arrives too slowly", f"send at least {PACE:g} bytes a second", 408)
+TOO_MANY = Refusal("request", "too many incomplete requests from this address", "complete those first", 503)
+TOO_BUSY = Refusal("request", "too many open requests from this address", "close some, then try again", 503)
 
 
 def raw(refusal: Refusal) -> bytes:
-    """The whole answer of a refusal that nobody else can give, as bytes of HTTP."""
+    """Return the complete HTTP response to a request that does not reach Flask."""
     body = json.dumps(refusal.fields).encode()
     lines = [f"HTTP/1.1 {refusal.status} {STATUS[refusal.status]}", "Content-Type: application/json"]
     lines += [f"{name}: {value}" for name, value in HEADERS.items()]
@@ -50,9 +51,9 @@ def raw(refusal: Refusal) -> bytes:
 
 
 class CappedRequest(SiteRequest):
-    """A request whose body is never kept beyond ``guard.MAX_BODY``: answered with 413 and cut off.
+    """A request whose body is limited to ``guard.MAX_BODY``; a larger one is answered with 413 and disconnected.
 
-    ``who`` asks, where a native resource is asked.
+    ``who`` is the authenticated client of a request to a native resource.
     """
 
     who = Visitor()
@@ -60,13 +61,13 @@ class CappedRequest(SiteRequest):
     _cut = False
 
     def gotLength(self, length: int | None) -> None:  # noqa: N802
-        """Refuse a body that announces itself as too large."""
+        """Refuse a body whose Content-Length is too large."""
         super().gotLength(0 if length is not None and length > MAX_BODY else length)
         if length is not None and length > MAX_BODY:
             self._refuse()
 
     def handleContentChunk(self, data: bytes) -> None:  # noqa: N802
-        """Take a piece of the body, or refuse the rest."""
+        """Take a chunk of the body, or refuse the rest."""
         self._taken += len(data)
         if self._taken > MAX_BODY:
             self._refuse()
@@ -74,7 +75,7 @@ class CappedRequest(SiteRequest):
             super().handleContentChunk(data)
 
     def requestReceived(self, command: bytes, path: bytes, version: bytes) -> None:  # noqa: N802
-        """Go on, unless the body was refused."""
+        """Process the request, unless its body was refused."""
         if not self._cut:
             super().requestReceived(command, path, version)
 
@@ -91,7 +92,7 @@ class CappedRequest(SiteRequest):
 
 
 class Channel(HTTPChannel):
-    """A connection with deadlines; ``factory`` is a site that was ``limited``."""
+    """A connection with deadlines; ``factory`` is a site that was passed to ``limited``."""
 
     factory: Any
     transport: Any
@@ -106,7 +107,7 @@ class Channel(HTTPChannel):
     _since = 0.0
 
     def connectionMade(self) -> None:  # noqa: N802
-        """Wait for a request, unless its address has far too many connections."""
+        """Wait for a request; abort if the address has too many connections."""
         super().connectionMade()
         self.limits = self.factory.limits
         self._address = str(getattr(self.getPeer(), "host", ""))
@@ -119,7 +120,7 @@ class Channel(HTTPChannel):
         self._within(HEAD_S, self._close)
 
     def dataReceived(self, data: bytes) -> None:  # noqa: N802
-        """Take bytes, and see what they complete."""
+        """Take bytes and update the request's phase."""
         if self._over:
             return
         if self._phase == "idle":
@@ -129,7 +130,7 @@ class Channel(HTTPChannel):
         self._weigh()
 
     def allHeadersReceived(self) -> None:  # noqa: N802
-        """From here the body has its own pace."""
+        """Start the deadline of the body."""
         if self._over:
             return
         self._phase, self._since = "body", self._now()
@@ -137,7 +138,7 @@ class Channel(HTTPChannel):
         super().allHeadersReceived()
 
     def allContentReceived(self) -> None:  # noqa: N802
-        """From here it is ours to answer."""
+        """End the deadline, and count the request as being answered."""
         if self._over:
             return
         self._phase = "answer"
@@ -150,7 +151,7 @@ class Channel(HTTPChannel):
         super().allContentReceived()
 
     def requestDone(self, request: Any) -> None:  # noqa: N802
-        """The answer is out; the next request may have come already, or begun to."""
+        """Wait for the next request, of which bytes may have arrived already."""
         self._count(None)
         self._phase = "idle"
         waits = bool(self._dataBuffer)
@@ -161,19 +162,19 @@ class Channel(HTTPChannel):
         self._weigh()
 
     def pauseProducing(self) -> None:  # noqa: N802
-        """The client does not take what it asked for."""
+        """Start the deadline for a client that does not read its response."""
         super().pauseProducing()
         if self._stalled is None and not self._over:
             self._stalled = self.callLater(STALL_S, self._abort)
 
     def resumeProducing(self) -> None:  # noqa: N802
-        """It does again."""
+        """End the deadline for the client to read."""
         super().resumeProducing()
         self._end(self._stalled)
         self._stalled = None
 
     def connectionLost(self, reason: Failure) -> None:  # type: ignore[override]  # noqa: N802
-        """Forget all of it."""
+        """Cancel all deadlines and counts."""
         self._over = True
         self._count(None)
         if self._open:
@@ -185,7 +186,7 @@ class Channel(HTTPChannel):
         super().connectionLost(reason)
 
     def refuse(self, refusal: Refusal) -> None:
-        """Answer what is no whole request, and end the connection."""
+        """Answer an invalid or incomplete request, and end the connection."""
         if self._over:
             return
         self._over = True
@@ -195,11 +196,11 @@ class Channel(HTTPChannel):
         self._within(CLOSE_S, self._abort)
 
     def lineLengthExceeded(self, line: bytes) -> None:  # noqa: N802
-        """Refuse a line that is longer than all headers may be."""
+        """Refuse a line that exceeds the limit for all headers."""
         self.refuse(UNREADABLE)
 
     def _respondToBadRequestAndDisconnect(self) -> None:  # noqa: N802
-        # Twisted's own name: it would answer without a body and without the headers that all answers have.
+        # Twisted's method sends neither a body nor the security headers.
         self.refuse(UNREADABLE)
 
     def _begin(self) -> None:
@@ -207,7 +208,7 @@ class Channel(HTTPChannel):
         self._within(HEAD_S, lambda: self.refuse(LATE_HEAD))
 
     def _weigh(self) -> None:
-        """Count a request that is not complete for now; most are, with the bytes that they begin with."""
+        """Count a request that is not complete; a request that arrives whole is not counted."""
         if self._over or self._phase not in ("head", "body") or self._counted:
             return
         if not self.limits.may("unfinished", self._address):
@@ -251,10 +252,10 @@ class Channel(HTTPChannel):
 
 
 def limited(site: Site, limits: AddressLimits) -> None:
-    """Have the connections of ``site`` keep to ``limits`` and to the deadlines above."""
+    """Apply ``limits`` and the deadlines of this module to the connections of ``site``."""
     held: Any = site
     held.protocol = Channel
     held.limits = limits
     held.timeOut = None
-    # A channel of this kind speaks nothing newer, whatever is installed.
+    # Channel implements HTTP/1.1 only, also if the package h2 is installed.
     held.acceptableProtocols = lambda: [b"http/1.1"]

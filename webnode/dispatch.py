@@ -1,4 +1,4 @@
-"""Dispatch: a route's answer, called once for what is asked once, with a line in the audit for each change."""
+"""Call a route's answer once per idempotency key, and write each change to the audit log."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from webnode.errors import Refusal
 from webnode.route import Ask, Route
 
 REMEMBERED = 256
-"""Orders that are known again when they are repeated."""
+"""Number of answers kept for repeated requests."""
 
 
 class Dispatch:
-    """Carries out what is asked of routes; on the reactor's thread."""
+    """Calls the answers of routes; on the reactor's thread."""
 
     def __init__(self) -> None:
         self._answers: OrderedDict[tuple[str, str, str], _Answer] = OrderedDict()
 
     def carry_out(self, route: Route, ask: Ask) -> Deferred[Any]:
-        """The answer; one that was given to the same id from the same visitor is given again."""
-        # What a viewer may ask changes nothing, whatever its method.
+        """Return the answer; a repeated id of the same session gets the first answer again."""
+        # A route that a viewer may call changes nothing, whatever its method.
         if route.method == "GET" or route.role == "viewer":
             return self._called(route, ask)
-        # Whoever has not signed in is nobody in particular: what one was answered is not another's to hear.
+        # Unauthenticated clients share one identity: a stored answer must not reach another client.
         if not ask.id or route.role == "anyone":
             return self._noted(route, ask)
         key = ask.who.token_id, route.name, ask.id
@@ -57,7 +57,7 @@ class Dispatch:
 
 
 class _Answer:
-    """What came, or who waits for it."""
+    """The outcome of a route's answer, and the requests that wait for it."""
 
     def __init__(self) -> None:
         self._outcome: list[Any] = []

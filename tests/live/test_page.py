@@ -238,7 +238,7 @@ class PageTests(PageCase):
         """What happens is told in words, newest first: of all, of one kind, and of one device or task."""
         page = self.opened(DESK)
         story = page.locator("#events li")
-        page.locator("#events li", has_text="begins to look").wait_for()
+        page.locator("#events li", has_text="starts to observe").wait_for()
         self.team.order("gone dog2")
         page.locator("#events li[data-kind=gone]", has_text="dog2 is gone").wait_for()
         self.team.order("status dog1 EXECUTING")
@@ -280,7 +280,7 @@ class PageTests(PageCase):
         page.locator(".device[data-state=DONE]", has_text="done").wait_for()
         # Where the events have the screen to themselves the page is scrolled, and not a list within it.
         self.view(page, "events")
-        page.locator("#events li", has_text="begins to look").wait_for()
+        page.locator("#events li", has_text="starts to observe").wait_for()
         inside = """events => {
           for (let n = 0; n < 100; n += 1) events.append(events.firstElementChild.cloneNode(true));
           return events.scrollHeight - events.clientHeight;

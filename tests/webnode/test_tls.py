@@ -96,7 +96,7 @@ class CertifiedTests(SynchronousTestCase):
             (lambda: self.path.write_bytes(b""), "no certificate with its key"),
             (moved, "it lacks 192.168.0.8"),
             (sworn, "another authority"),
-            (aged, "it runs out"),
+            (aged, "it expires soon"),
         ]
         for seed, (fault, words) in enumerate(faults):
             self.certified(seed)
