@@ -1,6 +1,6 @@
-"""Survey: what devices answer when they are asked over the network.
+"""Query devices over the network for diagnostics.
 
-However many look at the network, each device is asked once a second; what it says is not believed to be lawful.
+Each device is queried at most once a second, however many pages ask; replies are not trusted and therefore sanitized.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from webnode.errors import Refusal
 from webnode.field import MAX_ENTRIES, Json, count, distance, number, text
 
 PATIENCE_S = 1.2
-"""How long a device has to answer; below what the caller of a route waits."""
+"""Timeout of a device's reply in seconds; less than the time limit of a route."""
 FRESH_S = 1.0
 MAX_ASKED = 64
-"""Devices that are asked for the view of the network, in the order of joining."""
+"""Maximum number of devices queried, in the order of joining."""
 OWN: dict[str, Callable[[SwarmNode], dict[str, Any]]] = {INVENTORY: inventory, NETWORK: network, LINKS: links}
 
 
 class TeamSurvey:
-    """Asks the devices that ``client`` knows; the one of ``node`` answers here."""
+    """Queries the devices that ``client`` knows; the device of ``node`` is read locally."""
 
     def __init__(self, node: SwarmNode, client: TeamClient) -> None:
         self._node = node
@@ -38,19 +38,19 @@ class TeamSurvey:
         self._rounds = {NETWORK: _Round(_network_view), LINKS: _Round(_links_view)}
 
     def network(self) -> Deferred[Json]:
-        """Who knows whom, and how far they are; ``silent`` are the uuids of those that did not answer."""
+        """Fire with each device's contacts and round-trip times; ``silent`` lists devices without a reply."""
         return self._told(NETWORK)
 
     def links(self) -> Deferred[Json]:
-        """How each device reaches the others, and how well; ``here`` is the uuid of this node."""
+        """Fire with the path and its quality from each device to the others; ``here`` is the uuid of this node."""
         return self._told(LINKS)
 
     def team(self) -> Json:
-        """What team this is."""
+        """Return the kind of team, and its members if it is closed."""
         return team(self._node)
 
     def inventory(self, uuid: str) -> Deferred[Json]:
-        """What a device stores; fails with ``Refusal`` 409 or 504."""
+        """Fire with the records that a device stores; fails with ``Refusal`` 409 or 504."""
         device = self._client.view.device(uuid)
         if device is None:
             raise Refusal("device", "it has left the network", "wait until it is back", 409)
@@ -59,13 +59,13 @@ class TeamSurvey:
     # -- inside -----------------------------------------------------------------------------------------------------
 
     def _told(self, method: str) -> Deferred[Json]:
-        """What all answered, asked at most once a ``FRESH_S``."""
+        """Fire with the replies of all devices, queried at most once in ``FRESH_S``."""
         asked = self._rounds[method]
         if asked.waiting is None:
             if self._node.clock.seconds() - asked.ended_at < FRESH_S:
                 return succeed(asked.told)
             self._ask_all(method, asked)
-        if asked.waiting is None:  # everybody has answered at once
+        if asked.waiting is None:  # all devices have replied synchronously
             return succeed(asked.told)
         waiter: Deferred[Json] = Deferred(asked.waiting.remove)
         asked.waiting.append(waiter)
@@ -78,7 +78,7 @@ class TeamSurvey:
         asked.waiting = []
 
         def ended(outcomes: list[tuple[bool, Any]]) -> None:
-            # In the order of joining, whoever was quicker.
+            # In the order of joining, whatever the order of the replies.
             told = [(device.uuid, outcome) for device, (_, outcome) in zip(devices, outcomes, strict=True)]
             views = {uuid: asked.view(outcome, names) for uuid, outcome in told if isinstance(outcome, dict)}
             silent: list[Json] = [uuid for uuid, _ in told if uuid not in views]
@@ -99,7 +99,7 @@ class TeamSurvey:
 
 @dataclass
 class _Round:
-    """What is asked of all: how an answer is made lawful, the newest answers, and who waits for others."""
+    """One kind of query to all devices: its sanitizing function, the newest replies, and the callers that wait."""
 
     view: Callable[[dict[Any, Any], dict[str, str]], Json]
     told: Json = None
@@ -110,7 +110,7 @@ class _Round:
 def _refused(failure: Any, name: str) -> None:
     failure.trap(EntangledError)
     if failure.check(Refused):
-        raise Refusal("device", f"{name} says no: {failure.getErrorMessage()}", "bring it to this version", 409)
+        raise Refusal("device", f"{name} refused: {failure.getErrorMessage()}", "update it to this version", 409)
     raise Refusal("device", f"{name} did not answer", "wait until it is back, then try again", 504)
 
 
@@ -153,7 +153,7 @@ def _links_view(told: dict[Any, Any], names: dict[str, str]) -> Json:
 
 
 def _link_view(told: dict[Any, Any], names: dict[str, str]) -> Json:
-    """One way, and its score, which is None as long as nothing is measured."""
+    """Return one path and its score, which is None if nothing is measured."""
     way, by = told.get("way"), text(told.get("by"), limit=64)
     loss, round_trip, jitter = (distance(told.get(name)) for name in ("loss", "round_trip", "jitter"))
     loss = None if loss is None else min(loss, 1.0)

@@ -45,7 +45,7 @@ class KeyfileTests(SynchronousTestCase):
         self.assertIn("cannot be read", self.refusal())
         self.path.unlink()
         os.mkfifo(self.path, 0o600)
-        self.assertIn("no plain file", self.refusal())
+        self.assertIn("not a regular file", self.refusal())
         self.path.unlink()
         self.path.mkdir(0o700)
         self.assertIn("no plain file", self.refusal())

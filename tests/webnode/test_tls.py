@@ -91,7 +91,7 @@ class CertifiedTests(SynchronousTestCase):
             self.now += 340 * DAY
 
         faults: list[tuple[Any, str]] = [
-            (lambda: self.path.chmod(0o644), "others may read"),
+            (lambda: self.path.chmod(0o644), "other users can read"),
             (cut, "no certificate with its key"),
             (lambda: self.path.write_bytes(b""), "no certificate with its key"),
             (moved, "it lacks 192.168.0.8"),
@@ -112,7 +112,7 @@ class CertifiedTests(SynchronousTestCase):
         """Where it cannot be kept it serves all the same, and the log says why the next start makes another."""
         self.path = self.path.parent / "nowhere" / "a.tls"
         certified, said = self.certified()
-        self.assertIn("cannot be kept", said)
+        self.assertIn("cannot store", said)
         self.assertIn("192.168.0.7", self.served(certified))
 
     def test_follow_the_machine(self) -> None:
