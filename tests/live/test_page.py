@@ -52,7 +52,7 @@ class PageTests(PageCase):
             "devices": ["Devices"],
             "tasks": ["Tasks"],
             "cameras": ["Cameras"],
-            "map": ["Yard"],
+            "map": ["Simulator"],
             "groups": ["More", "Consensus"],
             "network": ["More", "Network"],
             "events": ["More", "Events"],
@@ -307,7 +307,7 @@ class PageTests(PageCase):
         for _ in range(4):
             page.keyboard.press("ArrowRight")
         page.locator("#place", has_text="Target at 1.2").wait_for()
-        page.get_by_role("button", name="Take away").click()
+        page.get_by_role("button", name="Remove target").click()
         page.locator("#place", has_text="No target").wait_for()
         page.get_by_role("button", name="Place target").click()
         page.locator("#place", has_text="Target at 1.50, 1.20").wait_for()

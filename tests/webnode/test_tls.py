@@ -104,7 +104,7 @@ class CertifiedTests(SynchronousTestCase):
             fault()
             _, said = self.certified(100 + seed)
             self.assertIn(words, said)
-            self.assertIn("is made anew", said)
+            self.assertIn("is replaced", said)
             self.assertNotEqual(read(self.path.read_bytes()).certificate.serial_number, before)
             self.assertEqual(stat.S_IMODE(self.path.stat().st_mode), 0o600)
 
