@@ -79,7 +79,9 @@ class ActionPageTests(PageCase):
             self.assertEqual(asked.value.post_data_json, {"name": "search", "group": "yard"})
             self.told(page, "Assigned")
             page.locator("#group").fill("elsewhere")
-            page.locator("[data-can=with]", has_text="no other task yet; this is the first of group elsewhere").wait_for()
+            page.locator(
+                "[data-can=with]", has_text="no other task yet; this is the first of group elsewhere"
+            ).wait_for()
             self.sound(page)
 
     def test_lift_a_robot(self) -> None:

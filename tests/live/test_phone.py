@@ -84,7 +84,9 @@ class PhoneViewTests(BrowserCase, TeamCase):
         page.locator(".phone .trouble", has_text="Left the team, as this page was hidden").wait_for()
         with page.expect_request("**/api/v1/phones") as joined:
             page.evaluate(HIDE, False)
-        page.locator(".phone .trouble", has_text="The phone left while this page was hidden, and has returned").wait_for()
+        page.locator(
+            ".phone .trouble", has_text="The phone left while this page was hidden, and has returned"
+        ).wait_for()
         page.locator(".phone .said", has_text="Look for the red target").wait_for()
         self.assertEqual(json.loads(joined.value.post_data)["secret"], json.loads(secret)["secret"])
         self.assertEqual(self.faults, [])
