@@ -1,6 +1,6 @@
-"""Visitor: a client of a web node's page, as a browser is one, for programs.
+"""A programmatic client of a web node's page.
 
-Follows the live stream of states, and orders through the page's JSON.
+It follows the live stream of states, and sends orders through the HTTP API.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ MAX_EVENT = 1 << 20
 
 
 class PageError(Exception):
-    """The page refused, or answered what is no answer; the message is the page's own."""
+    """The page refused a request or sent an invalid answer; the message contains the page's text."""
 
 
 class EventStream:
-    """Server-sent events out of bytes, however these are cut; an event above one MiB is dropped."""
+    """A parser of server-sent events for any chunks of bytes; an event above one MiB is dropped."""
 
     def __init__(self) -> None:
         self._buffer = b""
@@ -36,7 +36,7 @@ class EventStream:
         self._data: list[bytes] = []
 
     def feed(self, data: bytes) -> list[tuple[str, bytes]]:
-        """Take the next bytes; returns the events that are complete now, each with its name and data."""
+        """Parse more bytes; returns the completed events, each with its name and data."""
         events = []
         *lines, self._buffer = (self._buffer + data).split(b"\n")
         if len(self._buffer) > MAX_EVENT:
@@ -57,10 +57,10 @@ class EventStream:
 
 
 class Visitor:
-    """One visitor of the page at ``http://HOST:PORT``.
+    """A client of the page at ``http://HOST:PORT``.
 
-    ``on_state(before, after)`` is called at each new state; ``state`` is the newest, empty before the first one.
-    ``code`` is what it signs in with; it signs in again when the page no longer knows it.
+    ``on_state(before, after)`` is called for each new state; ``state`` is the newest, empty before the first one.
+    ``code`` is the sign-in code; the client signs in again when its session has ended.
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class Visitor:
         self._following = False
 
     def follow(self) -> None:
-        """Follow the live states until ``leave``; a lost stream is opened again."""
+        """Follow the live states until ``leave``; a lost stream is reopened."""
         self._following = True
         self._open()
 
@@ -96,7 +96,7 @@ class Visitor:
             self._stream.transport.loseConnection()
 
     async def post(self, path: str) -> dict[str, Any]:
-        """Give an order to the page; raises ``PageError`` where it is refused."""
+        """Send an order to the page; raises ``PageError`` if it is refused."""
         await self._sign_in()
         return await self._posted(path, None)
 
