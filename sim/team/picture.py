@@ -1,4 +1,4 @@
-"""Picture: a run's figures over time as one SVG, a small diagram each, without a library."""
+"""Draw a run's figures over time as SVG, one small diagram each."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ LINE, AXIS, FAULT = "#2563a8", "#6b7280", "#c2410c"
 
 
 def drawn(title: str, series: Series, faults: Sequence[tuple[float, str]] = ()) -> str:
-    """The picture; ``faults`` are moments and what happened then, drawn as vertical lines."""
+    """Return the SVG; ``faults`` are times and descriptions, drawn as vertical lines."""
     parts: list[str] = []
     shown = {name: points for name, points in series.items() if len(points) > 1}
     end = max((points[-1][0] for points in shown.values()), default=1.0) or 1.0

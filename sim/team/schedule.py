@@ -1,7 +1,7 @@
-"""Schedule: one random run of a fleet under loss, partitions, kills and restarts, with workloads that watch it.
+"""Run one random schedule of nodes with losses, partitions, kills and restarts, observed by workloads.
 
-Everything follows from the seed.  After the faults everything heals, those that are to come back come back, and when
-the repair interval is over the workloads give their verdicts.
+Everything follows from the seed.  Finally all faults end and killed nodes restart, and after the repair interval the
+workloads give their verdicts.
 """
 
 from __future__ import annotations
@@ -20,18 +20,17 @@ from sim.team.workload import Workload
 from sim.team.world import Fleet
 
 STRANDED = 0.15
-"""The share of schedules in which a cut leaves a few with newcomers of their own."""
+"""Share of schedules in which a partition separates a minority together with newcomers."""
 STEP = 0.5
 SETTLE = 45.0
-"""Seconds after which a healed team is as it should be: tries, three rounds of mending, and a struck member."""
+"""Repair interval in seconds: retries, three rounds of anti-entropy, and the removal of a dead member."""
 
 
 class Schedule:
-    """The run of ``seed``: a fleet, its weather and its faults.
+    """The run of ``seed``: nodes, network conditions and faults.
 
-    ``workloads`` are made with the schedule when the fleet stands.  ``rng`` is for the first of them; the others have
-    dice of their own, so that the seeds that show a bug go on showing it.  ``world`` is what makes the nodes; ``trim``
-    says what is left of it.
+    ``workloads`` are made when the nodes exist.  ``rng`` belongs to the first workload; the others have their own
+    generators, so that a seed that shows a bug keeps showing it.  ``world`` makes the nodes; ``trim`` reduces the run.
     """
 
     def __init__(self, seed: int, world: type[Fleet] = Fleet, trim: Trim = WHOLE) -> None:
@@ -59,22 +58,22 @@ class Schedule:
             self.faults += self._stranded(dice)
         self.seconds = trim.within(self.seconds)
         self.down: set[int] = set()
-        """The places whose nodes are to come back."""
+        """The places whose nodes will restart."""
 
     def alive(self) -> list[int]:
-        """The places whose nodes run."""
+        """Return the places with running nodes."""
         return self.fleet.alive()
 
     def node(self, place: int) -> EntangledNode:
-        """The node of a place, in its present life."""
+        """Return the node at a place in its present life."""
         return self.fleet.nodes[place]
 
     def addresses(self, places: Sequence[int]) -> list[Address]:
-        """Where those places listen."""
+        """Return the addresses of these places."""
         return [self.fleet.address(place) for place in places]
 
     def run(self, workloads: Sequence[Workload]) -> list[str]:
-        """Run everything; the violations, a line each."""
+        """Run the schedule; returns the violations, one line each."""
         fleet = self.fleet
         fleet.run(2.0)
         fleet.board.weather = self.weather
@@ -100,7 +99,7 @@ class Schedule:
         return found + check(self.history)
 
     def restart(self, place: int) -> None:
-        """Let the node of a place live again, on the store of its former life."""
+        """Restart the node of a place with the store of its former life."""
         self.down.discard(place)
         others = sorted({*self.alive(), place})
         self.fleet.restart(place, [one for one in self.rng.sample(others, min(2, len(others))) if one != place])
@@ -109,7 +108,7 @@ class Schedule:
 
     def _faults(self, dice: random.Random) -> list[TimedFault]:
         places, faults = list(range(self.n)), []
-        # As many may die for good as a majority can do without, one quorum of the smallest record kept.
+        # Permanent failures never exceed a minority of the smallest replica set.
         mortal = dice.sample(places, max(0, (min(self.n, 8) - 1) // 2))
         for _ in range(dice.randrange(1, 6)):
             at = dice.uniform(0.0, self.seconds * 0.8)
@@ -129,7 +128,7 @@ class Schedule:
         return faults
 
     def _stranded(self, dice: random.Random) -> list[TimedFault]:
-        """Less than half are cut off, and so many newcomers join them that together they are more than half."""
+        """Cut off a minority, which newcomers join until they are a majority together."""
         few = dice.sample(range(self.n), (self.n - 1) // 2)
         newcomers = range(self.n, 2 * self.n - 2 * len(few) + 1)
         at = dice.uniform(2.0, self.seconds * 0.5)
@@ -142,7 +141,7 @@ class Schedule:
         if fault.kind == "join":
             known: Sequence[int] = fault.places[1:]
             if not {*self.alive(), *self.down}.intersection(known):
-                known = self.alive()[:1]  # who knows nobody but the dead never gets in
+                known = self.alive()[:1]  # a newcomer that knows only dead nodes could not join
             self.fleet.restart(len(self.fleet.nodes), known)
             self.n += 1
         elif fault.kind == "cut":
