@@ -1,4 +1,4 @@
-"""Carry out the faults and sessions of a scenario in a simulated team."""
+"""Apply the faults and sessions of a scenario to a simulated team."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from sim.team.faults.settings import Fault
 from sim.team.team import Node, Team
 
 FEW = 2
-"""So many nodes stay, whatever the sessions say: who is alone has no network to come back to."""
+"""Number of nodes that always stay, as a single node would have no network to return to."""
 
 
 class TeamFaults:
-    """The faults and sessions of a team from ``begin`` to ``end``.
+    """The faults and sessions of a team between ``begin`` and ``end``.
 
-    Whom a fault befalls is drawn when it comes, from those that are in the network then.
+    The affected nodes are drawn when a fault occurs, from the nodes in the network at that time.
     """
 
     def __init__(self, team: Team) -> None:
@@ -30,7 +30,7 @@ class TeamFaults:
         self._undo: dict[int, Callable[[], None]] = {}
         self._number = 0
         self._away: dict[int, int] = {}
-        """Places whose node is to come back, each with the number of the life that ended there."""
+        """Places whose nodes will restart, each with the number of the life that ended."""
         self._befall: dict[str, Callable[[Fault], None]] = {
             "crash": partial(self._end_lives, kill=True),
             "leave": partial(self._end_lives, kill=False),
@@ -49,7 +49,7 @@ class TeamFaults:
         }
 
     def begin(self) -> None:
-        """The team stands: sessions run from now on, and faults come at their time."""
+        """Start the sessions of a complete team, and schedule the faults."""
         team, stays = self._team, self._sessions.stays
         self._is_on = True
         if stays is not None:
@@ -60,7 +60,7 @@ class TeamFaults:
             team.at(fault.at, partial(self._strike, fault, number))
 
     def end(self) -> None:
-        """Take back every fault, and let those come back that are to; nothing happens any more."""
+        """End every fault, restart the nodes that are due, and stop."""
         team = self._team
         self._is_on = False
         for number in list(self._undo):
@@ -113,7 +113,7 @@ class TeamFaults:
             self._befall[fault.kind](fault)
 
     def _whom(self, fault: Fault) -> list[int]:
-        """Those that a fault befalls, in the order in which it comes to them."""
+        """Draw the nodes that a fault affects, in the order of its spread."""
         here = sorted(self._team.inside())
         if fault.places:
             return [place for place in fault.places if place in self._team.living]
@@ -121,7 +121,7 @@ class TeamFaults:
         return self._dice.sample(here, min(count, len(here)))
 
     def _spread(self, fault: Fault, work: list[Callable[[], None]]) -> None:
-        """Do all of it, over the time over which the fault spreads."""
+        """Run all of ``work``, spread over the duration ``fault.over``."""
         for turn, each in enumerate(work):
             if fault.over:
                 self._team.at(turn * fault.over / len(work), partial(self._if_on, each))
@@ -133,7 +133,7 @@ class TeamFaults:
             work()
 
     def _for_a_while(self, seconds: float, undo: Callable[[], None]) -> None:
-        """Have something taken back after ``seconds``, or when all is."""
+        """Call ``undo`` after ``seconds``, or earlier by ``end``."""
         self._number += 1
         self._undo[self._number] = undo
         self._team.at(seconds, partial(self._take_back, self._number))
@@ -144,7 +144,7 @@ class TeamFaults:
             undo()
 
     def _hosts(self, places: list[int]) -> list[str]:
-        """Where those places are seen by others."""
+        """Return the addresses at which other nodes see these places."""
         here = [self._team.place(place) for place in places]
         return [place.address.host if place.home is None else place.home.host for place in here]
 

@@ -1,6 +1,6 @@
-"""Auctions: one task at a time, for which everybody bids; how soon who agrees, and what it costs.
+"""Workload: auctions of one task at a time among all agents; measures time to agreement, and messages.
 
-The seconds count from the end of the waiting period, which begins with the first bid: until then everybody waits.
+Times count from the end of the waiting period, which starts with the first bid.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from sim.team.team import Team
 
 @dataclass(frozen=True)
 class AuctionSettings:
-    """``[load.auctions]``: one task after the other, for all."""
+    """``[load.auctions]``: successive tasks for which all agents bid."""
 
     count: Annotated[int, Meta(ge=1, le=10_000)] = 3
-    """Auctions in all."""
+    """Total number of auctions."""
 
     every: Annotated[float, Meta(ge=2.0, le=3600.0), Unit("seconds")] = 10.0
-    """Seconds from one to the next."""
+    """Seconds between the starts of two auctions."""
 
     waiting: Annotated[float, Meta(ge=0.0, le=60.0), Unit("seconds")] = 0.5
-    """Seconds that the agents wait for each other's bids after the first one."""
+    """Waiting period for bids after the first one, in seconds."""
 
     spread: Annotated[float, Meta(ge=0.0, le=60.0), Unit("seconds")] = 0.1
-    """Seconds within which all of them bid."""
+    """Interval in seconds within which all agents bid."""
 
 
 class Auctions(Load):
@@ -58,7 +58,7 @@ class Auctions(Load):
         self.trouble: list[str] = []
 
     def step(self) -> None:
-        """Read an auction when its time is over, and begin the next one."""
+        """Evaluate an auction at its end, and start the next one."""
         now = self._clock.seconds()
         if now >= self._next_at:
             self._end()
@@ -67,15 +67,15 @@ class Auctions(Load):
             self._next_at = now + self._settings.every
 
     def settled(self) -> None:
-        """Read the last one."""
+        """Evaluate the last auction."""
         self._end()
 
     def verdict(self) -> list[str]:
-        """Auctions that could not begin."""
+        """Return the auctions that could not start."""
         return self.trouble
 
     def figures(self) -> list[Figure]:
-        """Who is right, the seconds until they are, and the messages that it took."""
+        """Return the share of agents that are right, the time until then, and the number of messages."""
         n = len(self.right)
         return [
             Figure("auctions.right", mean(self.right), "share", n=n),
@@ -95,7 +95,7 @@ class Auctions(Load):
         task = Task(f"auction {self._begun}", "none", "nothing", waiting_period=self._settings.waiting)
         dice = self._team.generator(f"auction/{self._begun}")
         places = self._residents.places()
-        dice.shuffle(places)  # who is first asks for the council
+        dice.shuffle(places)  # the first one requests the council
         contest = Contest(task, self._deputies, places, self._clock, dice, self._settings.spread)
         self._contest = contest
         Deferred.fromCoroutine(contest.begin())
@@ -121,7 +121,7 @@ class Auctions(Load):
         contest.end()
 
     def _passed(self, deputy: Deputy) -> tuple[int, int, int]:
-        """The datagrams that it sent since the auction began, those that it had to do with, and bytes of questions."""
+        """Return a node's datagrams sent and handled since the auction started, and its bytes of requests."""
         sent, handled, volume = self._before.get(deputy.place, (0, 0, 0))
         now_sent, now_handled, now_volume = _counts(deputy)
         if now_handled < handled:  # another life

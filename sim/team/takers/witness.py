@@ -1,4 +1,4 @@
-"""A record of every vote of every council member of a tuple space, over all lives of its nodes, for the checker."""
+"""Record every vote of every council member of a tuple space, over all lives of its nodes, for the checker."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from sim.team import event
 from sim.team.history import History
 
 INCARNATION = "decree/incarnation"
-"""The note in which a member of councils keeps which life it is in."""
+"""The note in which a council member stores its incarnation."""
 
 
 class Witness:
-    """Writes down every acceptance of every council member, in all of its lives."""
+    """Records every acceptance of every council member, in all of its lives."""
 
     def __init__(self, history: History) -> None:
         self._history = history
@@ -33,7 +33,7 @@ class Witness:
         self.bids: dict[Place, dict[tuple[int, bytes, bytes], set[bytes]]] = defaultdict(lambda: defaultdict(set))
 
     def stored(self, record: Record) -> None:
-        """Take note of a tuple that some replica holds now."""
+        """Record a tuple that a replica holds."""
         said = posting(record)
         if isinstance(said, Posted):
             if said.place not in self.posted:
@@ -42,7 +42,7 @@ class Witness:
             self.posted[said.place] = said
 
     def attend(self, seat: Seat, expose: Callable[..., object], member: bytes) -> None:
-        """Look over the shoulder of the council member ``member`` as it confirms takes, and tells what it accepted."""
+        """Wrap the answers of the council member ``member`` to record the takes that it accepts."""
         confirm: Callable[..., Any] = seat.answer_confirm
         claim: Callable[..., Any] = seat.answer_claim
 
@@ -61,7 +61,7 @@ class Witness:
 
         def claimed(peer: Contact, key: bytes, places: list[object], *rest: Any) -> Any:
             def noted(answers: list[object]) -> list[object]:
-                # One whose disk was full when it accepted could not say so, and tells it with the next it can write.
+                # A member whose disk was full when it accepted reports the acceptance with a later answer.
                 for place, reply in told(Event.PREPARE, key, places, answers):
                     if reply.accepted != NONE:
                         self.accepted(place, (*reply.accepted, reply.value), member)
@@ -74,21 +74,21 @@ class Witness:
         expose("decree.claim", claimed, changes=True)
 
     def accepted(self, place: Place, ballot: tuple[int, bytes, bytes], member: bytes) -> None:
-        """Take note of what a member of the council accepted."""
+        """Record an acceptance of a council member."""
         if member not in self.bids[place][ballot]:
             self._history.note(event.Voted, place, ballot[:2], ballot[2], member)
         self.bids[place][ballot].add(member)
 
     def seated(self, nodes: Iterable[EntangledNode]) -> None:
-        """Write down who lives now, and what it is to the councils; to ask it would make it take its seat."""
+        """Record the living members and their incarnations; a request would make them take their seats."""
         members = [(node.identity.public, node.seat._life or node.store.noted(INCARNATION) or b"") for node in nodes]
         self._history.note(event.Seated, tuple(members))
 
     def takers(self, place: Place) -> set[bytes]:
-        """Everybody for whom a majority of the council ever accepted a take; more than one is a violation."""
+        """Return all takers that a majority of the council ever accepted; more than one is a violation."""
         quorum = len(self.posted[place].council) // 2 + 1
         return {value for (_, _, value), members in self.bids[place].items() if len(members) >= quorum}
 
     def open(self) -> list[Posted]:
-        """The tuples that no majority has given to anybody."""
+        """Return the tuples without a taker accepted by a majority."""
         return [posted for place, posted in self.posted.items() if not self.takers(place)]
