@@ -48,4 +48,4 @@ class KeyfileTests(SynchronousTestCase):
         self.assertIn("not a regular file", self.refusal())
         self.path.unlink()
         self.path.mkdir(0o700)
-        self.assertIn("no plain file", self.refusal())
+        self.assertIn("not a regular file", self.refusal())
