@@ -28,23 +28,23 @@ MAX_ID = 64
 OnReactor = Callable[..., Any]
 
 
-def _here(wish: Callable[..., Any], *arguments: Any, limit_s: float | None = None) -> Any:
-    told = wish(*arguments)
-    if not isinstance(told, Deferred):
-        return told
-    came: list[Any] = []
-    told.addBoth(came.append)
-    if not came:
+def _call_directly(call: Callable[..., Any], *arguments: Any, limit_s: float | None = None) -> Any:
+    result = call(*arguments)
+    if not isinstance(result, Deferred):
+        return result
+    outcomes: list[Any] = []
+    result.addBoth(outcomes.append)
+    if not outcomes:
         raise Refusal("node", "it did not answer in time", "look at the state, then try again", 503)
-    if isinstance(came[0], Failure):
-        came[0].raiseException()
-    return came[0]
+    if isinstance(outcomes[0], Failure):
+        outcomes[0].raiseException()
+    return outcomes[0]
 
 
 def create_app(
     read: Callable[[], State],
     board: Board,
-    on_reactor: OnReactor = _here,
+    on_reactor: OnReactor = _call_directly,
     hosts: Collection[str] = (),
     wall: Callable[[], float] = lambda: 0.0,
 ) -> Flask:
@@ -61,8 +61,8 @@ def create_app(
     # navigator.sendBeacon, which a phone uses when its page is closed, cannot set headers.
     unmarked = {(str(route.method), _rule(route.path)) for route in TABLE if route.role == "phone"}
     lets_in = partial(on_reactor, board.fallbacks.lets_in)
-    _guard(app, lets_in, hosts, lambda: (request.method, str(request.url_rule)) not in unmarked)
-    _explain(app)
+    _add_checks(app, lets_in, hosts, lambda: (request.method, str(request.url_rule)) not in unmarked)
+    _add_error_handlers(app)
     _serve_page(app, read)
     dispatch = Dispatch()
 
@@ -72,10 +72,10 @@ def create_app(
             who = on_reactor(board.sessions.visitor, _token(), now)
             guarded(route.role, who)
             given = checked(route, path, request.args, {} if route.method == "GET" else _body())
-            ask = Ask(given, who, board, read(), _id(), request.remote_addr or "", now, TABLE)
-            told = on_reactor(dispatch.carry_out, route, ask, limit_s=route.limit_s)
-            is_content = isinstance(told, Content)
-            response = app.response_class(told.body, content_type=told.kind) if is_content else jsonify(told)
+            ask = Ask(given, who, board, read(), _idempotency_key(), request.remote_addr or "", now, TABLE)
+            result = on_reactor(dispatch.carry_out, route, ask, limit_s=route.limit_s)
+            is_content = isinstance(result, Content)
+            response = app.response_class(result.body, content_type=result.kind) if is_content else jsonify(result)
             response.status_code = route.status
             return response
 
@@ -87,7 +87,7 @@ def create_app(
     return app
 
 
-def _guard(app: Flask, lets_in: LetsIn, hosts: Collection[str], needs_mark: Callable[[], bool]) -> None:
+def _add_checks(app: Flask, lets_in: LetsIn, hosts: Collection[str], needs_mark: Callable[[], bool]) -> None:
     """Check ``Host`` and ``Origin`` of each request, and set the security headers of each response."""
 
     @app.before_request
@@ -109,7 +109,7 @@ def _guard(app: Flask, lets_in: LetsIn, hosts: Collection[str], needs_mark: Call
         return response
 
 
-def _explain(app: Flask) -> None:
+def _add_error_handlers(app: Flask) -> None:
     """Answer every error as JSON with field, problem and remedy."""
 
     @app.errorhandler(Refusal)
@@ -117,7 +117,7 @@ def _explain(app: Flask) -> None:
         return jsonify(error.fields), error.status
 
     @app.errorhandler(HTTPException)
-    def unlawful(error: HTTPException) -> tuple[Response, int]:
+    def http_error(error: HTTPException) -> tuple[Response, int]:
         code = error.code or 500
         remedy = "send a smaller body" if code == 413 else "see docs/reference/http-api.md for the routes and methods"
         response = jsonify(Refusal(request.path, error.name.lower(), remedy).fields)
@@ -150,11 +150,11 @@ def _token() -> str:
     return token_of(request.headers.get("Authorization", ""), request.args.get("ticket", ""))
 
 
-def _id() -> str:
-    words = request.headers.get("Idempotency-Key", "")
-    if len(words) > MAX_ID or not words.isprintable():
+def _idempotency_key() -> str:
+    value = request.headers.get("Idempotency-Key", "")
+    if len(value) > MAX_ID or not value.isprintable():
         raise Refusal("Idempotency-Key", "invalid value", f"send at most {MAX_ID} printable characters")
-    return words
+    return value
 
 
 def _body() -> object:

@@ -34,7 +34,7 @@ class Audit:
         self._path = path
         self._wall = wall
         self._most = most
-        self._newest: deque[dict[str, Json]] = deque([] if path is None else _tail(path), maxlen=AUDITED)
+        self._newest: deque[dict[str, Json]] = deque([] if path is None else _read_tail(path), maxlen=AUDITED)
         self._counts: Counter[tuple[str, str]] = Counter()
         self._strangers: OrderedDict[tuple[str, str, str], list[float]] = OrderedDict()
         self._is_failing = False
@@ -43,7 +43,7 @@ class Audit:
         """Write one line: ``route`` is method and path, ``target`` the path parameters, ``outcome`` the status."""
         self._counts[who.role, outcome[:3]] += 1
         now = self._wall()
-        repeated = self._repeated((source, route, outcome), now) if who.role == "anyone" else 0
+        repeated = self._count_repetitions((source, route, outcome), now) if who.role == "anyone" else 0
         if repeated is None:
             return
         line: dict[str, Json] = {"at": round(now, 3), "who": who.name, "role": who.role, "from": source}
@@ -70,7 +70,7 @@ class Audit:
         """Return the number of changes since the start by role and status, suppressed repetitions included."""
         return self._counts
 
-    def _repeated(self, what: tuple[str, str, str], now: float) -> int | None:
+    def _count_repetitions(self, what: tuple[str, str, str], now: float) -> int | None:
         """Return the number of repetitions suppressed since the last line; None if this one is suppressed as well."""
         known = self._strangers.get(what)
         if known is not None and 0.0 <= now - known[0] < QUIET_S:
@@ -94,7 +94,7 @@ def _write(path: Path, line: str, most: int) -> None:
         _write(path, line[:most], most)
 
 
-def _tail(path: Path) -> list[dict[str, Json]]:
+def _read_tail(path: Path) -> list[dict[str, Json]]:
     """Return the newest lines of the file, newest first."""
     try:
         with path.open("rb") as file:

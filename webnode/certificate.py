@@ -82,13 +82,15 @@ def authority(secret: bytes, title: str) -> Authority:
         ],
         None,
     )
-    made = (
-        _begun(name, name, key, int.from_bytes(hashlib.blake2b(_point(key), digest_size=15).digest()), FROM, UNTIL)
+    builder = (
+        _start_builder(
+            name, name, key, int.from_bytes(hashlib.blake2b(_point(key), digest_size=15).digest()), FROM, UNTIL
+        )
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
         .add_extension(_usage(signs_certificates=True), critical=True)
         .add_extension(constraints, critical=True)
     )
-    return Authority(key, made.sign(key, SHA256(), ecdsa_deterministic=True))
+    return Authority(key, builder.sign(key, SHA256(), ecdsa_deterministic=True))
 
 
 class Leaf(Credential):
@@ -101,7 +103,7 @@ class Leaf(Credential):
 
     def flaw(self, signer: Authority, names: Collection[str], now: float) -> str:
         """Return why the certificate cannot serve ``names`` at the unix time ``now``; empty if it can."""
-        certificate, moment = self.certificate, _moment(now)
+        certificate, moment = self.certificate, _to_datetime(now)
         if _point(self.key) != certificate.public_key().public_bytes(Encoding.X962, PublicFormat.UncompressedPoint):
             return "its key does not match"
         try:
@@ -143,16 +145,16 @@ def leaf(signer: Authority, title: str, names: Collection[str], now: float, rng:
     """Sign a certificate for the node called ``title``, for those of ``names`` that the authority may sign."""
     key = _key(rng.randbytes(32), b"leaf")
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, title)])
-    since = min(max(_moment(now) - EARLIER, FROM), UNTIL - LASTS)
+    since = min(max(_to_datetime(now) - EARLIER, FROM), UNTIL - LASTS)
     serial = int.from_bytes(rng.randbytes(15)) or 1
-    made = (
-        _begun(subject, signer.certificate.subject, key, serial, since, since + LASTS, signer)
+    builder = (
+        _start_builder(subject, signer.certificate.subject, key, serial, since, since + LASTS, signer)
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
         .add_extension(_usage(signs_certificates=False), critical=True)
         .add_extension(x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH]), critical=False)
-        .add_extension(x509.SubjectAlternativeName([_named(name) for name in nameable(names)]), critical=False)
+        .add_extension(x509.SubjectAlternativeName([_general_name(name) for name in nameable(names)]), critical=False)
     )
-    return Leaf(key, made.sign(signer.key, SHA256(), ecdsa_deterministic=True))
+    return Leaf(key, builder.sign(signer.key, SHA256(), ecdsa_deterministic=True))
 
 
 def nameable(names: Collection[str]) -> list[str]:
@@ -168,9 +170,9 @@ def plain(name: str) -> str:
     except ValueError:
         lower = name.rstrip(".").lower()
         labels = lower.split(".")
-        is_lawful = all(0 < len(label) < 64 and label.replace("-", "").isalnum() for label in labels)
-        is_ours = is_lawful and lower.isascii() and len(lower) < 254
-        return lower if is_ours and any(lower == end or lower.endswith(f".{end}") for end in DOMAINS) else ""
+        is_valid = all(0 < len(label) < 64 and label.replace("-", "").isalnum() for label in labels)
+        is_hostname = is_valid and lower.isascii() and len(lower) < 254
+        return lower if is_hostname and any(lower == end or lower.endswith(f".{end}") for end in DOMAINS) else ""
     if isinstance(address, ipaddress.IPv6Address):
         address = address.ipv4_mapped or address
     # A zone such as fe80::1%eth0 is valid on one machine only.
@@ -178,7 +180,7 @@ def plain(name: str) -> str:
     return str(address) if fits else ""
 
 
-def _named(name: str) -> x509.GeneralName:
+def _general_name(name: str) -> x509.GeneralName:
     try:
         return x509.IPAddress(ipaddress.ip_address(name))
     except ValueError:
@@ -195,7 +197,7 @@ def _point(key: ec.EllipticCurvePrivateKey) -> bytes:
     return bytes(key.public_key().public_bytes(Encoding.X962, PublicFormat.UncompressedPoint))
 
 
-def _moment(now: float) -> datetime:
+def _to_datetime(now: float) -> datetime:
     """Convert unix time to a datetime, clamped to the validity of the authority."""
     try:
         return min(max(datetime.fromtimestamp(now, UTC), FROM), UNTIL)
@@ -203,7 +205,7 @@ def _moment(now: float) -> datetime:
         return FROM
 
 
-def _begun(
+def _start_builder(
     subject: x509.Name,
     issuer: x509.Name,
     key: ec.EllipticCurvePrivateKey,

@@ -58,7 +58,7 @@ class CappedRequest(SiteRequest):
 
     who = Visitor()
     _taken = 0
-    _cut = False
+    _is_cut = False
 
     def gotLength(self, length: int | None) -> None:  # noqa: N802
         """Refuse a body whose Content-Length is too large."""
@@ -71,18 +71,18 @@ class CappedRequest(SiteRequest):
         self._taken += len(data)
         if self._taken > MAX_BODY:
             self._refuse()
-        if not self._cut:
+        if not self._is_cut:
             super().handleContentChunk(data)
 
     def requestReceived(self, command: bytes, path: bytes, version: bytes) -> None:  # noqa: N802
         """Process the request, unless its body was refused."""
-        if not self._cut:
+        if not self._is_cut:
             super().requestReceived(command, path, version)
 
     def _refuse(self) -> None:
-        if self._cut or self.channel is None:
+        if self._is_cut or self.channel is None:
             return
-        self._cut = True
+        self._is_cut = True
         channel: Any = self.channel
         if isinstance(channel, Channel):
             channel.refuse(TOO_LARGE)
@@ -98,12 +98,12 @@ class Channel(HTTPChannel):
     transport: Any
     limits: AddressLimits
     _phase = "idle"
-    _due: IDelayedCall | None = None
-    _stalled: IDelayedCall | None = None
+    _deadline: IDelayedCall | None = None
+    _stall_deadline: IDelayedCall | None = None
     _counted: Kept | None = None
     _open = False
-    _over = False
-    _came = 0
+    _is_over = False
+    _received_bytes = 0
     _since = 0.0
 
     def connectionMade(self) -> None:  # noqa: N802
@@ -112,38 +112,38 @@ class Channel(HTTPChannel):
         self.limits = self.factory.limits
         self._address = str(getattr(self.getPeer(), "host", ""))
         if not self.limits.may("open", self._address):
-            self._over = True
+            self._is_over = True
             self.transport.abortConnection()
             return
         self.limits.count("open", self._address, 1)
         self._open = True
-        self._within(HEAD_S, self._close)
+        self._set_deadline(HEAD_S, self._close)
 
     def dataReceived(self, data: bytes) -> None:  # noqa: N802
         """Take bytes and update the request's phase."""
-        if self._over:
+        if self._is_over:
             return
         if self._phase == "idle":
-            self._begin()
-        self._came += len(data)
+            self._start_request()
+        self._received_bytes += len(data)
         super().dataReceived(data)
-        self._weigh()
+        self._count_incomplete()
 
     def allHeadersReceived(self) -> None:  # noqa: N802
         """Start the deadline of the body."""
-        if self._over:
+        if self._is_over:
             return
         self._phase, self._since = "body", self._now()
-        self._within(GRACE_S, self._pace)
+        self._set_deadline(GRACE_S, self._check_pace)
         super().allHeadersReceived()
 
     def allContentReceived(self) -> None:  # noqa: N802
         """End the deadline, and count the request as being answered."""
-        if self._over:
+        if self._is_over:
             return
         self._phase = "answer"
-        self._end(self._due)
-        self._due = None
+        self._cancel(self._deadline)
+        self._deadline = None
         if not self.limits.may("stream", self._address):
             self.refuse(TOO_BUSY)
             return
@@ -155,45 +155,45 @@ class Channel(HTTPChannel):
         self._count(None)
         self._phase = "idle"
         waits = bool(self._dataBuffer)
-        self._within(KEEP_S, self._close)
+        self._set_deadline(KEEP_S, self._close)
         if waits:
-            self._begin()
+            self._start_request()
         super().requestDone(request)
-        self._weigh()
+        self._count_incomplete()
 
     def pauseProducing(self) -> None:  # noqa: N802
         """Start the deadline for a client that does not read its response."""
         super().pauseProducing()
-        if self._stalled is None and not self._over:
-            self._stalled = self.callLater(STALL_S, self._abort)
+        if self._stall_deadline is None and not self._is_over:
+            self._stall_deadline = self.callLater(STALL_S, self._abort)
 
     def resumeProducing(self) -> None:  # noqa: N802
         """End the deadline for the client to read."""
         super().resumeProducing()
-        self._end(self._stalled)
-        self._stalled = None
+        self._cancel(self._stall_deadline)
+        self._stall_deadline = None
 
     def connectionLost(self, reason: Failure) -> None:  # type: ignore[override]  # noqa: N802
         """Cancel all deadlines and counts."""
-        self._over = True
+        self._is_over = True
         self._count(None)
         if self._open:
             self.limits.count("open", self._address, -1)
             self._open = False
-        for each in (self._due, self._stalled):
-            self._end(each)
-        self._due = self._stalled = None
+        for each in (self._deadline, self._stall_deadline):
+            self._cancel(each)
+        self._deadline = self._stall_deadline = None
         super().connectionLost(reason)
 
     def refuse(self, refusal: Refusal) -> None:
         """Answer an invalid or incomplete request, and end the connection."""
-        if self._over:
+        if self._is_over:
             return
-        self._over = True
+        self._is_over = True
         self._count(None)
         self.transport.write(raw(refusal))
         self.loseConnection()
-        self._within(CLOSE_S, self._abort)
+        self._set_deadline(CLOSE_S, self._abort)
 
     def lineLengthExceeded(self, line: bytes) -> None:  # noqa: N802
         """Refuse a line that exceeds the limit for all headers."""
@@ -203,24 +203,24 @@ class Channel(HTTPChannel):
         # Twisted's method sends neither a body nor the security headers.
         self.refuse(UNREADABLE)
 
-    def _begin(self) -> None:
-        self._phase, self._came = "head", 0
-        self._within(HEAD_S, lambda: self.refuse(LATE_HEAD))
+    def _start_request(self) -> None:
+        self._phase, self._received_bytes = "head", 0
+        self._set_deadline(HEAD_S, lambda: self.refuse(LATE_HEAD))
 
-    def _weigh(self) -> None:
+    def _count_incomplete(self) -> None:
         """Count a request that is not complete; a request that arrives whole is not counted."""
-        if self._over or self._phase not in ("head", "body") or self._counted:
+        if self._is_over or self._phase not in ("head", "body") or self._counted:
             return
         if not self.limits.may("unfinished", self._address):
             self.refuse(TOO_MANY)
             return
         self._count("unfinished")
 
-    def _pace(self) -> None:
-        if self._came < PACE * (self._now() - self._since - GRACE_S):
+    def _check_pace(self) -> None:
+        if self._received_bytes < PACE * (self._now() - self._since - GRACE_S):
             self.refuse(LATE_BODY)
         else:
-            self._within(1.0, self._pace)
+            self._set_deadline(1.0, self._check_pace)
 
     def _count(self, kind: Kept | None) -> None:
         if self._counted != kind:
@@ -230,11 +230,11 @@ class Channel(HTTPChannel):
                 self.limits.count(kind, self._address, 1)
             self._counted = kind
 
-    def _within(self, seconds: float, late: Any) -> None:
-        self._end(self._due)
-        self._due = self.callLater(seconds, late)
+    def _set_deadline(self, seconds: float, late: Any) -> None:
+        self._cancel(self._deadline)
+        self._deadline = self.callLater(seconds, late)
 
-    def _end(self, call: IDelayedCall | None) -> None:
+    def _cancel(self, call: IDelayedCall | None) -> None:
         if call is not None and call.active():
             call.cancel()
 
@@ -242,12 +242,12 @@ class Channel(HTTPChannel):
         return float(self.factory.reactor.seconds())
 
     def _close(self) -> None:
-        self._over = True
+        self._is_over = True
         self.loseConnection()
-        self._within(CLOSE_S, self._abort)
+        self._set_deadline(CLOSE_S, self._abort)
 
     def _abort(self) -> None:
-        self._over = True
+        self._is_over = True
         self.transport.abortConnection()
 
 

@@ -144,7 +144,7 @@ class TeamChronicle:
     def _groups(self, before: Mapping[str, State], groups: Iterable[State], now: float) -> None:
         for group in groups:
             agreed = bool(group["assigned_uuid"]) and group["agree"] == group["of"]
-            if agreed and _point(group) != _point(before.get(group["task"], {})):
+            if agreed and _consensus_point(group) != _consensus_point(before.get(group["task"], {})):
                 bids = ", ".join(f"{m['name']} {m['cost']:.2f} m" for m in group["members"] if m["cost"] is not None)
                 change = f"{group['agree']} of {group['of']} agree on {group['assigned']}" + (
                     f" ({bids})" if bids else ""
@@ -164,14 +164,14 @@ class TeamChronicle:
                     at = loss.at if loss is not None and loss.uuid == device["uuid"] else now
                     self._lost[task] = _Loss(device["uuid"], device["name"], at, True)
         for task, uuids in acting.items():
-            self._followed(task, titles.get(task, task), uuids, names, now)
+            self._record_takeover(task, titles.get(task, task), uuids, names, now)
         for task in [*self._lost]:
             if task in ended or (not self._lost[task].is_gone and now - self._lost[task].at > DOUBTED_S):
                 del self._lost[task]
         # Between two acting devices there may be none for some time: keep the last one until the next acts.
         self._acting = {**{task: who for task, who in self._acting.items() if task not in ended}, **acting}
 
-    def _followed(self, task: str, title: str, uuids: set[str], names: Mapping[str, str], now: float) -> None:
+    def _record_takeover(self, task: str, title: str, uuids: set[str], names: Mapping[str, str], now: float) -> None:
         before, loss = self._acting.get(task, set()), self._lost.get(task)
         fresh = sorted(uuids - before)
         if loss is not None and loss.is_gone and loss.uuid in uuids:
@@ -186,7 +186,7 @@ class TeamChronicle:
             self._add(now, "handover", fresh[0], task, f"{names[fresh[0]]} continues {title} in place of {left}")
 
 
-def _point(group: Mapping[str, Any]) -> tuple[Any, ...]:
+def _consensus_point(group: Mapping[str, Any]) -> tuple[Any, ...]:
     return group.get("assigned_uuid"), group.get("agree"), group.get("of")
 
 

@@ -25,35 +25,35 @@ class Dispatch:
         """Return the answer; a repeated id of the same session gets the first answer again."""
         # A route that a viewer may call changes nothing, whatever its method.
         if route.method == "GET" or route.role == "viewer":
-            return self._called(route, ask)
+            return self._call(route, ask)
         # Unauthenticated clients share one identity: a stored answer must not reach another client.
         if not ask.id or route.role == "anyone":
-            return self._noted(route, ask)
+            return self._call_audited(route, ask)
         key = ask.who.token_id, route.name, ask.id
         known = self._answers.get(key)
         if known is None:
             known = self._answers[key] = _Answer()
             while len(self._answers) > REMEMBERED:
                 self._answers.popitem(last=False)
-            self._noted(route, ask).addBoth(known.came)
+            self._call_audited(route, ask).addBoth(known.set_outcome)
         return known.wait()
 
-    def _called(self, route: Route, ask: Ask) -> Deferred[Any]:
+    def _call(self, route: Route, ask: Ask) -> Deferred[Any]:
         assert route.answer is not None
         return maybeDeferred(route.answer, ask)
 
-    def _noted(self, route: Route, ask: Ask) -> Deferred[Any]:
+    def _call_audited(self, route: Route, ask: Ask) -> Deferred[Any]:
         def note(outcome: Any) -> Any:
-            told = str(route.status)
+            result = str(route.status)
             if isinstance(outcome, Failure):
                 refusal = outcome.value
-                told = f"{refusal.status} {refusal.problem}" if isinstance(refusal, Refusal) else "500"
+                result = f"{refusal.status} {refusal.problem}" if isinstance(refusal, Refusal) else "500"
             named = {name for name in ask.given if f"{{{name}}}" in route.path}
             target = " ".join(str(ask.given[name]) for name in sorted(named))
-            ask.board.audit.note(ask.who, ask.source, route.name, target, told)
+            ask.board.audit.note(ask.who, ask.source, route.name, target, result)
             return outcome
 
-        return self._called(route, ask).addBoth(note)
+        return self._call(route, ask).addBoth(note)
 
 
 class _Answer:
@@ -71,7 +71,7 @@ class _Answer:
             self._waiting.append(waiter)
         return waiter
 
-    def came(self, outcome: Any) -> None:
+    def set_outcome(self, outcome: Any) -> None:
         self._outcome.append(outcome)
         waiting, self._waiting = self._waiting, []
         for waiter in waiting:

@@ -76,7 +76,7 @@ class FaultControl:
             return fail(Refusal("kind" if can else "device", f"{name} does not allow {kind}", remedy, 409))
         task = acting(device for device, _ in devices_of(self._watch.records)).get(uuid, "")
 
-        def taken(answer: object) -> None:
+        def add_fault(answer: object) -> None:
             now = self._clock() + begins_in(answer)
             self._count += 1
             self._caused.insert(0, _Caused(self._count, fault, name, Takeover(uuid, task, now, now + fault.seconds)))
@@ -92,7 +92,7 @@ class FaultControl:
         asked = self._node.entangled.call(
             contact, CAUSE, fault.kind, fault.seconds, amount, timeout=PATIENCE_S, changes=True
         )
-        return asked.addCallbacks(taken, refused)
+        return asked.addCallbacks(add_fault, refused)
 
     def active(self) -> list[dict[str, Json]]:
         """Return the faults that are active or ended recently, newest first.
@@ -144,17 +144,17 @@ class FaultControl:
         if contact is None:
             return
 
-        def told(answer: Any) -> None:
+        def store_kinds(answer: Any) -> None:
             kinds = answer.get("kinds") if isinstance(answer, dict) else None
             if isinstance(kinds, list):
                 self._kinds[uuid] = tuple(kind for kind in KINDS if kind in kinds)
 
-        def untold(failure: Any) -> None:
+        def handle_failure(failure: Any) -> None:
             failure.trap(EntangledError)
             if failure.check(NoAnswer):
                 self._asked.discard(uuid)  # ask again at the next change of any device
             else:
                 self._kinds.pop(uuid, None)
 
-        asked = self._node.entangled.call(contact, ASKED).addCallbacks(told, untold)
+        asked = self._node.entangled.call(contact, ASKED).addCallbacks(store_kinds, handle_failure)
         asked.addErrback(lambda failure: self._log.failure("cannot read which faults a device allows", failure))

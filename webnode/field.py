@@ -61,12 +61,12 @@ def properties(value: object) -> dict[str, dict[str, str | float]]:
     for name, entries in list(value.items())[:MAX_ENTRIES]:
         if not text(name):
             continue
-        kept: dict[str, str | float] = {}
+        valid: dict[str, str | float] = {}
         if isinstance(entries, Mapping):
             for key, entry in list(entries.items())[:MAX_ENTRIES]:
                 if isinstance(entry, str) and text(key):
-                    kept[text(key)] = text(entry)
+                    valid[text(key)] = text(entry)
                 elif isinstance(entry, int | float) and math.isfinite(number(entry, math.inf)) and text(key):
-                    kept[text(key)] = number(entry)
-        found[text(name)] = kept
+                    valid[text(key)] = number(entry)
+        found[text(name)] = valid
     return found

@@ -41,7 +41,7 @@ LetsIn = Callable[[str], bool]
 
 def is_local_name(host: str) -> bool:
     """Return whether a ``Host`` header can name a machine of the local network: an address or a local name."""
-    name = _name_of(host)
+    name = _hostname_of(host)
     is_plain = bool(name) and all(c.isalnum() or c in "-_" for c in name)
     return is_plain or name.endswith(LOCAL_ENDS) or _is_address(name)
 
@@ -52,11 +52,11 @@ def is_own_host(host: str, names: Collection[str] = ()) -> bool:
     Other local names are not accepted: any machine of a LAN can register a name such as evil.local and then let it
     resolve to this machine's address (DNS rebinding).
     """
-    name = _name_of(host)
+    name = _hostname_of(host)
     return name == "localhost" or name.endswith(".localhost") or _is_address(name) or name in names
 
 
-def _name_of(host: str) -> str:
+def _hostname_of(host: str) -> str:
     name = host.rsplit("]", 1)[0].lstrip("[") if host.startswith("[") else host.rsplit(":", 1)[0]
     return name.rstrip(".").lower()
 

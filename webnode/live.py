@@ -161,9 +161,9 @@ class Events(JsonResource):
         request.notifyFinish().addBoth(lambda _: self._close(viewer))
         viewer.narrow()
         request.registerProducer(viewer, True)
-        self._look()
-        words = ["retry: 1000\n\n", self._missed(viewer, bool(since)), self._offered(viewer, self._news())]
-        request.write("".join([*words, self._beat(viewer)]).encode())
+        self._read_state()
+        text = ["retry: 1000\n\n", self._backlog(viewer, bool(since)), self._latest_events(viewer, self._news())]
+        request.write("".join([*text, self._beat(viewer)]).encode())
         if len(self._viewers) == 1:
             self._beat_at = self._clock.seconds() + BEAT_S
             self._schedule(PACE_S)
@@ -183,7 +183,7 @@ class Events(JsonResource):
 
     def _tick(self) -> None:
         self._schedule(PACE_S if self._viewers else IDLE_S)
-        self._look()
+        self._read_state()
         if not self._viewers:
             return
         news, is_beat = self._news(), self._clock.seconds() >= self._beat_at
@@ -198,9 +198,13 @@ class Events(JsonResource):
             if viewer.paused:
                 viewer.skipped += viewer.heard < self._journal.n
                 continue
-            words = self._missed(viewer, True) + self._offered(viewer, news) + (self._beat(viewer) if is_beat else "")
-            if words:
-                viewer.request.write(words.encode())
+            text = (
+                self._backlog(viewer, True)
+                + self._latest_events(viewer, news)
+                + (self._beat(viewer) if is_beat else "")
+            )
+            if text:
+                viewer.request.write(text.encode())
 
     def _may_stay(self, viewer: Viewer) -> bool:
         """End the stream of an expired session; announce the expiry of one that can be renewed."""
@@ -218,7 +222,7 @@ class Events(JsonResource):
         viewer.request.unregisterProducer()
         viewer.request.finish()
 
-    def _look(self) -> None:
+    def _read_state(self) -> None:
         """Read the state, if it may have changed."""
         now = self._clock.seconds()
         if now - self._read_at < SPARED * self._took:
@@ -227,52 +231,56 @@ class Events(JsonResource):
         if version is not None and version == self._known and now - self._read_at < IDLE_S:
             return
         self._known, self._read_at = version, now
-        with_state = self._sound("state", lambda: self._journal.take(self._read()))
+        with_state = self._call_logged("state", lambda: self._journal.take(self._read()))
         if with_state:
             self._board.chronicle.saw(self._journal.state, self._wall())
         self._took = self._clock.seconds() - now
 
-    def _missed(self, viewer: Viewer, is_again: bool) -> str:
+    def _backlog(self, viewer: Viewer, is_again: bool) -> str:
         """Return the missed changes or the whole state, whichever is smaller, and the missed chronicle entries."""
-        journal, words = self._journal, []
+        journal, text = self._journal, []
         missed = None if viewer.is_whole else journal.since(viewer.heard)
-        if missed is not None and len(missed) > 1 and sum(len(each.words) for each in missed) > len(self._written()):
+        if (
+            missed is not None
+            and len(missed) > 1
+            and sum(len(each.words) for each in missed) > len(self._encoded_state())
+        ):
             missed = None
         if missed is not None:
-            words = [f"id: {journal.id(each.n)}\nevent: change\ndata: {each.words}\n\n" for each in missed]
+            text = [f"id: {journal.id(each.n)}\nevent: change\ndata: {each.words}\n\n" for each in missed]
         elif viewer.heard < journal.n:
             start = "true," if is_again and not viewer.is_whole else "false,"
-            words = [f'id: {journal.id(journal.n)}\nevent: state\ndata: {{"resync":{start}{self._written()}\n\n']
+            text = [f'id: {journal.id(journal.n)}\nevent: state\ndata: {{"resync":{start}{self._encoded_state()}\n\n']
         viewer.heard = journal.n
         entries = self._board.chronicle.since(viewer.entry)[-ENTRIES:]
         if entries:
             viewer.entry = entries[-1].n
-            words.append(_event("event", dumped([asdict(entry) for entry in entries])))
-        return "".join(words)
+            text.append(_event("event", dumped([asdict(entry) for entry in entries])))
+        return "".join(text)
 
-    def _written(self) -> str:
+    def _encoded_state(self) -> str:
         """Return the whole state as JSON without its first brace, encoded once for all viewers."""
         if self._whole[0] != self._journal.n:
             self._whole = (self._journal.n, dumped(self._journal.state)[1:])
         return self._whole[1]
 
-    def _offered(self, viewer: Viewer, news: Mapping[str, str]) -> str:
+    def _latest_events(self, viewer: Viewer, news: Mapping[str, str]) -> str:
         """Return the events of which only the newest counts, if the viewer has not received them yet."""
-        fresh = {event: words for event, words in news.items() if viewer.seen.get(event) != words}
+        fresh = {event: text for event, text in news.items() if viewer.seen.get(event) != text}
         viewer.seen |= fresh
-        return "".join(_event(event, words) for event, words in fresh.items())
+        return "".join(_event(event, text) for event, text in fresh.items())
 
     def _beat(self, viewer: Viewer) -> str:
         return _event("beat", dumped({"now": round(self._wall(), 3), "skipped": viewer.skipped}))
 
     def _news(self) -> dict[str, str]:
-        told = {event: self._sound(event, partial(_read_out, source)) for event, source in self._newest.items()}
-        return {event: words for event, words in told.items() if words is not None}
+        encoded = {event: self._call_logged(event, partial(_encode, source)) for event, source in self._newest.items()}
+        return {event: text for event, text in encoded.items() if text is not None}
 
-    def _sound(self, event: str, made: Callable[[], Any]) -> Any:
-        """Call ``made`` and return its result, or None if it fails; consecutive failures are logged once."""
+    def _call_logged(self, event: str, produce: Callable[[], Any]) -> Any:
+        """Call ``produce`` and return its result, or None if it fails; consecutive failures are logged once."""
         try:
-            found = made()
+            found = produce()
         except Exception:
             # A store that cannot be read for a moment must not end the streams.
             if not self._failing.get(event):
@@ -288,12 +296,12 @@ class Events(JsonResource):
             self._schedule(IDLE_S if self._is_open else None)
 
 
-def _read_out(source: Callable[[], Any]) -> str:
+def _encode(source: Callable[[], Any]) -> str:
     return dumped(source())
 
 
-def _event(event: str, words: str) -> str:
-    return f"event: {event}\ndata: {words}\n\n"
+def _event(event: str, text: str) -> str:
+    return f"event: {event}\ndata: {text}\n\n"
 
 
 def shown(request: Request) -> str:

@@ -46,7 +46,7 @@ class TeamRevocations(Revocations):
         super().__init__()
         self._node = node
         self._own: dict[str, float] = {}
-        self._watch = node.entangled.watch(REVOKED, self._heard, keep=True)
+        self._watch = node.entangled.watch(REVOKED, self._on_records, keep=True)
 
     def add(self, token_id: str, until: float) -> None:
         """Revoke a session here, and publish that to the other web nodes."""
@@ -54,9 +54,9 @@ class TeamRevocations(Revocations):
         own = {each: end for each, end in self._own.items() if end > self._node.wall()}
         self._own = _newest({**own, token_id: until}, MOST)
         ends = {bytes.fromhex(each): int(min(end, LARGEST)) for each, end in self._own.items()}
-        self._node.entangled.put(REVOKED, SLOT, bounded(bytes(msgpack.packb(ends))), "team").addErrback(_untold)
+        self._node.entangled.put(REVOKED, SLOT, bounded(bytes(msgpack.packb(ends))), "team").addErrback(_ignore_failure)
 
-    def _heard(self, records: list[Record]) -> None:
+    def _on_records(self, records: list[Record]) -> None:
         for record in records:
             self._learn(revoked_in(record))
 
@@ -82,6 +82,6 @@ def _newest(ends: Mapping[str, float], most: int) -> dict[str, float]:
     return dict(list(ends.items())[-most:])
 
 
-def _untold(failure: Any) -> None:
+def _ignore_failure(failure: Any) -> None:
     """Ignore that no replica could be reached: the revocation is valid here."""
     failure.trap(EntangledError)

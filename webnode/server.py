@@ -57,9 +57,9 @@ def caller(reactor: Any, usual_s: float = LIMIT_S) -> OnReactor:
     ``Refusal`` with status 503; the call may still succeed.
     """
 
-    def on_reactor(wish: Callable[..., Any], *arguments: Any, limit_s: float | None = None) -> Any:
+    def on_reactor(call: Callable[..., Any], *arguments: Any, limit_s: float | None = None) -> Any:
         answers: SimpleQueue[Any] = SimpleQueue()
-        reactor.callFromThread(lambda: maybeDeferred(wish, *arguments).addBoth(answers.put))
+        reactor.callFromThread(lambda: maybeDeferred(call, *arguments).addBoth(answers.put))
         try:
             outcome = answers.get(timeout=usual_s if limit_s is None else limit_s)
         except Empty:
@@ -155,7 +155,7 @@ class Root(Resource):
         assert request.prepath is not None and request.postpath is not None
         asked = (path, *request.postpath)
         for pattern, resource, role in self._native:
-            if _begins(asked, pattern):
+            if _matches(asked, pattern):
                 for _ in pattern[1:]:
                     request.prepath.append(request.postpath.pop(0))
                 return self._guarded(resource, role, request)
@@ -196,7 +196,7 @@ class _Preflight(Resource):
         return b""
 
 
-def _begins(asked: Sequence[bytes], pattern: Sequence[bytes]) -> bool:
+def _matches(asked: Sequence[bytes], pattern: Sequence[bytes]) -> bool:
     return len(asked) >= len(pattern) and all(
         segment == wanted or (wanted.startswith(b"{") and segment != b"")
         for segment, wanted in zip(asked, pattern, strict=False)

@@ -93,19 +93,19 @@ class SignedSessions:
         if wait > 0.0:
             return fail(Refusal("code", "too many wrong attempts", f"wait {math.ceil(wait)} s", 429))
         self._attempts.tried(source, now)
-        if hmac.compare_digest(_plain(proof), _plain(self.code)):
+        if hmac.compare_digest(_normalized(proof), _normalized(self.code)):
             return succeed(self._operator(source, now))
         if not self._password:
-            return fail(_wrong())
+            return fail(_wrong_code())
         if len(self._gate.waiting) >= WAITING:
             return fail(Refusal("code", "too many sign-ins at once", "try again in a few seconds", 503))
 
-        def judged(is_right: bool) -> Token:
+        def finish(is_right: bool) -> Token:
             if not is_right:
-                raise _wrong()
+                raise _wrong_code()
             return self._operator(source, now)
 
-        return self._gate.run(self._check, self._password, proof).addCallback(judged)
+        return self._gate.run(self._check, self._password, proof).addCallback(finish)
 
     def visitor(self, token: str, now: float) -> Visitor:
         """Return the visitor of a token or ticket."""
@@ -121,22 +121,22 @@ class SignedSessions:
     def token(self, who: Visitor, name: str, role: Role, now: float, seconds: float) -> Token:
         """Return a token for a guest of ``who``, valid no longer than ``who`` can stay."""
         end = min(now + seconds, who.limit)
-        claim = Claim(self._fresh_id(), name, role, int(end), limit=int(end), vouchers=self._through(who))
+        claim = Claim(self._fresh_id(), name, role, int(end), limit=int(end), vouchers=self._vouchers_of(who))
         return self._signed(claim)
 
     def derived(self, who: Visitor, name: str, role: Role, now: float, seconds: float) -> Token:
         """Return a token for ``who`` under another name, which ends with the session."""
-        token = Claim(self._fresh_id(), name, role, int(min(now + seconds, who.limit)), vouchers=self._through(who))
+        token = Claim(self._fresh_id(), name, role, int(min(now + seconds, who.limit)), vouchers=self._vouchers_of(who))
         return self._signed(replace(token, limit=token.until, parents=_lineage(who)))
 
     def renewed(self, who: Visitor, now: float) -> Token:
         """Return another token for the same session; revoking one ends both."""
-        _checked_session(who)
+        _require_session(who)
         return self._session(who, now + self.signed_s, who.limit)
 
     def passes(self, who: Visitor, nodes: Iterable[str], now: float) -> dict[str, Token]:
         """Return tokens for the same session at other web nodes, by uuid, each valid only there and for ``PASS_S``."""
-        _checked_session(who)
+        _require_session(who)
         until = min(now + PASS_S, who.limit)
         return {node: self._session(who, until, who.limit, bytes.fromhex(node)) for node in dict.fromkeys(nodes)}
 
@@ -155,13 +155,13 @@ class SignedSessions:
 
     def _session(self, who: Visitor, until: float, limit: float, audience: bytes = b"") -> Token:
         claim = Claim(who.token_id, who.name, who.role, int(min(until, limit)), limit=int(limit))
-        return self._signed(replace(claim, parents=who.parents, vouchers=self._through(who)), audience)
+        return self._signed(replace(claim, parents=who.parents, vouchers=self._vouchers_of(who)), audience)
 
     def _signed(self, claim: Claim, audience: bytes = b"") -> Token:
         text, ticket = (self.key.token(each, audience) for each in (claim, claim.ticket))
         return Token(text, ticket, claim.role, float(claim.until))
 
-    def _through(self, who: Visitor) -> tuple[bytes, ...]:
+    def _vouchers_of(self, who: Visitor) -> tuple[bytes, ...]:
         """Return the other web nodes that vouch for ``who``; raises ``Refusal`` if there are too many."""
         others = tuple(each for each in who.vouchers if each != self.key.public)
         if len(others) > MAX_VOUCHERS:
@@ -232,11 +232,11 @@ def sessions(settings: Settings, node: SwarmNode, reactor: Any, rng: random.Rand
     return SignedSessions(key, team.may_vouch, code, web.password, rng, check, TeamRevocations(node))
 
 
-def _wrong() -> Refusal:
+def _wrong_code() -> Refusal:
     return Refusal("code", "wrong code", "see the node's output at its start, or run: swarm web", 401)
 
 
-def _plain(code: str) -> bytes:
+def _normalized(code: str) -> bytes:
     """Normalize a code: capitals, spaces and hyphens do not matter."""
     return "".join(c for c in code.lower() if not c.isspace() and c != "-").encode()
 
@@ -246,7 +246,7 @@ def _lineage(who: Visitor) -> tuple[str, ...]:
     return tuple(each for each in (who.token_id, *who.parents) if each)[:MAX_PARENTS]
 
 
-def _checked_session(who: Visitor) -> None:
+def _require_session(who: Visitor) -> None:
     if who.role == "anyone" or who.is_ticket:
         problem = "a ticket is not enough" if who.is_ticket else "not signed in"
         raise Refusal("Authorization", problem, "send the token, as 'Bearer TOKEN', or sign in", 401)

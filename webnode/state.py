@@ -217,9 +217,9 @@ def _ruling_view(fields: Fields) -> State:
 
 def _position(value: object) -> State | None:
     """Return the position of a device in metres on its map, or in degrees on the globe; None if it reports neither."""
-    said = value if isinstance(value, Mapping) else {}
+    reported = value if isinstance(value, Mapping) else {}
     x, y, heading, lat, lon, accuracy = (
-        number(said.get(key), math.nan) for key in ("x", "y", "heading", "lat", "lon", "accuracy")
+        number(reported.get(key), math.nan) for key in ("x", "y", "heading", "lat", "lon", "accuracy")
     )
     if abs(x) <= FARTHEST and abs(y) <= FARTHEST:
         return {"x": x, "y": y, "heading": None if math.isnan(heading) else heading}
@@ -228,8 +228,8 @@ def _position(value: object) -> State | None:
     return None
 
 
-def _status(value: object, lawful: Sequence[str]) -> str:
-    return value if isinstance(value, str) and value in lawful else UNKNOWN
+def _status(value: object, allowed: Sequence[str]) -> str:
+    return value if isinstance(value, str) and value in allowed else UNKNOWN
 
 
 def _messages(value: object) -> list[list[float | str]]:

@@ -103,8 +103,8 @@ class TeamDesk:
         """
         if task_id:
             found = self._client.find_task(task_id)
-            return found.addCallback(lambda task: task_id if task else self._demonstrated(task_id))
-        return self._demonstrated(self._client.new_task_id())
+            return found.addCallback(lambda task: task_id if task else self._start_demo(task_id))
+        return self._start_demo(self._client.new_task_id())
 
     def assign(self, name: str, tolerates: int = 1, group: str = "", task_id: str = "") -> Any:
         """Publish a predefined task; ``tolerates`` members of its council may fail at once.
@@ -116,8 +116,8 @@ class TeamDesk:
         template = replace(self._template(name, group), tolerates=tolerates)
         if task_id:
             found = self._client.find_task(task_id)
-            return found.addCallback(lambda task: self._told(task) if task else self._published(template, task_id))
-        return self._published(template, self._client.new_task_id())
+            return found.addCallback(lambda task: self._describe(task) if task else self._publish(template, task_id))
+        return self._publish(template, self._client.new_task_id())
 
     def preview(self, name: str, group: str = "") -> dict[str, Any]:
         """Return which devices can take a predefined task and why others cannot; sends nothing.
@@ -144,15 +144,15 @@ class TeamDesk:
 
     def cancel(self, task_id: str) -> None:
         """Record that the task is cancelled; its devices stop."""
-        self._quietly(self._client.cancel(task_id))
+        self._log_failure(self._client.cancel(task_id))
 
     def pause(self, task_id: str) -> None:
         """Record that the task is paused; its devices stop and are free for other tasks."""
-        self._quietly(self._client.order(task_id, PAUSE))
+        self._log_failure(self._client.order(task_id, PAUSE))
 
     def resume(self, task_id: str) -> None:
         """Record that the task is resumed."""
-        self._quietly(self._client.order(task_id, RESUME))
+        self._log_failure(self._client.order(task_id, RESUME))
 
     def message(self, uuid: str, text: str) -> Deferred[dict[str, Any]]:
         """Send a text to one device, or to all if ``uuid`` is empty.
@@ -162,19 +162,19 @@ class TeamDesk:
         delivered: list[str] = []
         failed: dict[str, str] = {}
 
-        def told(device: Device) -> Deferred[Any]:
+        def send(device: Device) -> Deferred[Any]:
             asked = self.call(device.uuid, "device.message", text)
             return asked.addCallback(lambda _: delivered.append(device.name))
 
-        def untold(failure: Any, name: str) -> None:
+        def note_failure(failure: Any, name: str) -> None:
             failure.trap(Refusal)
             failed[name] = failure.value.problem
 
         if uuid:
             one = self.call(uuid, "device.message", text)
             return one.addCallback(lambda _: {"delivered": [self._view.name_of(uuid)], "failed": failed})
-        all_told = DeferredList([told(device).addErrback(untold, device.name) for device in self._view.devices])
-        return all_told.addCallback(lambda _: {"delivered": sorted(delivered), "failed": failed})
+        all_sent = DeferredList([send(device).addErrback(note_failure, device.name) for device in self._view.devices])
+        return all_sent.addCallback(lambda _: {"delivered": sorted(delivered), "failed": failed})
 
     def disconnect(self, uuid: str, seconds: float) -> Deferred[Any]:
         """Ask a device to leave the network for ``seconds``, as if it had failed; fires when it confirms."""
@@ -197,39 +197,39 @@ class TeamDesk:
             return fail(Refusal("device", f"{name} has left the network", "choose one of /api/v1/devices", 409))
         until = self._client.clock.seconds() + PATIENCE
         asked = self._client.call(uuid, method, *arguments, timeout=PATIENCE, changes=True)
-        return asked.addErrback(self._unanswered, uuid, name, until, refused)
+        return asked.addErrback(self._explain_failure, uuid, name, until, refused)
 
     def move_target(self, x: float, y: float) -> Deferred[Any]:
         """Put the target at (x, y), metres on the simulator's map."""
-        return self._with_yard().place_target(x, y).addErrback(_refused)
+        return self._with_yard().place_target(x, y).addErrback(_raise_refusal)
 
     def clear_target(self) -> Deferred[Any]:
         """Remove the target."""
-        return self._with_yard().clear_target().addErrback(_refused)
+        return self._with_yard().clear_target().addErrback(_raise_refusal)
 
     def move_robot(self, name: str, x: float, y: float, heading: float) -> Deferred[Any]:
         """Move a simulated robot to (x, y), facing ``heading`` (radians)."""
-        return self._with_yard().move_dog(name, x, y, heading).addErrback(_refused, name)
+        return self._with_yard().move_dog(name, x, y, heading).addErrback(_raise_refusal, name)
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
-    def _demonstrated(self, task_id: str) -> str:
+    def _start_demo(self, task_id: str) -> str:
         for task in self._view.open_tasks:
             self.cancel(task.task_id)
         if self._yard is not None:
-            self._quietly(self._yard.clear_target())
+            self._log_failure(self._yard.clear_target())
             # The simulator places it, as this node may fail before.
-            self._quietly(self._yard.place_target_later(PLACING))
+            self._log_failure(self._yard.place_target_later(PLACING))
         # The acting device may fail together with the node that serves the page.
         template = replace(self._template(self._demo), tolerates=2)
-        return str(self._published(template, task_id)["id"])
+        return str(self._publish(template, task_id)["id"])
 
-    def _published(self, template: Task, task_id: str) -> dict[str, Any]:
+    def _publish(self, template: Task, task_id: str) -> dict[str, Any]:
         task, stored = self._client.submit(template, task_id)
-        self._quietly(stored)
-        return self._told(task)
+        self._log_failure(stored)
+        return self._describe(task)
 
-    def _told(self, task: Task) -> dict[str, Any]:
+    def _describe(self, task: Task) -> dict[str, Any]:
         refused = self._view.unable(task)
         able = [device.name for device in self._view.devices if device.name not in refused]
         return {"id": task.task_id, "able": able, "refused": refused}
@@ -254,7 +254,7 @@ class TeamDesk:
         nearest = min(costs, key=lambda uuid: (costs[uuid], uuid), default=None)
         return None if nearest is None else self._view.name_of(nearest)
 
-    def _unanswered(
+    def _explain_failure(
         self, failure: Any, uuid: str, name: str, until: float, refused: Callable[[Refused], Refusal | None]
     ) -> Deferred[Any]:
         """Convert a failed call of a device to a ``Refusal``."""
@@ -265,7 +265,7 @@ class TeamDesk:
             )
         silent: Deferred[Any] = Deferred()
 
-        def judge() -> None:
+        def decide() -> None:
             remedy = "check whether the order took effect, then try again"
             refusal = Refusal("device", f"{name} did not answer", remedy, 504)
             if self._view.device(uuid) is None:
@@ -273,7 +273,7 @@ class TeamDesk:
             silent.errback(refusal)
 
         # The device's presence record outlives it for a moment; its expiry tells a departure from silence.
-        self._client.clock.callLater(max(0.0, until - self._client.clock.seconds()), judge)
+        self._client.clock.callLater(max(0.0, until - self._client.clock.seconds()), decide)
         return silent
 
     def _with_yard(self) -> YardHand:
@@ -281,7 +281,7 @@ class TeamDesk:
             raise Refusal("target", "this node has no robot simulator", "start one, or name it in the settings", 409)
         return self._yard
 
-    def _quietly(self, work: Deferred[Any]) -> None:
+    def _log_failure(self, work: Deferred[Any]) -> None:
         def ended(failure: Any) -> None:
             if failure.check(EntangledError) is None:
                 self._log.warn("a request failed: {error}", error=failure.getErrorMessage())
@@ -289,5 +289,5 @@ class TeamDesk:
         work.addErrback(ended)
 
 
-def _refused(failure: Any, what: str = "target") -> None:
+def _raise_refusal(failure: Any, what: str = "target") -> None:
     raise Refusal(what, failure.getErrorMessage(), "choose another position, or check that the simulator runs", 409)

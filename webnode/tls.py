@@ -64,8 +64,8 @@ class Certified:
         self._wall = wall
         self._rng = rng
         self._reached: list[str] = []
-        self._looked = 0.0
-        self._leaf = self._found() or self._made("there is none yet")
+        self._checked_at = 0.0
+        self._leaf = self._load() or self._create("there is none yet")
         self._options: Any = None
 
     @property
@@ -78,17 +78,17 @@ class Certified:
         for name in nameable([host]):
             if name not in self._leaf.names:
                 self._reached = [*self._reached, name][-MOST_REACHED:]
-                self._looked = 0.0
+                self._checked_at = 0.0
 
     def serverConnectionForTLS(self, protocol: object) -> Connection:  # noqa: N802
         """Return the TLS state of the next connection."""
         now = self._wall()
         # Check again also if the clock was set back.
-        if not 0.0 <= now - self._looked < LOOK_S:
-            self._looked = now
-            flaw = self._leaf.flaw(self._signer, self._wanted(), now)
+        if not 0.0 <= now - self._checked_at < LOOK_S:
+            self._checked_at = now
+            flaw = self._leaf.flaw(self._signer, self._required_names(), now)
             if flaw:
-                self._leaf, self._options = self._made(flaw), None
+                self._leaf, self._options = self._create(flaw), None
         if self._options is None:
             self._options = CertificateOptions(
                 privateKey=PKey.from_cryptography_key(self._leaf.key),
@@ -97,10 +97,10 @@ class Certified:
             )
         return Connection(self._options.getContext(), None)
 
-    def _wanted(self) -> list[str]:
+    def _required_names(self) -> list[str]:
         return [*self._reached, *self._names()]
 
-    def _found(self) -> Leaf | None:
+    def _load(self) -> Leaf | None:
         """Return the certificate of the file, if it is still usable."""
         if self._path is None:
             return None
@@ -108,33 +108,33 @@ class Certified:
             pem = kept(self._path)
             if pem is None:
                 return None
-            found = read(pem)
-            flaw = found.flaw(self._signer, self._wanted(), self._wall())
+            stored = read(pem)
+            flaw = stored.flaw(self._signer, self._required_names(), self._wall())
         except (Unsafe, ValueError) as error:
             flaw = str(error)
         if not flaw:
-            return found
+            return stored
         _log.warn("the certificate in {path} is replaced: {flaw}", path=str(self._path), flaw=flaw)
         return None
 
-    def _made(self, why: str) -> Leaf:
+    def _create(self, why: str) -> Leaf:
         """Create a certificate and store it in the file."""
-        made = leaf(self._signer, self._title, self._wanted(), self._wall(), self._rng)
-        _log.info("new certificate for {names}: {why}", names=", ".join(made.names), why=why)
-        foreign = [name for name in self._wanted() if name and not plain(name)]
-        if foreign:
-            words = "{names}: not local names, so not in the certificate; open the page by another name"
-            _log.warn(words, names=", ".join(foreign))
+        created = leaf(self._signer, self._title, self._required_names(), self._wall(), self._rng)
+        _log.info("new certificate for {names}: {why}", names=", ".join(created.names), why=why)
+        excluded = [name for name in self._required_names() if name and not plain(name)]
+        if excluded:
+            warning = "{names}: not local names, so not in the certificate; open the page by another name"
+            _log.warn(warning, names=", ".join(excluded))
         if self._path is not None:
             try:
-                keep(self._path, made.pem_with_key)
+                keep(self._path, created.pem_with_key)
             except OSError as error:
                 _log.warn(
                     "cannot store the certificate in {path} ({error}): the next start creates another",
                     path=str(self._path),
                     error=error,
                 )
-        return made
+        return created
 
 
 class _Connection(BufferingTLSTransport):

@@ -20,18 +20,18 @@ def is_halted(ask: Ask) -> Json:
 
 def halt(ask: Ask) -> Any:
     """Stop every robot of the team."""
-    return _halts(ask).halt(_name(ask)).addCallback(_told, True)
+    return _halts(ask).halt(_name(ask)).addCallback(_summarize, True)
 
 
 def release(ask: Ask) -> Any:
     """End the given stops, or all known ones."""
-    return _halts(ask).release(_name(ask), ask.given.get("stops")).addCallback(_told, False)
+    return _halts(ask).release(_name(ask), ask.given.get("stops")).addCallback(_summarize, False)
 
 
-def _told(devices: dict[str, str], otherwise: bool) -> Any:
+def _summarize(devices: dict[str, str], otherwise: bool) -> Any:
     """Summarize the confirmations; ``otherwise``: whether a team without robots counts as stopped."""
-    robots = [said for said in devices.values() if said != NO_ROBOT]
-    return {"halted": all(said == STANDS for said in robots) if robots else otherwise, "devices": devices}
+    robots = [each for each in devices.values() if each != NO_ROBOT]
+    return {"halted": all(each == STANDS for each in robots) if robots else otherwise, "devices": devices}
 
 
 def _name(ask: Ask) -> str:

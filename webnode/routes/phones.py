@@ -107,7 +107,7 @@ class OfPhone(JsonResource):
     def __init__(self, board: Board, take: Callable[[Board, Phones, str, Request], Json]) -> None:
         super().__init__()
         self._board = board
-        self._take = take
+        self._handle = take
 
     def render_POST(self, request: Request) -> bytes:
         """Process the request, or refuse it."""
@@ -118,12 +118,12 @@ class OfPhone(JsonResource):
                 raise Refusal("phone", "this node does not accept phones", "use another web node", 409)
             if who.role == "phone" and who.name != f"{BOUND}{uuid}":
                 raise Refusal("ticket", "it belongs to another phone", f"join by POST {API}/phones", 403)
-            told = self._take(self._board, self._board.phones, uuid, request)
+            reply = self._handle(self._board, self._board.phones, uuid, request)
         except Refusal as refusal:
             return answer(request, refusal)
         request.setHeader("Content-Type", "application/json")
         request.setHeader("Cache-Control", "no-store")
-        return json.dumps(told).encode()
+        return json.dumps(reply).encode()
 
 
 def who_asks(request: Request) -> Visitor:

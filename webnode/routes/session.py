@@ -27,7 +27,7 @@ def sign_in(ask: Ask) -> Deferred[Json]:
     if bool(code) == bool(password):
         problem = "both code and password are given" if code else "it is missing or empty"
         raise Refusal("code", problem, 'send {"code": "..."} or {"password": "..."}')
-    return ask.board.sessions.sign_in(code or password, ask.source, ask.now).addCallback(_told)
+    return ask.board.sessions.sign_in(code or password, ask.source, ask.now).addCallback(_token_fields)
 
 
 def session(ask: Ask) -> Json:
@@ -46,13 +46,13 @@ def sign_out(ask: Ask) -> Json:
 
 def renew(ask: Ask) -> Json:
     """Return another token for the session."""
-    return _told(ask.board.sessions.renewed(ask.who, ask.now))
+    return _token_fields(ask.board.sessions.renewed(ask.who, ask.now))
 
 
 def passes(ask: Ask) -> Json:
     """Return tokens with which the page can continue at the team's other web nodes."""
     nodes = [page.node for page in ask.board.fallbacks.here() if not page.is_self]
-    return {node: _told(token) for node, token in ask.board.sessions.passes(ask.who, nodes, ask.now).items()}
+    return {node: _token_fields(token) for node, token in ask.board.sessions.passes(ask.who, nodes, ask.now).items()}
 
 
 def invite(ask: Ask) -> Any:
@@ -63,15 +63,20 @@ def invite(ask: Ask) -> Any:
         raise Refusal("page", "not a URL of this node's page", f"choose one of {', '.join(urls) or 'none'}")
     token = ask.board.sessions.token(ask.who, given["name"], given["role"], ask.now, given["seconds"])
     if invites is None or not urls:
-        return _told(token)
+        return _token_fields(token)
     url = given["page"] or urls[0]
     link = f"{url}/#code={token.text}" + ("/phone" if token.role == "phone" else "")
-    told: dict[str, Json] = {**_told(token), "link": link, **_reach(url), **_authority(invites, urls)}
-    told["pages"] = [*urls]
+    answer: dict[str, Json] = {
+        **_token_fields(token),
+        "link": link,
+        **_url_fields(url),
+        **_authority_fields(invites, urls),
+    }
+    answer["pages"] = [*urls]
     if not given["draw"]:
-        return told
-    drawn = gatherResults([invites.drawn(text) for text in (link, str(told["certificate"]))], consumeErrors=True)
-    return drawn.addCallback(partial(_with_codes, told))
+        return answer
+    qr_codes = gatherResults([invites.drawn(text) for text in (link, str(answer["certificate"]))], consumeErrors=True)
+    return qr_codes.addCallback(partial(_with_codes, answer))
 
 
 def authority(ask: Ask) -> Content:
@@ -82,17 +87,17 @@ def authority(ask: Ask) -> Content:
     return Content(pem, "application/x-x509-ca-cert")
 
 
-def _with_codes(told: dict[str, Json], codes: list[str]) -> Json:
-    return {**told, "code": codes[0], "certificate_code": codes[1]}
+def _with_codes(answer: dict[str, Json], codes: list[str]) -> Json:
+    return {**answer, "code": codes[0], "certificate_code": codes[1]}
 
 
-def _reach(url: str) -> dict[str, Json]:
+def _url_fields(url: str) -> dict[str, Json]:
     """Return who can open a page at ``url``, and whether the browser allows it to use the camera."""
     is_here = is_loopback(urlsplit(url).hostname or "")
     return {"is_secure": url.startswith("https:"), "reaches": "machine" if is_here else "network"}
 
 
-def _authority(invites: TeamInvites, urls: list[str]) -> dict[str, Json]:
+def _authority_fields(invites: TeamInvites, urls: list[str]) -> dict[str, Json]:
     """Return the URL of the authority, without TLS, as a browser that lacks it would show a warning."""
     if not invites.authority:
         return {"certificate": "", "fingerprint": ""}
@@ -100,7 +105,7 @@ def _authority(invites: TeamInvites, urls: list[str]) -> dict[str, Json]:
     return {"certificate": f"{plain}{API}/ca.crt", "fingerprint": invites.fingerprint}
 
 
-def _told(token: Token) -> dict[str, Json]:
+def _token_fields(token: Token) -> dict[str, Json]:
     return {"token": token.text, "ticket": token.ticket, "role": token.role, "until": token.until}
 
 

@@ -52,12 +52,12 @@ def _rows(answer: object) -> list[Row]:
 
 
 def _row(key: object, value: object, about: object, unit: object, least: object, most: object) -> Row:
-    lawful: Any = (
+    valid: Any = (
         properties(value) if isinstance(value, dict) else text(value) if isinstance(value, str) else number(value)
     )
     return {
         "key": text(key, limit=64),
-        "value": lawful,
+        "value": valid,
         "about": text(about),
         "unit": text(unit, limit=20),
         "least": None if least is None else number(least),

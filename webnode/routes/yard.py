@@ -15,18 +15,18 @@ TURN = round(math.tau, 4)
 def move_target(ask: Ask) -> Any:
     """Put the target at a position."""
     x, y = ask.given["x"], ask.given["y"]
-    _inside(_yard(ask, "target"), "target", x, y)
+    _require_inside(_require_yard(ask, "target"), "target", x, y)
     return ask.board.desk.move_target(x, y).addCallback(lambda _: {"x": x, "y": y})
 
 
 def move_robot(ask: Ask) -> Any:
     """Move a robot to a position."""
-    name, x, y, yard = ask.given["name"], ask.given["x"], ask.given["y"], _yard(ask, "robot")
+    name, x, y, yard = ask.given["name"], ask.given["x"], ask.given["y"], _require_yard(ask, "robot")
     found = next((dog for dog in yard["dogs"] if dog["name"] == name), None)
     if found is None:
         here = ", ".join(dog["name"] for dog in yard["dogs"])
         raise Refusal("name", "unknown robot", f"choose one of {here}", 404)
-    _inside(yard, "robot", x, y)
+    _require_inside(yard, "robot", x, y)
     heading = found["heading"] if ask.given["heading"] is None else ask.given["heading"]
     moved = {"name": name, "x": x, "y": y, "heading": heading}
     return ask.board.desk.move_robot(name, x, y, heading).addCallback(lambda _: moved)
@@ -37,14 +37,14 @@ def clear_target(ask: Ask) -> Any:
     return ask.board.desk.clear_target().addCallback(lambda _: {})
 
 
-def _yard(ask: Ask, what: str) -> Mapping[str, Any]:
+def _require_yard(ask: Ask, what: str) -> Mapping[str, Any]:
     yard = ask.board.desk.yard()
     if yard is None:
         raise Refusal(what, "this node has no robot simulator", "start one, or name it in the settings", 409)
     return yard
 
 
-def _inside(yard: Mapping[str, Any], what: str, x: float, y: float) -> None:
+def _require_inside(yard: Mapping[str, Any], what: str, x: float, y: float) -> None:
     width, height = yard["walls"]
     if not (0.0 <= x <= width and 0.0 <= y <= height):
         raise Refusal(what, f"({x:g}, {y:g}) is outside the map", f"send x in 0..{width:g} and y in 0..{height:g}")

@@ -105,7 +105,7 @@ function show(parts, told, role) {
   words(parts.hint, `${isHere ? "The link is for a browser of this machine." : "Scan the code, or send the link."} It allows its holder ${may}, until ${until}.`);
   parts.plain.hidden = told.is_secure || role !== "phone";
   words(parts.plain, told.certificate
-    ? "Browsers do not allow the camera over http: choose an address that begins with https."
+    ? "Browsers do not allow the camera over http. Choose an address that begins with https."
     : "Browsers do not allow the camera over http, and this node has no https. Run pip install 'swarm-node[tls]', set tls = \"auto\" below [web], and restart the node.");
   parts.trust.hidden = !told.is_secure || isHere;
   draw(parts.authority, told.certificate_code, "QR code of the certificate's address");
