@@ -52,7 +52,7 @@ def chosen(wish: str, names: tuple[str, ...], folder: Path, ports: Iterator[int]
         "bittle": lambda name: _bittle(name, folder, ports),
         "create2": lambda name: _create2(name, folder, ports),
         "rosbridge": lambda name: _rosbridge(ports),
-        "sim": lambda name: _sim(name, yard_port),
+        "sim": lambda name: _simulated(name, yard_port),
     }
     return {name: makers[kind](name) for name, kind in zip(names, CASTS[wish], strict=True)}
 
@@ -82,7 +82,7 @@ def _rosbridge(ports: Iterator[int]) -> Robot:
     return Robot("rosbridge", "ROS 2 robot", "Behind rosbridge", options, (_compass(ports),))
 
 
-def _sim(name: str, yard_port: int) -> Robot:
+def _simulated(name: str, yard_port: int) -> Robot:
     options = {"host": LOOPBACK, "port": yard_port, "robot": name, "camera_fps": FPS}
     stripes = _stripes(name)
     return Robot("sim", "simulated ERS-7", f"With {stripes}", options)

@@ -120,13 +120,13 @@ class Demonstration:
                 loss = "loss of the link" if self._loses_link else "kill"
                 self._tell(f"{run.takeover_s:.2f} s from the {loss} to the next dog moving")
             if victim:
-                await self._lose(victim)
+                await self._inject_failure(victim)
             self._check_processes()
         if run.killed and self._loses_link:
             await self._operator.plug(run.killed)
         return run
 
-    async def _lose(self, victim: str) -> None:
+    async def _inject_failure(self, victim: str) -> None:
         """Let the approaching dog fail: its node, or the link between its node and the robot."""
         if self._loses_link:
             self._tell(f"{victim} has come nearer; the link between its node and the robot is lost")
@@ -225,12 +225,12 @@ def _arguments(arguments: Sequence[str]) -> argparse.Namespace:
         help=f"port of the page (default {WEB_PORT}, or a free one; 0: only free ports, for several demonstrations)",
     )
     parser.add_argument("--tls", action="store_true", help="also serve the page over TLS, on this machine only")
-    wishes = parser.parse_args(arguments)
-    if wishes.lose == "link" and wishes.robot == "sim":
+    given = parser.parse_args(arguments)
+    if given.lose == "link" and given.robot == "sim":
         parser.error("--lose link: a simulated dog has no link; choose another --robot")
-    if wishes.report is not None and not wishes.report.absolute().parent.is_dir():
-        parser.error(f"--report {wishes.report}: no such folder; create it, or choose another file")
-    return wishes
+    if given.report is not None and not given.report.absolute().parent.is_dir():
+        parser.error(f"--report {given.report}: no such folder; create it, or choose another file")
+    return given
 
 
 def _port(word: str) -> int:
@@ -240,26 +240,26 @@ def _port(word: str) -> int:
     return int(word)
 
 
-async def _run(reactor: Any, wishes: argparse.Namespace) -> None:
+async def _run(reactor: Any, given: argparse.Namespace) -> None:
     try:
-        with fresh(wishes.run_dir.absolute()):
-            folder = wishes.run_dir.absolute()
+        with fresh(given.run_dir.absolute()):
+            folder = given.run_dir.absolute()
             # For this machine alone browsers trust http, so TLS is not needed.
-            with_tls = wishes.tls or (has_tls() and not wishes.headless and wishes.web_host != LOOPBACK)
-            if wishes.tls and not has_tls():
+            with_tls = given.tls or (has_tls() and not given.headless and given.web_host != LOOPBACK)
+            if given.tls and not has_tls():
                 raise Trouble("--tls needs libraries that are not installed; run: pip install 'swarm-node[tls]'")
-            is_usual = not wishes.headless and wishes.web_port != 0
-            plan = arranged(folder, wishes.web_host, wishes.web_port, is_usual, say, with_tls, wishes.robot)
-            demonstration = Demonstration(reactor, plan, wishes.seed, say, wishes.lose == "link")
+            is_usual = not given.headless and given.web_port != 0
+            plan = arranged(folder, given.web_host, given.web_port, is_usual, say, with_tls, given.robot)
+            demonstration = Demonstration(reactor, plan, given.seed, say, given.lose == "link")
             reactor.addSystemEventTrigger("before", "shutdown", demonstration.stop)
 
             async def begun() -> None:
                 _invite(demonstration, plan)
-                if not wishes.headless:
+                if not given.headless:
                     demonstration.watch()
                     await Deferred()
 
-            await judged(demonstration, begun, wishes.report, say)
+            await judged(demonstration, begun, given.report, say)
     except (Trouble, PageError, PortBusy, OSError) as problem:
         sys.stderr.write(f"swarm demo: {problem}\n")
         raise SystemExit(2 if isinstance(problem, PortBusy) else 1) from None
@@ -283,7 +283,7 @@ def _invite(demonstration: Demonstration, plan: Plan) -> None:
 
 def main(arguments: Sequence[str] = tuple(sys.argv[1:])) -> None:
     """Run the demonstration according to the command line."""
-    wishes = _arguments(arguments)
+    given = _arguments(arguments)
     # Twisted's timers use the wall clock; a step of that clock would delay or fire all of them.
     ReactorBase.seconds = staticmethod(time.monotonic)
-    react(lambda reactor: Deferred.fromCoroutine(_run(reactor, wishes)))
+    react(lambda reactor: Deferred.fromCoroutine(_run(reactor, given)))

@@ -38,7 +38,7 @@ class Team:
     def __init__(self, reactor: Any, run_dir: Path, said: Callable[[str, str], None] = lambda name, line: None) -> None:
         self._clock = IReactorTime(reactor)
         self._run_dir = run_dir
-        self._said = said
+        self._on_line = said
         self._logs: dict[str, TextIO] = {}
         self._tails: dict[str, deque[str]] = {}
         self._stopped: Deferred[None] | None = None
@@ -72,14 +72,14 @@ class Team:
             self._stopped = done
             if self._monitor.running:
                 self._monitor.stopService()
-            self._await_end()
+            self._check_ended()
         else:
             self._stopped.addCallback(lambda _: done.callback(None))
         return done
 
-    def _await_end(self) -> None:
+    def _check_ended(self) -> None:
         if self._monitor.protocols:
-            self._clock.callLater(0.05, self._await_end)
+            self._clock.callLater(0.05, self._check_ended)
             return
         for log in self._logs.values():
             log.close()
@@ -125,7 +125,7 @@ class Team:
         log = self._logs[name]
         if not log.closed:
             log.write(line + "\n")
-        self._said(name, line)
+        self._on_line(name, line)
 
 
 def on_leash(arguments: Sequence[str]) -> list[str]:

@@ -98,9 +98,9 @@ def arranged(
     tls = (0, 0)
     if with_tls:
         # The ports of the page are not bound yet, so they would look free.
-        wish = TLS_PORT if usual and not {TLS_PORT, TLS_PORT + 1} & {web, reserve} else 0
-        first = port.preferred("tcp", web_host, wish, spare)
-        tls = (first, port.preferred("tcp", web_host, first + 1 if first == wish else 0, spare))
+        preferred_port = TLS_PORT if usual and not {TLS_PORT, TLS_PORT + 1} & {web, reserve} else 0
+        first = port.preferred("tcp", web_host, preferred_port, spare)
+        tls = (first, port.preferred("tcp", web_host, first + 1 if first == preferred_port else 0, spare))
     yard = port.preferred("tcp", LOOPBACK, YARD_PORT if usual else 0, spare)
     quiet = iter(port.free("udp", LOOPBACK, 2 + len(DOGS)))
     node = port.preferred("udp", LOOPBACK, NODE_PORT if usual else 0, quiet)
@@ -108,9 +108,9 @@ def arranged(
     if usual:
         wanted = [("the page", web_port or WEB_PORT, web), ("the yard", YARD_PORT, yard), ("vaio", NODE_PORT, node)]
         wanted += [("the page over TLS", TLS_PORT, tls[0])] if with_tls else []
-        for what, wish, got in wanted:
-            if wish != got:
-                say(f"port {wish} is busy; {what} uses {got}")
+        for what, preferred_port, got in wanted:
+            if preferred_port != got:
+                say(f"port {preferred_port} is busy; {what} uses {got}")
     nodes = {BOOTSTRAP: node, **dict(zip((RESERVE, *DOGS), others, strict=True))}
     code = "".join(secrets.choice(LETTERS) for _ in range(8))
     robots = chosen(robot, DOGS, run_dir, spare, yard)

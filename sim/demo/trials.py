@@ -95,7 +95,7 @@ def trial(make_team: MakeTeam, experiment: int, seed: int, pictures: Path | None
     while not run.is_over and team.clock.seconds() - began < LIMIT_S:
         team.clock.advance(LOOK_S)
         state, truth = team.state(), team.truth()
-        _notice(outcome, state, truth, team.clock.seconds() - began, draw)
+        _record_times(outcome, state, truth, team.clock.seconds() - began, draw)
         killed = run.look(team.clock.seconds(), state, truth)
         if killed:
             draw("5-lost", f"{killed} is lost on its way")
@@ -115,7 +115,7 @@ def trial(make_team: MakeTeam, experiment: int, seed: int, pictures: Path | None
 Draw = Callable[[str, str], None]
 
 
-def _notice(outcome: Outcome, state: dict[str, Any], truth: dict[str, Any], now: float, draw: Draw) -> None:
+def _record_times(outcome: Outcome, state: dict[str, Any], truth: dict[str, Any], now: float, draw: Draw) -> None:
     """Record the times at which all dogs have found the target and all agents name the same dog."""
     group = state["groups"][0] if state["groups"] else None
     if truth["target"] is not None:
@@ -171,7 +171,7 @@ def table(outcomes: Iterable[Outcome]) -> str:
     return "\n".join(rows)
 
 
-def _one(job: tuple[MakeTeam, int, int, Path | None]) -> Outcome:
+def _run_job(job: tuple[MakeTeam, int, int, Path | None]) -> Outcome:
     make_team, experiment, seed, pictures = job
     return trial(make_team, experiment, seed, pictures)
 
@@ -185,11 +185,11 @@ def real(count: int, seed: int, run_dir: Path) -> list[bool]:
     return held
 
 
-def whole(word: str) -> int:
+def whole(text: str) -> int:
     """Parse a non-negative integer of the command line."""
-    if not (word.isdecimal() and len(word) <= 9):
-        raise argparse.ArgumentTypeError(f"must be a whole number from 0 on, is {word!r}")
-    return int(word)
+    if not (text.isdecimal() and len(text) <= 9):
+        raise argparse.ArgumentTypeError(f"must be a whole number from 0 on, is {text!r}")
+    return int(text)
 
 
 def main(arguments: Sequence[str], make_team: MakeTeam) -> int:
@@ -219,11 +219,11 @@ def main(arguments: Sequence[str], make_team: MakeTeam) -> int:
             # Forking a process with threads may deadlock.
             spawn = multiprocessing.get_context("spawn")
             spread = stack.enter_context(ProcessPoolExecutor(given.jobs, spawn)).map
-        for outcome in spread(_one, jobs):
+        for outcome in spread(_run_job, jobs):
             outcomes.append(outcome)
-            word = "ok  " if outcome.held else "FAIL"
+            text = "ok  " if outcome.held else "FAIL"
             broken = f"  ({'; '.join(outcome.broken)})" if outcome.broken else ""
-            line = f"{len(outcomes):4}/{len(jobs)} {word} experiment {outcome.experiment} seed {outcome.seed}"
+            line = f"{len(outcomes):4}/{len(jobs)} {text} experiment {outcome.experiment} seed {outcome.seed}"
             sys.stdout.write(f"{line}: {outcome.by or 'nobody'} reached it{broken}\n")
             sys.stdout.flush()
     (given.out / "trials.json").write_text(json.dumps([asdict(o) for o in outcomes], indent=1), encoding="utf-8")

@@ -98,9 +98,9 @@ class Visitor:
     async def post(self, path: str) -> dict[str, Any]:
         """Send an order to the page; raises ``PageError`` if it is refused."""
         await self._sign_in()
-        return await self._posted(path, None)
+        return await self._post(path, None)
 
-    async def _posted(self, path: str, body: IBodyProducer | None) -> dict[str, Any]:
+    async def _post(self, path: str, body: IBodyProducer | None) -> dict[str, Any]:
         asked = self._agent.request(b"POST", (self._address + path).encode(), self._headers(), body)
         response = await asked.addTimeout(LIMIT_S, self._clock)
         content = await readBody(response).addTimeout(LIMIT_S, self._clock)
@@ -117,7 +117,7 @@ class Visitor:
     async def _sign_in(self) -> None:
         if self._code and not self._token:
             body = FileBodyProducer(BytesIO(json.dumps({"code": self._code}).encode()))
-            answer = await self._posted("/api/v1/session", body)
+            answer = await self._post("/api/v1/session", body)
             self._token = str(answer.get("token", ""))
 
     def _headers(self) -> Headers:
@@ -125,28 +125,28 @@ class Visitor:
         return Headers({"X-Swarm": ["1"], **signed})
 
     def _open(self) -> None:
-        Deferred.fromCoroutine(self._asked_stream()).addCallbacks(self._opened, self._lost)
+        Deferred.fromCoroutine(self._request_stream()).addCallbacks(self._on_open, self._on_lost)
 
-    async def _asked_stream(self) -> IResponse:
+    async def _request_stream(self) -> IResponse:
         await self._sign_in()
         response = await self._agent.request(b"GET", f"{self._address}/events?whole=1".encode(), self._headers())
         if response.code == 401:
             self._token = ""
         return response
 
-    def _opened(self, response: IResponse) -> None:
-        self._stream = _Stream(self._heard)
-        self._stream.over.addBoth(self._lost)
+    def _on_open(self, response: IResponse) -> None:
+        self._stream = _Stream(self._on_event)
+        self._stream.over.addBoth(self._on_lost)
         response.deliverBody(self._stream)
         if not self._following:
             self.leave()
 
-    def _lost(self, _: object) -> None:
+    def _on_lost(self, _: object) -> None:
         self._stream = None
         if self._following:
             self._retry = self._clock.callLater(RETRY_S, self._open)
 
-    def _heard(self, name: str, data: bytes) -> None:
+    def _on_event(self, name: str, data: bytes) -> None:
         if name != "state":
             return
         try:
@@ -159,14 +159,14 @@ class Visitor:
 
 
 class _Stream(Protocol):
-    def __init__(self, heard: Callable[[str, bytes], None]) -> None:
+    def __init__(self, on_event: Callable[[str, bytes], None]) -> None:
         self.over: Deferred[None] = Deferred()
         self._events = EventStream()
-        self._heard = heard
+        self._on_event = on_event
 
     def dataReceived(self, data: bytes) -> None:
         for name, event in self._events.feed(data):
-            self._heard(name, event)
+            self._on_event(name, event)
 
     def connectionLost(self, reason: Failure = connectionDone) -> None:
         self.over.callback(None)

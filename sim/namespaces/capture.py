@@ -66,8 +66,8 @@ class Capture:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        said = self._process.communicate(timeout=20)[0]
-        self.traffic = {peer: Traffic(**counts) for peer, counts in json.loads(said).items()}
+        output = self._process.communicate(timeout=20)[0]
+        self.traffic = {peer: Traffic(**counts) for peer, counts in json.loads(output).items()}
 
     def from_host(self, address: str) -> Traffic:
         """Return the traffic with all ports of one address."""

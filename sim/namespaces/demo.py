@@ -80,8 +80,8 @@ def inside(given: argparse.Namespace) -> None:
     async def run(reactor: Any) -> None:
         try:
             with fresh(folder):
-                said = json.loads(sys.stdin.readline())
-                places = {name: Place(**{**each, "enter": tuple(each["enter"])}) for name, each in said.items()}
+                given_places = json.loads(sys.stdin.readline())
+                places = {name: Place(**{**each, "enter": tuple(each["enter"])}) for name, each in given_places.items()}
                 plan = planned(folder, given.robot, places, "over-there")
                 demonstration = Demonstration(reactor, plan, given.seed, say, given.lose == "link")
                 reactor.addSystemEventTrigger("before", "shutdown", demonstration.stop)

@@ -53,12 +53,12 @@ class Internet:
         self._rooms: dict[str, Room] = {}
         self._ports: dict[str, str] = {}
         self._addresses: dict[str, str] = {}
-        self._outside: dict[str, str] = {}
+        self._external: dict[str, str] = {}
         self._places: dict[str, str] = {}
         self._started: list[subprocess.Popen[Any]] = []
         self._switch: subprocess.Popen[str] | None = None
         self._forwards: dict[str, list[Forward]] = {}
-        self._moves = self._cables = 0
+        self._move_count = self._cables = 0
 
     def __enter__(self) -> Internet:
         try:
@@ -101,7 +101,7 @@ class Internet:
 
     def outside(self, site: str) -> str:
         """Return the external address of a site's router."""
-        return self._outside[site]
+        return self._external[site]
 
     def room(self, name: str) -> Room:
         """Return the namespace of a host, of a router (``a-gw``), or of the wide area (the empty name)."""
@@ -137,15 +137,15 @@ class Internet:
 
         ``way`` is relative to the site.  With ``to`` only the direction from this site to that one is impaired.
         """
-        said = asdict(Weather(**figures))
+        impairments = asdict(Weather(**figures))
         for port in self._ports_of(site):
             if to:
                 for other in self._ports_of(to):
-                    self._order(do="weather", port=port, to=other, weather=said)
+                    self._order(do="weather", port=port, to=other, weather=impairments)
                 continue
             for is_up in (True, False):
                 if way == "both" or is_up == (way == "out"):
-                    self._order(do="weather", port=port, to="", is_up=is_up, weather=said)
+                    self._order(do="weather", port=port, to="", is_up=is_up, weather=impairments)
 
     def cut(self, site: str, way: Way = "both", to: str = "") -> None:
         """Block traffic into a site, out of it, or both; with ``to`` only from this site to that one."""
@@ -175,15 +175,15 @@ class Internet:
     def renumber(self, site: str) -> str:
         """Change the external address of a router, as providers do; returns the new one."""
         number = self._numbers[site]
-        self._moves += 1
-        new, old = f"198.18.{1 + self._moves % 9}.{number}", self._outside[site]
+        self._move_count += 1
+        new, old = f"198.18.{1 + self._move_count % 9}.{number}", self._external[site]
         if new == old:
             return self.renumber(site)
         self._router(site).run(
             f"ip address add {new}/16 dev {WAN}\nip address del {old}/16 dev {WAN}\n"
             f"ip address show dev {WAN} | grep -q {new}/16 || ip address add {new}/16 dev {WAN}\n"
         )
-        self._outside[site] = new
+        self._external[site] = new
         self.forget(site)
         return new
 
@@ -197,8 +197,8 @@ class Internet:
         if Kind.NONE in (self.sites[site].kind, self.sites[self._places[host]].kind):
             raise ValueError(f"{host} can only move between sites with a router")
         self._rooms[host].run(f"ip link del {WAN}\n")
-        self._moves += 1
-        self._plug(host, site, 100 + self._moves)
+        self._move_count += 1
+        self._attach_host(host, site, 100 + self._move_count)
         return self._addresses[host]
 
     def forward(self, site: str, host: str, *ports: tuple[Literal["udp", "tcp"], int]) -> None:
@@ -209,7 +209,7 @@ class Internet:
 
     def island(self, name: str) -> None:
         """Create a host without a network connection."""
-        self._make(name)
+        self._make_room(name)
 
     def cable(self, host: str, other: str) -> tuple[str, str]:
         """Connect two hosts by a separate link, as a robot and its computer; returns their addresses on it."""
@@ -231,16 +231,16 @@ class Internet:
 
     def _build(self) -> None:
         self._rooms[""] = Room()
-        self._quiet(self._rooms[""])
-        self._make(PUB)
+        self._disable_ipv6(self._rooms[""])
+        self._make_room(PUB)
         self._uplink(PUB, PUBS)
-        self._addresses[PUB] = self._outside[PUB] = PUBS[0]
+        self._addresses[PUB] = self._external[PUB] = PUBS[0]
         for name, site in self.sites.items():
             if site.kind is not Kind.NONE:
                 self._make_router(name)
             for number in range(1, site.hosts + 1):
-                self._make(f"{name}{number}")
-                self._plug(f"{name}{number}", name, number)
+                self._make_room(f"{name}{number}")
+                self._attach_host(f"{name}{number}", name, number)
         ports = [f"{name}={interface}" for name, interface in self._ports.items()]
         pipe = subprocess.PIPE
         arguments = [sys.executable, "-m", "sim.namespaces.switch", str(self._seed), *ports]
@@ -249,12 +249,12 @@ class Internet:
         if not self._switch.stdout.readline():
             raise RuntimeError("the switch of the wide area did not start")
 
-    def _make(self, name: str) -> Room:
+    def _make_room(self, name: str) -> Room:
         room = self._rooms[name] = Room(self._rooms[""])
-        self._quiet(room)
+        self._disable_ipv6(room)
         return room
 
-    def _quiet(self, room: Room) -> None:
+    def _disable_ipv6(self, room: Room) -> None:
         # IPv6 would send unsolicited datagrams.
         room.run("for f in /proc/sys/net/ipv6/conf/*/disable_ipv6; do echo 1 >$f; done\nip link set lo up\n")
 
@@ -271,9 +271,9 @@ class Internet:
         )
 
     def _make_router(self, site: str) -> None:
-        room, number = self._make(f"{site}-gw"), self._numbers[site]
-        self._outside[site] = f"198.18.1.{number}"
-        self._uplink(f"{site}-gw", (self._outside[site],))
+        room, number = self._make_room(f"{site}-gw"), self._numbers[site]
+        self._external[site] = f"198.18.1.{number}"
+        self._uplink(f"{site}-gw", (self._external[site],))
         room.run(
             f"echo 1 >/proc/sys/net/ipv4/ip_forward\n"
             f"ip link add {LAN} type bridge stp_state 0 forward_delay 0\nip link set {LAN} up\n"
@@ -283,7 +283,7 @@ class Internet:
     def _rules(self, site: str) -> str:
         return self.sites[site].kind.rules(self._forwards.get(site, ()))
 
-    def _plug(self, host: str, site: str, place: int) -> None:
+    def _attach_host(self, host: str, site: str, place: int) -> None:
         number, room = self._numbers[site], self._rooms[host]
         self._places[host] = site
         if self.sites[site].kind is Kind.NONE:

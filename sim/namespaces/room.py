@@ -38,17 +38,19 @@ class Room:
     def __init__(self, inside: Room | None = None) -> None:
         self._is_own_user: bool = inside is not None and inside._is_own_user
         before = () if inside is None else inside.entry
-        ways: list[Sequence[str]] = [()] if inside is not None else [(), OWN_USER] if not os.geteuid() else [OWN_USER]
-        said = ""
-        for way in ways:
-            held = _held([*before, "unshare", *way, "--net", "sh", "-c", "echo; exec cat"])
-            if isinstance(held, str):
-                said = held
+        prefixes: list[Sequence[str]] = (
+            [()] if inside is not None else [(), OWN_USER] if not os.geteuid() else [OWN_USER]
+        )
+        error_text = ""
+        for prefix in prefixes:
+            started = _start_holder([*before, "unshare", *prefix, "--net", "sh", "-c", "echo; exec cat"])
+            if isinstance(started, str):
+                error_text = started
                 continue
-            self._holder = held
-            self._is_own_user |= way is OWN_USER
+            self._holder = started
+            self._is_own_user |= prefix is OWN_USER
             return
-        raise Refused(f"cannot create a network namespace: {said}; {_remedy()}")
+        raise Refused(f"cannot create a network namespace: {error_text}; {_remedy()}")
 
     @property
     def pid(self) -> int:
@@ -114,7 +116,7 @@ def refusal() -> str:
     return ""
 
 
-def _held(command: list[str]) -> subprocess.Popen[str] | str:
+def _start_holder(command: list[str]) -> subprocess.Popen[str] | str:
     """Return the holder once it is in its namespace, else its error output."""
     pipe = subprocess.PIPE
     try:

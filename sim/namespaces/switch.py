@@ -63,8 +63,8 @@ class Switch:
         self._rng = rng
         self._ports = {name: Port(name, interface, rng) for name, interface in ports.items()}
         self._by_file = {port.socket.fileno(): port for port in self._ports.values()}
-        self._ways: defaultdict[tuple[str, str], Line] = defaultdict(lambda: Line(rng))
-        self._heard_at: dict[bytes, Port] = {}
+        self._pair_lines: defaultdict[tuple[str, str], Line] = defaultdict(lambda: Line(rng))
+        self._port_of: dict[bytes, Port] = {}
         self._waiting: list[tuple[float, int, Port, bytes]] = []
         self._number = 0
         self._record: BinaryIO | None = None
@@ -88,7 +88,7 @@ class Switch:
                     return
                 *lines, rest = (rest + read).split(b"\n")
                 for line in lines:
-                    sys.stdout.write(json.dumps(self._obey(json.loads(line))) + "\n")
+                    sys.stdout.write(json.dumps(self._execute(json.loads(line))) + "\n")
                     sys.stdout.flush()
             now = time.monotonic()
             while self._waiting and self._waiting[0][0] <= now:
@@ -97,16 +97,16 @@ class Switch:
 
     def _enter(self, source: Port, frame: bytes) -> None:
         receiver, sender = frame[:6], frame[6:12]
-        self._heard_at[sender] = source
-        target = None if receiver[0] & 1 else self._heard_at.get(receiver)
+        self._port_of[sender] = source
+        target = None if receiver[0] & 1 else self._port_of.get(receiver)
         targets = [target] if target is not None else [port for port in self._ports.values() if port is not source]
         if self._record is not None:
             self._record.write(recorded(frame))
         now = time.monotonic()
         for port in targets:
             if port is not source:
-                way = self._ways.get((source.name, port.name))
-                self._carry([source.up, *([way] if way is not None else []), port.down], port, frame, now)
+                pair_line = self._pair_lines.get((source.name, port.name))
+                self._carry([source.up, *([pair_line] if pair_line is not None else []), port.down], port, frame, now)
 
     def _carry(self, lines: list[Line], port: Port, frame: bytes, now: float) -> None:
         if frame[12:14] == ARP:
@@ -131,7 +131,7 @@ class Switch:
         except OSError:
             port.down.lost += 1
 
-    def _obey(self, order: dict[str, Any]) -> object:
+    def _execute(self, order: dict[str, Any]) -> object:
         match order["do"]:
             case "weather":
                 self._line(order).weather = Weather(**order["weather"])
@@ -143,7 +143,7 @@ class Switch:
 
     def _line(self, order: dict[str, Any]) -> Line:
         if order["to"]:
-            return self._ways[order["port"], order["to"]]
+            return self._pair_lines[order["port"], order["to"]]
         port = self._ports[order["port"]]
         return port.up if order["is_up"] else port.down
 

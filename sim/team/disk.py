@@ -32,13 +32,13 @@ class Disk(Memory):
         self.safe: dict[Slot, Record] = {}
         self.safe_notes: dict[str, bytes] = {}
         self._clock = clock
-        self._dice = rng
+        self._rng = rng
         self._trouble = ""
-        self._owed: dict[Slot, Record | None] = {}
-        self._owed_notes: dict[str, bytes] = {}
+        self._pending: dict[Slot, Record | None] = {}
+        self._pending_notes: dict[str, bytes] = {}
         self._waiting: list[Deferred[None]] = []
-        self._is_turning = False
-        self._is_lost = False
+        self._is_scheduled = False
+        self._is_powered_off = False
 
     @property
     def trouble(self) -> str:
@@ -55,7 +55,7 @@ class Disk(Memory):
         """Fire when all writes until now are durable; fail with ``Unwritable`` as soon as a commit fails."""
         if self._trouble:
             return fail(_refusal(self._trouble))
-        if not self._owed and not self._owed_notes:
+        if not self._pending and not self._pending_notes:
             return succeed(None)
         waiting: Deferred[None] = Deferred()
         self._waiting.append(waiting)
@@ -65,14 +65,17 @@ class Disk(Memory):
         """Store a note of the node under ``name``."""
         if self.noted(name) != value:
             super().note(name, value)
-            self._owed_notes[name] = value
+            self._pending_notes[name] = value
             self._schedule()
 
     def begin(self) -> None:
         """Make the present content durable."""
-        self.safe, self.safe_notes = {slot: record for slot, record in self._owed.items() if record}, dict(self._notes)
-        self._owed.clear()
-        self._owed_notes.clear()
+        self.safe, self.safe_notes = (
+            {slot: record for slot, record in self._pending.items() if record},
+            dict(self._notes),
+        )
+        self._pending.clear()
+        self._pending_notes.clear()
 
     def kept(self) -> tuple[list[Record], dict[str, bytes]]:
         """Return the records and notes that would survive a loss of power now."""
@@ -85,37 +88,37 @@ class Disk(Memory):
 
     def lose_power(self) -> None:
         """Stop all writing."""
-        self._is_lost = True
+        self._is_powered_off = True
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
     def _changed(self, slot: Slot, record: Record | None) -> None:
-        self._owed[slot] = record
+        self._pending[slot] = record
         self._schedule()
 
     def _schedule(self) -> None:
-        if not self._is_turning:
-            self._is_turning = True
-            wait = TRY_AGAIN if self._trouble else self._dice.uniform(0.0, COMMIT_AFTER)
+        if not self._is_scheduled:
+            self._is_scheduled = True
+            wait = TRY_AGAIN if self._trouble else self._rng.uniform(0.0, COMMIT_AFTER)
             self._clock.callLater(wait, self._commit)
 
     def _commit(self) -> None:
-        self._is_turning = False
-        if self._is_lost:
+        self._is_scheduled = False
+        if self._is_powered_off:
             return
         self._trouble = FULL if self.is_full else ""
         waiting, self._waiting = self._waiting, []
         if self._trouble:
             self._schedule()
         else:
-            for slot, record in self._owed.items():
+            for slot, record in self._pending.items():
                 if record is None:
                     self.safe.pop(slot, None)
                 else:
                     self.safe[slot] = record
-            self.safe_notes.update(self._owed_notes)
-            self._owed.clear()
-            self._owed_notes.clear()
+            self.safe_notes.update(self._pending_notes)
+            self._pending.clear()
+            self._pending_notes.clear()
         for each in waiting:
             if self._trouble:
                 each.errback(_refusal(self._trouble))

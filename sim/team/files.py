@@ -154,9 +154,9 @@ class DiskFleet(Fleet):
 
     def __init__(self, n: int, seed: int = 1, weather: Weather = CALM) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="schedule-", dir=MEMORY if os.path.isdir(MEMORY) else None)
-        self._dice = random.Random(f"{seed}/disk")
+        self._disk_rng = random.Random(f"{seed}/disk")
         self._memories: Counter[int] = Counter()
-        self._rotten: set[int] = set()
+        self._corrupt: set[int] = set()
         self.decay: dict[int, str] = {}
         self.decayed: list[int] = []
         self.lost: list[str] = []
@@ -176,9 +176,9 @@ class DiskFleet(Fleet):
     def store(self, place: int) -> Store:
         """Open the store of the next life of the node at this place."""
         former = self.stores.get(place)
-        store = self.stores[place] = self._opened(self._path(place))
-        if place in self._rotten:
-            self._rotten.discard(place)
+        store = self.stores[place] = self._open_store(self._path(place))
+        if place in self._corrupt:
+            self._corrupt.discard(place)
             if not store.rotten and store.origin != "replaced":
                 self.overlooked.append(f"node {place} does not detect that its store is corrupt")
         elif isinstance(former, DiskStore):
@@ -195,18 +195,18 @@ class DiskFleet(Fleet):
         self._memories[place] += 1
         later = self._path(place)
         before = _size(path + "-wal")
-        is_torn = self._dice.random() < 0.5
+        is_torn = self._disk_rng.random() < 0.5
         if is_torn:
             store.writer.tear()
         _copy(path, later)
         after = _size(later + "-wal")
         if is_torn and after > before:
-            os.truncate(later + "-wal", self._dice.randrange(before, after + 1))
+            os.truncate(later + "-wal", self._disk_rng.randrange(before, after + 1))
         store.abandon()
         kind = self.decay.get(place)
-        if kind is not None and self._rot(later, kind):
+        if kind is not None and self._corrupt_file(later, kind):
             del self.decay[place]
-            self._rotten.add(place)
+            self._corrupt.add(place)
             self.decayed.append(place)
 
     def stop(self) -> None:
@@ -222,7 +222,7 @@ class DiskFleet(Fleet):
         """Compare a node's memory with the content that its file would give after a kill now."""
         store, path = self.disk(place), f"{self._path(place)}-copy"
         _copy(self._path(place), path)
-        copy = self._opened(path)
+        copy = self._open_store(path)
         here = {record for record in store.records() if record.lifetime == "team"}
         there = set(copy.records())
         found = []
@@ -238,8 +238,8 @@ class DiskFleet(Fleet):
     def _path(self, place: int) -> str:
         return str(Path(self._folder.name) / f"{place}-{self._memories[place]}")
 
-    def _opened(self, path: str) -> DiskStore:
-        dice = random.Random(f"{self._dice.random()}/{Path(path).name}")
+    def _open_store(self, path: str) -> DiskStore:
+        dice = random.Random(f"{self._disk_rng.random()}/{Path(path).name}")
         clock = self.clock
 
         class Store(DiskStore):
@@ -252,7 +252,7 @@ class DiskFleet(Fleet):
         assert isinstance(store, DiskStore)
         return store
 
-    def _rot(self, path: str, kind: str) -> bool:
+    def _corrupt_file(self, path: str, kind: str) -> bool:
         """Corrupt a row or the file; returns whether there was content to corrupt."""
         with closing(sqlite3.connect(path, isolation_level=None)) as connection:
             rows = [row for (row,) in connection.execute("SELECT id FROM records WHERE value IS NOT NULL ORDER BY id")]
@@ -265,7 +265,7 @@ class DiskFleet(Fleet):
         if kind == "file":
             with open(path, "r+b") as file:
                 file.seek(4096)
-                file.write(self._dice.randbytes(4096))
+                file.write(self._disk_rng.randbytes(4096))
         return True
 
 

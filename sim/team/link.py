@@ -72,7 +72,7 @@ class TeamLink:
         self._plain_loss = settings.loss if not (settings.burst or settings.asymmetry) else 0.0
         self._bursts: dict[Address, tuple[float, bool]] = {}
         self._free_at: dict[Address, float] = {}
-        self._spots: dict[Address, tuple[float, float, float]] = {}
+        self._positions: dict[Address, tuple[float, float, float]] = {}
         self._delay = getattr(self, f"_{settings.kind}")
         self._is_plain = not (settings.duplicate or settings.reorder or settings.bandwidth)
 
@@ -84,22 +84,22 @@ class TeamLink:
             return LOST
         if self._is_plain:
             return (self._delay(source, to, rng),)
-        settings, waited = self.settings, 0.0
+        settings, queueing = self.settings, 0.0
         if settings.bandwidth:
             begins = max(now, self._free_at.get(source, 0.0))
             if begins - now > settings.queue:
                 return LOST
             self._free_at[source] = begins + size / settings.bandwidth
-            waited = self._free_at[source] - now
+            queueing = self._free_at[source] - now
         copies = 2 if settings.duplicate and rng.random() < settings.duplicate else 1
         delays = [self._delay(source, to, rng) for _ in range(copies)]
         if settings.reorder:
             delays = [2 * d + 0.001 if rng.random() < settings.reorder else d for d in delays]
-        return [waited + delay for delay in delays]
+        return [queueing + delay for delay in delays]
 
     def distance(self, source: Address, to: Address) -> float:
         """Return the one-way delay between two nodes on the internet in seconds, without variation."""
-        (x, y, height), (x2, y2, height2) = self._spot(source), self._spot(to)
+        (x, y, height), (x2, y2, height2) = self._position(source), self._position(to)
         return math.hypot(x - x2, y - y2) + height + height2
 
     # -- inside -----------------------------------------------------------------------------------------------------
@@ -119,13 +119,17 @@ class TeamLink:
         self._bursts[source] = now, is_bad
         return is_bad
 
-    def _spot(self, address: Address) -> tuple[float, float, float]:
-        spot = self._spots.get(address)
-        if spot is None:
-            dice = random.Random(f"{self._seed}/{address}")
-            spot = dice.uniform(0, SIDE), dice.uniform(0, SIDE), dice.expovariate(1 / HEIGHT)
-            self._spots[address] = spot
-        return spot
+    def _position(self, address: Address) -> tuple[float, float, float]:
+        position = self._positions.get(address)
+        if position is None:
+            position_rng = random.Random(f"{self._seed}/{address}")
+            position = (
+                position_rng.uniform(0, SIDE),
+                position_rng.uniform(0, SIDE),
+                position_rng.expovariate(1 / HEIGHT),
+            )
+            self._positions[address] = position
+        return position
 
     def _none(self, source: Address, to: Address, rng: random.Random) -> float:
         return 0.0

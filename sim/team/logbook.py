@@ -88,8 +88,8 @@ def _close_the_line(book: Any) -> None:
     book.truncate(whole)
 
 
-def _entry(told: dict[str, Any]) -> Entry:
-    known = {one.name: told[one.name] for one in fields(Entry)}
+def _entry(content: dict[str, Any]) -> Entry:
+    known = {one.name: content[one.name] for one in fields(Entry)}
     known["failures"] = tuple(map(int, known["failures"]))
     known["first"], known["count"] = int(known["first"]), int(known["count"])
     return Entry(**known)

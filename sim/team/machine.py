@@ -97,75 +97,75 @@ class Machine:
         self.is_alive = True
         self.is_still = False
         self.timers: list[_MachineCall] = []
-        self._arrived: list[tuple[Callable[..., object], tuple[Any, ...]]] = []
-        self._world = world
+        self._pending_input: list[tuple[Callable[..., object], tuple[Any, ...]]] = []
+        self._clock = world
         # The clock's value at the last change of its rate, and the simulator's time of it.
-        self._shown = offset
-        self._since = 0.0
-        self._lost = 0.0
+        self._base_value = offset
+        self._base_time = 0.0
+        self._suspended_s = 0.0
         self._stopped_at: float | None = None
 
     def seconds(self) -> float:
         """Return the machine's time; it continues while the machine is frozen."""
-        return self.shown_at(self._world.seconds())
+        return self.shown_at(self._clock.seconds())
 
     def shown_at(self, moment: float) -> float:
         """Return the value of its clock at a ``moment`` of the simulator's clock, if its rate stays the same."""
         if self._stopped_at is not None:
             moment = self._stopped_at
-        return self._shown + self.rate * (moment - self._since)
+        return self._base_value + self.rate * (moment - self._base_time)
 
     def at(self, shown: float) -> float:
         """Return the simulator's time at which the clock shows ``shown``, if its rate stays the same."""
-        return self._since + (shown - self._shown) / self.rate
+        return self._base_time + (shown - self._base_value) / self.rate
 
     def unstopped_at(self, shown: float) -> float:
         """Return the simulator's time at which the clock would show ``shown`` without any suspension."""
-        return self.at(shown) - self._lost
+        return self.at(shown) - self._suspended_s
 
     def set_rate(self, rate: float) -> None:
         """Change the rate from now on; existing timers keep their times on the simulator's clock."""
-        self._shown, self._since = self.seconds(), self._world.seconds()
+        self._base_value, self._base_time = self.seconds(), self._clock.seconds()
         self.rate = rate
 
     def callLater(self, delay: float, callable: Callable[..., object], *args: Any, **kw: Any) -> IDelayedCall:  # noqa: A002
         """Schedule a call after ``delay`` seconds of the machine's clock."""
         call = _MachineCall(self, callable, args, kw)
-        call.inner = self._world.callLater(max(delay / self.rate, LEAST) if delay else 0.0, call.due)
+        call.inner = self._clock.callLater(max(delay / self.rate, LEAST) if delay else 0.0, call.due)
         return call
 
     def getDelayedCalls(self) -> Sequence[IDelayedCall]:
         """Return all calls on the simulator's clock, which all machines share."""
-        return list(self._world.getDelayedCalls())
+        return list(self._clock.getDelayedCalls())
 
     def heard(self, receive: Callable[..., object], *arguments: Any) -> None:
         """Deliver external input, now or when the machine continues."""
         if self.is_still:
-            self._arrived.append((receive, arguments))
+            self._pending_input.append((receive, arguments))
         elif self.is_alive:
             receive(*arguments)
 
     def take(self, receive: Callable[..., object], *arguments: Any) -> None:
         """Deliver a datagram; a frozen machine queues at most ``MOST_WAITING``."""
-        if not self.is_still or len(self._arrived) < MOST_WAITING:
+        if not self.is_still or len(self._pending_input) < MOST_WAITING:
             self.heard(receive, *arguments)
 
     def freeze(self, is_suspended: bool = False) -> None:
         """Stop the process like SIGSTOP, or suspend the whole machine."""
         self.is_still = True
         if is_suspended and not self.COUNTS_SUSPENSION:
-            self._stopped_at = self._world.seconds()
+            self._stopped_at = self._clock.seconds()
 
     def thaw(self) -> None:
         """Continue, with everything that is overdue."""
         self.is_still = False
         if self._stopped_at is not None:
-            stopped = self._world.seconds() - self._stopped_at
+            stopped = self._clock.seconds() - self._stopped_at
             self._stopped_at = None
-            self._lost += stopped
-            self._since += stopped
+            self._suspended_s += stopped
+            self._base_time += stopped
         timers, self.timers = self.timers, []
-        arrived, self._arrived = self._arrived, []
+        arrived, self._pending_input = self._pending_input, []
         for call in timers:
             call.run()
         for receive, arguments in arrived:
@@ -176,7 +176,7 @@ class Machine:
         """Stop for ever."""
         self.is_alive = False
         self.timers.clear()
-        self._arrived.clear()
+        self._pending_input.clear()
 
 
 class MachineNetwork:

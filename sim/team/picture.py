@@ -23,11 +23,11 @@ def drawn(title: str, series: Series, faults: Sequence[tuple[float, str]] = ()) 
         parts.append(_diagram(x, y, name, points, end, faults))
     rows = math.ceil(len(shown) / COLUMNS)
     width, height = COLUMNS * (WIDE + LEFT + 20), TOP + max(1, rows) * (HIGH + GAP) + 10
-    said = escape("; ".join(f"{moment:g} s {what}" for moment, what in faults) or "no faults")
+    text = escape("; ".join(f"{moment:g} s {what}" for moment, what in faults) or "no faults")
     nothing = "" if shown else f'<text x="{LEFT}" y="{TOP + 20}">nothing was measured</text>'
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}" height="{height}" viewBox="0 0 {width} {height}" '
-        f'font-family="sans-serif" font-size="11" role="img">\n<title>{escape(title)}</title>\n<desc>{said}</desc>\n'
+        f'font-family="sans-serif" font-size="11" role="img">\n<title>{escape(title)}</title>\n<desc>{text}</desc>\n'
         f'<rect width="100%" height="100%" fill="white"/>\n<text x="{LEFT}" y="20" font-size="14" font-weight="bold">'
         f"{escape(title)}</text>\n{nothing}" + "\n".join(parts) + "\n</svg>\n"
     )

@@ -118,12 +118,12 @@ def packed(scenario: Scenario, outcome: Outcome, cost: Cost, line: str, series: 
         "wall_seconds": round(cost.wall, 3),
         "resident_bytes": cost.resident,
         "faults": [str(fault) for fault in scenario.faults],
-        "series": _jagged(series),
+        "series": _finite(series),
     }
     return json.dumps(content, indent=1, allow_nan=False) + "\n"
 
 
-def _jagged(series: Series) -> dict[str, Sequence[tuple[float, float | None]]]:
+def _finite(series: Series) -> dict[str, Sequence[tuple[float, float | None]]]:
     """Return ``series`` with None for values that are not finite, as JSON has none."""
     return {
         name: [(moment, value if abs(value) != float("inf") and value == value else None) for moment, value in points]
@@ -141,7 +141,7 @@ class Trace:
     def __init__(self, out: TextIO, most: int = MOST_LINES) -> None:
         self._out = out
         self._most = most
-        self._told = 0
+        self._count = 0
 
     def begin(self, **facts: object) -> None:
         """Write the parameters of the run."""
@@ -149,8 +149,8 @@ class Trace:
 
     def told(self, now: float, event: str, place: int, more: str) -> None:
         """Write one event: the time in seconds, its name, its place, and details."""
-        self._told += 1
-        if self._told > self._most:
+        self._count += 1
+        if self._count > self._most:
             return
         line: dict[str, object] = {"at": round(now, 6), "event": event}
         if place >= 0:
@@ -161,7 +161,7 @@ class Trace:
 
     def end(self, **facts: object) -> None:
         """Write the last line, with the number of omitted events."""
-        self._write({"end": True, "events": self._told, "left_out": max(0, self._told - self._most), **facts})
+        self._write({"end": True, "events": self._count, "left_out": max(0, self._count - self._most), **facts})
         self._out.flush()
 
     def _write(self, line: dict[str, object]) -> None:

@@ -105,15 +105,15 @@ class Run:
             (REPAIRING, self._repair),
             (ASKING, self._ask),
         )
-        logged = cast(ILogObserver, self._logged)
-        globalLogPublisher.addObserver(logged)
+        observer = cast(ILogObserver, self._on_log_event)
+        globalLogPublisher.addObserver(observer)
         try:
             for self.phase, work in phases:
                 work()
                 if self._is_ended:
                     return self.outcome()
         finally:
-            globalLogPublisher.removeObserver(logged)
+            globalLogPublisher.removeObserver(observer)
         self.phase = DONE
         return self.outcome()
 
@@ -129,7 +129,7 @@ class Run:
         figures = self.figures()
         violations = [
             *self.violations,
-            *self._unheld(figures),
+            *self._unmatched_targets(figures),
             *(line for _, workload in self.workloads for line in workload.verdict()),
             *check(team.history),
         ]
@@ -144,7 +144,7 @@ class Run:
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
-    def _logged(self, event: LogEvent) -> None:
+    def _on_log_event(self, event: LogEvent) -> None:
         """Record a failure that a node logged as a violation, as no client would notice it."""
         failure = event.get("log_failure")
         if failure is not None and len(self.violations) < MOST_VIOLATIONS:
@@ -155,8 +155,8 @@ class Run:
         team, within = self.team, self.scenario.join.within
         last = team.come()
         self.expected_end += last
-        self._pass(last)
-        self._pass(within, until=team.is_standing)
+        self._advance(last)
+        self._advance(within, until=team.is_standing)
         self.expected_end += team.clock.seconds() - last
         outside = len(team.living) - len(team.inside())
         if outside and not self._is_ended:
@@ -164,7 +164,7 @@ class Run:
 
     def _settle(self) -> None:
         self._grown()
-        self._pass(self.scenario.join.settle)
+        self._advance(self.scenario.join.settle)
 
     def _act(self) -> None:
         """Apply faults and sessions while the workloads run."""
@@ -176,27 +176,27 @@ class Run:
             if clock.seconds() >= began + scenario.lead - NONE:
                 for _, workload in self.workloads:
                     workload.step()
-            self._pass(min(scenario.step, end - clock.seconds()))
+            self._advance(min(scenario.step, end - clock.seconds()))
 
     def _repair(self) -> None:
         if self.scenario.repair:
             self._faults.end()
-        self._pass(self.scenario.repair)
+        self._advance(self.scenario.repair)
 
     def _ask(self) -> None:
         if self.scenario.repair:
             self.team.history.note(Settled)
         for _, workload in self.workloads:
             workload.settled()
-        self._pass(ASKED if self.workloads else 0.0)
+        self._advance(ASKED if self.workloads else 0.0)
 
-    def _unheld(self, figures: list[Figure]) -> list[str]:
+    def _unmatched_targets(self, figures: list[Figure]) -> list[str]:
         """Return the targets that match no figure."""
         names = [figure.name for figure in figures]
-        unheld = [] if self.phase != DONE else [name for name, _ in self.scenario.targets if name not in names]
-        return [f"targets: nothing measured {name!r}; there are {', '.join(names) or 'none'}" for name in unheld]
+        unmatched = [] if self.phase != DONE else [name for name, _ in self.scenario.targets if name not in names]
+        return [f"targets: nothing measured {name!r}; there are {', '.join(names) or 'none'}" for name in unmatched]
 
-    def _pass(self, seconds: float, until: Callable[[], bool] = lambda: False) -> None:
+    def _advance(self, seconds: float, until: Callable[[], bool] = lambda: False) -> None:
         """Let time pass in slices."""
         clock = self.team.clock
         end = clock.seconds() + seconds

@@ -245,7 +245,7 @@ class _Reader:
         """Return the scenario, with each value validated on its own."""
         own = [f.name for f in fields(Scenario) if f.name not in (*TABLES, "faults", "loads", "targets", "name")]
         known = [*own, *TABLES, "fault", "load", "targets"]
-        self._known(content, "", known)
+        self._require_known(content, "", known)
         parts: dict[str, Any] = {key: self._value(key, content[key]) for key in own if key in content}
         for key, value in changes.items():
             parts[key] = self._value(key, value, f"--{key}")
@@ -309,7 +309,7 @@ class _Reader:
         except Invalid as error:
             raise self.bad("", key, error.problem, error.remedy, shown) from error
 
-    def _known(self, content: Mapping[str, object], where: str, known: list[str]) -> None:
+    def _require_known(self, content: Mapping[str, object], where: str, known: list[str]) -> None:
         for key in content:
             if key not in known:
                 raise self.bad(where, key, "is an unknown key", remedy_of(key, known))

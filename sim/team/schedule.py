@@ -37,25 +37,25 @@ class Schedule:
         self.seed = seed
         self.trim = trim
         self.rng = random.Random(f"invariants/{seed}")
-        dice = random.Random(f"faults/{seed}")
-        self.n = dice.choice([3, 4, 5, 5, 6, 7, 9, 10, 11])
-        self.seconds = dice.choice([20.0, 30.0, 45.0])
+        generator = random.Random(f"faults/{seed}")
+        self.n = generator.choice([3, 4, 5, 5, 6, 7, 9, 10, 11])
+        self.seconds = generator.choice([20.0, 30.0, 45.0])
         self.fleet = world(self.n, seed, Weather(delay_s=0.002))
         self.history = self.fleet.history
-        self.liar: int | None = dice.randrange(self.n) if dice.random() < 0.2 else None
+        self.liar: int | None = generator.randrange(self.n) if generator.random() < 0.2 else None
         self.weather = Weather(
-            delay_s=dice.choice([0.001, 0.01, 0.05]),
-            jitter_s=dice.choice([0.0, 0.01]),
-            loss=dice.choice([0.0, 0.0, 0.05, 0.2]),
-            duplicate=dice.choice([0.0, 0.1]),
-            reorder=dice.choice([0.0, 0.2]),
+            delay_s=generator.choice([0.001, 0.01, 0.05]),
+            jitter_s=generator.choice([0.0, 0.01]),
+            loss=generator.choice([0.0, 0.0, 0.05, 0.2]),
+            duplicate=generator.choice([0.0, 0.1]),
+            reorder=generator.choice([0.0, 0.2]),
         )
-        self.faults = self._faults(dice)
+        self.faults = self._faults(generator)
         if trim.calm:
             self.weather = Weather(delay_s=self.weather.delay_s)
-        dice = random.Random(f"stranded/{seed}")
-        if dice.random() < STRANDED and self.n <= 7:
-            self.faults += self._stranded(dice)
+        generator = random.Random(f"stranded/{seed}")
+        if generator.random() < STRANDED and self.n <= 7:
+            self.faults += self._minority_faults(generator)
         self.seconds = trim.within(self.seconds)
         self.down: set[int] = set()
         """The places whose nodes will restart."""
@@ -80,7 +80,7 @@ class Schedule:
         timeline, now = Timeline(self.faults, self.trim), 0.0
         while now < self.seconds:
             for fault, is_end in timeline.due(now):
-                (self._end if is_end else self._begin)(fault)
+                (self._end_fault if is_end else self._start_fault)(fault)
             for workload in workloads:
                 workload.step()
             fleet.run(STEP)
@@ -106,37 +106,37 @@ class Schedule:
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
-    def _faults(self, dice: random.Random) -> list[TimedFault]:
+    def _faults(self, generator: random.Random) -> list[TimedFault]:
         places, faults = list(range(self.n)), []
         # Permanent failures never exceed a minority of the smallest replica set.
-        mortal = dice.sample(places, max(0, (min(self.n, 8) - 1) // 2))
-        for _ in range(dice.randrange(1, 6)):
-            at = dice.uniform(0.0, self.seconds * 0.8)
-            until = at + dice.choice([0.5, 2.0, 8.0, 20.0])
-            kind = dice.choice(["cut", "cut", "one way", "kill", "kill", "kill all", "die"])
+        mortal = generator.sample(places, max(0, (min(self.n, 8) - 1) // 2))
+        for _ in range(generator.randrange(1, 6)):
+            at = generator.uniform(0.0, self.seconds * 0.8)
+            until = at + generator.choice([0.5, 2.0, 8.0, 20.0])
+            kind = generator.choice(["cut", "cut", "one way", "kill", "kill", "kill all", "die"])
             if kind == "cut":
-                chosen = dice.sample(places, dice.randrange(1, self.n))
+                chosen = generator.sample(places, generator.randrange(1, self.n))
             elif kind == "one way":
-                chosen = dice.sample(places, 2)
+                chosen = generator.sample(places, 2)
             elif kind == "kill":
-                chosen = dice.sample(places, dice.randrange(1, 1 + self.n // 2))
+                chosen = generator.sample(places, generator.randrange(1, 1 + self.n // 2))
             elif kind == "kill all":
-                chosen = places if dice.random() < 0.3 else places[:1]
+                chosen = places if generator.random() < 0.3 else places[:1]
             else:
-                chosen = [mortal.pop()] if mortal and dice.random() < 0.5 else []
+                chosen = [mortal.pop()] if mortal and generator.random() < 0.5 else []
             faults.append(TimedFault(at, until, kind, tuple(chosen)))
         return faults
 
-    def _stranded(self, dice: random.Random) -> list[TimedFault]:
+    def _minority_faults(self, generator: random.Random) -> list[TimedFault]:
         """Cut off a minority, which newcomers join until they are a majority together."""
-        few = dice.sample(range(self.n), (self.n - 1) // 2)
+        few = generator.sample(range(self.n), (self.n - 1) // 2)
         newcomers = range(self.n, 2 * self.n - 2 * len(few) + 1)
-        at = dice.uniform(2.0, self.seconds * 0.5)
-        faults = [TimedFault(at, at + dice.choice([8.0, 15.0]), "cut", (*few, *newcomers))]
-        first = at + dice.choice([0.5, 2.0, 5.0])
+        at = generator.uniform(2.0, self.seconds * 0.5)
+        faults = [TimedFault(at, at + generator.choice([8.0, 15.0]), "cut", (*few, *newcomers))]
+        first = at + generator.choice([0.5, 2.0, 5.0])
         return faults + [TimedFault(first + n, first + n, "join", (place, *few)) for n, place in enumerate(newcomers)]
 
-    def _begin(self, fault: TimedFault) -> None:
+    def _start_fault(self, fault: TimedFault) -> None:
         board = self.fleet.board
         if fault.kind == "join":
             known: Sequence[int] = fault.places[1:]
@@ -156,7 +156,7 @@ class Schedule:
                         self.down.add(place)
                     self.fleet.kill(place)
 
-    def _end(self, fault: TimedFault) -> None:
+    def _end_fault(self, fault: TimedFault) -> None:
         if fault.kind in ("cut", "one way"):
             self.fleet.board.heal()
         elif fault.kind not in ("die", "join"):

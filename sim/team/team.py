@@ -71,7 +71,7 @@ class Team(World):
         self.board.link = self.link
         self.told: list[Told] = []
         self._places: list[Place] = []
-        self._dice = self.generator("team")
+        self._rng = self.generator("team")
         self._inside: list[int] = []
         self._inside_at: dict[int, int] = {}
         self._hash = hashlib.blake2b(digest_size=32)
@@ -182,8 +182,8 @@ class Team(World):
         if self.life[place]:
             here.store = next_life(here.store, self._store(place), self.clock.seconds())
         here.entered = []
-        through = [self.address(other) for other in (self._known(place) if known is None else known)]
-        node = self._made(place, here, through)
+        through = [self.address(other) for other in (self._draw_known(place) if known is None else known)]
+        node = self._make_node(place, here, through)
         self.tell("born", place, here.identity.node_id.hex())
         self.begin_life(place, node, here.identity)
         life = self.life[place]
@@ -193,7 +193,7 @@ class Team(World):
         else:
             node.start()
             joined = node.join(through)
-        joined.addCallback(lambda _: self._is_in(place, life))
+        joined.addCallback(lambda _: self._on_joined(place, life))
         # The node may be killed before it has joined.
         joined.addErrback(lambda failure: failure.trap(NotRunning))
         joined.addErrback(lambda failure: self._log.failure("joining failed", failure))
@@ -207,7 +207,7 @@ class Team(World):
 
     def kill(self, place: int) -> None:
         """Kill a node like a loss of power; its disk stays as it is."""
-        node = self._ends(place, "killed")
+        node = self._end_node(place, "killed")
         here = self._places[place]
         if here.machine is not None:
             here.machine.die()
@@ -221,7 +221,7 @@ class Team(World):
         if machine is not None and machine.is_still:
             self.kill(place)
             return
-        node = self._ends(place, "left")
+        node = self._end_node(place, "left")
         if isinstance(node, SwarmNode):
             node.stopService()
         else:
@@ -257,15 +257,15 @@ class Team(World):
         place = len(self._places)
         address = Address(f"10.{place >> 16}.{place >> 8 & 255}.{place & 255}", PORT)
         here = Place(address, self._identity(place, 0), self._store(place))
-        scenario, dice = self.scenario, self.generator(f"place/{place}")
+        scenario, place_rng = self.scenario, self.generator(f"place/{place}")
         if scenario.clocks.drift:
-            here.rate = 1 + dice.uniform(-1, 1) * scenario.clocks.drift
+            here.rate = 1 + place_rng.uniform(-1, 1) * scenario.clocks.drift
         if scenario.clocks.wall:
-            here.step = dice.uniform(-1, 1) * scenario.clocks.wall
+            here.step = place_rng.uniform(-1, 1) * scenario.clocks.wall
         nat = scenario.nat
-        if nat.share and place >= scenario.join.known and dice.random() < nat.share:
+        if nat.share and place >= scenario.join.known and place_rng.random() < nat.share:
             kind: Any = nat.kinds[place % len(nat.kinds)]
-            here.home = self.board.router(Nat(kind, f"100.{place >> 16}.{place >> 8 & 255}.{place & 255}", dice))
+            here.home = self.board.router(Nat(kind, f"100.{place >> 16}.{place >> 8 & 255}.{place & 255}", place_rng))
         self._places.append(here)
         return place
 
@@ -273,9 +273,9 @@ class Team(World):
         return Identity(self.generator(f"identity/{place}/{lives}").randbytes(32))
 
     def _store(self, place: int) -> Memory:
-        return Disk(self.clock, self._dice) if self.scenario.has_disks else Memory()
+        return Disk(self.clock, self._rng) if self.scenario.has_disks else Memory()
 
-    def _made(self, place: int, here: Place, known: Sequence[Address]) -> Node:
+    def _make_node(self, place: int, here: Place, known: Sequence[Address]) -> Node:
         port = self.board.network(*here.address, here.home, here.traffic)
         network: Network = port
         clock: IReactorTime = self.clock
@@ -293,16 +293,16 @@ class Team(World):
         device = Device("", f"dog{place}", capabilities=CAPABILITIES)
         return SwarmNode(device, here.identity, TEAM, known, network, here.store, clock, rng, wall, lease)
 
-    def _known(self, place: int) -> list[int]:
+    def _draw_known(self, place: int) -> list[int]:
         """Return the places that a new node knows: some that have joined, or the first one."""
         others = self._inside if self._inside else [other for other in list(self.living)[:1] if other != place]
         count = min(self.scenario.join.known, len(others))
         if self.scenario.nat.share:  # nodes behind a router cannot be reached without an introduction
             others = [other for other in others if self._places[other].home is None]
             count = min(count, len(others))
-        return self._dice.sample(others, count)
+        return self._rng.sample(others, count)
 
-    def _is_in(self, place: int, life: int) -> None:
+    def _on_joined(self, place: int, life: int) -> None:
         here = self._places[place]
         if self.life[place] != life or place not in self.living or here.entered is None:
             return
@@ -313,7 +313,7 @@ class Team(World):
         for done in waiting:
             done.callback(True)
 
-    def _ends(self, place: int, how: str) -> Node:
+    def _end_node(self, place: int, how: str) -> Node:
         node: Node = self.end_life(place)
         at = self._inside_at.pop(place, None)
         if at is not None:

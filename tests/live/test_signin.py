@@ -84,7 +84,7 @@ class SigningInTests(PageCase):
     def invitation(self, page: Any) -> str:
         page.get_by_role("button", name="Invite").click()
         page.locator("#i-kind").select_option("viewer")
-        page.locator("#invite", has_text="may look").wait_for()
+        page.locator("#invite", has_text="to view the team").wait_for()
         link = str(page.locator("#i-link").input_value())
         page.get_by_role("button", name="Close").click()
         page.locator("#invite").wait_for(state="detached")

@@ -47,7 +47,7 @@ class _Space:
 
 def t1(events: Iterable[Event]) -> Iterator[str]:
     """One taker: no tuple is confirmed to two takers, neither by two majorities nor in answers to clients."""
-    space, told = _Space(), defaultdict[Hashable, list[str]](list)
+    space, confirmed = _Space(), defaultdict[Hashable, list[str]](list)
     taking: dict[int, Asked] = {}
     for event in events:
         space.read(event)
@@ -56,11 +56,11 @@ def t1(events: Iterable[Event]) -> Iterator[str]:
                 taking[number] = event
             case Answered(at, number, tuple() as taken) if number in taking:
                 for fields in taken:
-                    told[fields].append(f"node {taking[number].client} at {at:.1f}")
+                    confirmed[fields].append(f"node {taking[number].client} at {at:.1f}")
     for mark, posted in space.posted.items():
         if len(space.takers(mark)) > 1:
             yield f"{posted.fields} was accepted for two"
-    for fields, ways in told.items():
+    for fields, ways in confirmed.items():
         if len(ways) > 1:
             yield f"{fields} was confirmed to {' and '.join(ways)}"
 
@@ -108,7 +108,7 @@ def t3(events: Iterable[Event]) -> Iterator[str]:
     """Finality: a confirmed take is visible in every survey that starts later."""
     space = _Space()
     asked: dict[int, Asked] = {}
-    told: dict[Hashable, str] = {}
+    confirmed: dict[Hashable, str] = {}
     over: dict[int, dict[Hashable, str]] = {}
     for event in events:
         space.read(event)
@@ -116,12 +116,12 @@ def t3(events: Iterable[Event]) -> Iterator[str]:
             case Asked(_, number, _, what):
                 asked[number] = event
                 if what == SURVEY:
-                    over[number] = dict(told)
+                    over[number] = dict(confirmed)
             case Answered(at, number, tuple() as result) if number in asked:
                 client = asked[number].client
                 if asked[number].what == TAKE:
                     for fields in result:
-                        told.setdefault(fields, f"node {client} at {at:.1f}")
+                        confirmed.setdefault(fields, f"node {client} at {at:.1f}")
                 elif asked[number].what == SURVEY:
                     before, known = over.pop(number), {posted.fields: posted for posted in space.posted.values()}
                     for fields in result:
@@ -133,8 +133,8 @@ def t4(events: Iterable[Event]) -> Iterator[str]:
     """Same answer: a member that accepted the decided value repeats it whenever it is asked."""
     for event in events:
         if isinstance(event, Repeated) and event.said != event.taker:
-            said = event.said.hex()[:6] if event.said else event.said
-            yield f"a member changed its answer about {event.fields}: {said}"
+            value = event.said.hex()[:6] if event.said else event.said
+            yield f"a member changed its answer about {event.fields}: {value}"
 
 
 def t5(events: Iterable[Event]) -> Iterator[str]:

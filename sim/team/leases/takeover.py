@@ -21,9 +21,9 @@ NEVER = 1e12
 
 def standing(seed: int, loss: float, ttl: float, stand_bys: int = 2) -> LeaseTeam:
     """Return a team of three council members and of agents, the first of which holds the lease."""
-    dice = random.Random(f"takeover/{seed}")
+    rng = random.Random(f"takeover/{seed}")
     agents = 1 + stand_bys
-    rates = [1.0 + dice.uniform(-DRIFT, DRIFT) for _ in range(agents + 3)]
+    rates = [1.0 + rng.uniform(-DRIFT, DRIFT) for _ in range(agents + 3)]
     team = LeaseTeam(f"takeover/{seed}", rates, agents, ttl, tick=NEVER)
     team.radio.air = Air(DELAY, JITTER, loss)
     team.add_task(TASK, range(agents, agents + 3))
@@ -33,7 +33,7 @@ def standing(seed: int, loss: float, ttl: float, stand_bys: int = 2) -> LeaseTea
         team.clock.advance(0.05)
     for rank in range(1, agents):
         team.bidders[rank].lessee(TASK).stand_by(rank)
-    team.clock.advance(ttl + dice.uniform(0.0, ttl))
+    team.clock.advance(ttl + rng.uniform(0.0, ttl))
     return team
 
 

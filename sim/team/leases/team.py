@@ -97,11 +97,11 @@ class Bidder:
                 now = self.machine.seconds()
                 permit = Permit(lease.token, lease.deadline)
                 # As in a driver: the device's last known time, and the remaining duration of the lease.
-                told = self.world.clock.seconds() - self._rng.random() * 0.02
-                self.machine.callLater(ACT, self._act, task_id, permit, told, lease.deadline - now)
+                device_time = self.world.clock.seconds() - self._rng.random() * 0.02
+                self.machine.callLater(ACT, self._act, task_id, permit, device_time, lease.deadline - now)
         self.machine.callLater(self.world.tick, self._tick)
 
-    def _act(self, task_id: str, permit: Permit, told: float, remaining: float) -> None:
+    def _act(self, task_id: str, permit: Permit, device_time: float, remaining: float) -> None:
         lessee = self.lessees[task_id]
         gate = self._gates[task_id]
         try:
@@ -111,7 +111,7 @@ class Bidder:
         if lessee.lease is None and not lessee.token:
             return  # the lease was released meanwhile
         self.world.referee.on_issue(self, task_id, permit)
-        self.world.clock.callLater(WIRE, self.world.referee.on_command, self, task_id, permit, told, remaining)
+        self.world.clock.callLater(WIRE, self.world.referee.on_command, self, task_id, permit, device_time, remaining)
 
     # -- the wire ---------------------------------------------------------------------------------------------------
 
@@ -179,9 +179,9 @@ class Referee:
         lease = bidder.lessees[task_id].lease
         if lease is None:
             return
-        mine = (task_id, bidder.place)
-        is_new = self._won.get(mine) != (lease.token, id(bidder))
-        self._won[mine] = lease.token, id(bidder)
+        key = (task_id, bidder.place)
+        is_new = self._won.get(key) != (lease.token, id(bidder))
+        self._won[key] = lease.token, id(bidder)
         others = [other.place for other in self._world.bidders if other is not bidder and other.holds(task_id)]
         self.history.note(Held, task_id, bidder.place, tuple(others))
         if is_new:
@@ -193,10 +193,10 @@ class Referee:
         truly = bidder.machine.unstopped_at(permit.deadline)
         self.history.note(Issued, task_id, bidder.place, bidder.machine.at(permit.deadline), truly)
 
-    def on_command(self, bidder: Bidder, task_id: str, permit: Permit, told: float, remaining: float) -> None:
+    def on_command(self, bidder: Bidder, task_id: str, permit: Permit, device_time: float, remaining: float) -> None:
         """Let the device, which all agents share, accept or refuse a command."""
         now, gate = self._world.clock.seconds(), self.gates[task_id]
-        deadline = min(told, now) + remaining
+        deadline = min(device_time, now) + remaining
         truly, is_accepted = bidder.machine.unstopped_at(permit.deadline), True
         try:
             gate.admit(Permit(permit.token, deadline), now)
@@ -225,10 +225,10 @@ class Referee:
             places = [self._world.place_of(member) for member in charter.members]
             for agent in self._world.agents:
                 near = [p for p in places if not {(agent, p), (p, agent)} & self._world.radio.cut]
-                is_reached, mine = len(near) >= majority(len(places)), (task_id, agent)
-                if is_reached == (mine in self._is_cut):
-                    self._is_cut ^= {mine}
-                    self.history.note(Reached, *mine, is_reached)
+                is_reached, key = len(near) >= majority(len(places)), (task_id, agent)
+                if is_reached == (key in self._is_cut):
+                    self._is_cut ^= {key}
+                    self.history.note(Reached, *key, is_reached)
 
 
 class _Call(bytes):

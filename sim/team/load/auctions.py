@@ -61,14 +61,14 @@ class Auctions(Load):
         """Evaluate an auction at its end, and start the next one."""
         now = self._clock.seconds()
         if now >= self._next_at:
-            self._end()
+            self._evaluate_auction()
             if self._begun < self._settings.count:
-                self._begin()
+                self._start_auction()
             self._next_at = now + self._settings.every
 
     def settled(self) -> None:
         """Evaluate the last auction."""
-        self._end()
+        self._evaluate_auction()
 
     def verdict(self) -> list[str]:
         """Return the auctions that could not start."""
@@ -89,18 +89,18 @@ class Auctions(Load):
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
-    def _begin(self) -> None:
+    def _start_auction(self) -> None:
         self._begun += 1
         self._before = {deputy.place: _counts(deputy) for deputy in self._deputies.present()}
         task = Task(f"auction {self._begun}", "none", "nothing", waiting_period=self._settings.waiting)
-        dice = self._team.generator(f"auction/{self._begun}")
+        rng = self._team.generator(f"auction/{self._begun}")
         places = self._residents.places()
-        dice.shuffle(places)  # the first one requests the council
-        contest = Contest(task, self._deputies, places, self._clock, dice, self._settings.spread)
+        rng.shuffle(places)  # the first one requests the council
+        contest = Contest(task, self._deputies, places, self._clock, rng, self._settings.spread)
         self._contest = contest
         Deferred.fromCoroutine(contest.begin())
 
-    def _end(self) -> None:
+    def _evaluate_auction(self) -> None:
         contest, self._contest = self._contest, None
         if contest is None:
             return
@@ -108,19 +108,19 @@ class Auctions(Load):
             self.trouble.append(f"{contest.task.task_id} did not begin: {contest.trouble}")
             return
         present, best = contest.present(), contest.best()
-        passed = [self._passed(deputy) for deputy in self._deputies.present()]
+        traffic = [self._traffic_since_start(deputy) for deputy in self._deputies.present()]
         n = max(1, len(present))
-        self.messages.append(sum(sent for sent, _, _ in passed) / n)
-        self.busiest.append(max((handled for _, handled, _ in passed), default=0))
-        self.bytes.append(sum(volume for _, _, volume in passed) / n)
+        self.messages.append(sum(sent for sent, _, _ in traffic) / n)
+        self.busiest.append(max((handled for _, handled, _ in traffic), default=0))
+        self.bytes.append(sum(volume for _, _, volume in traffic) / n)
         right = [bidder for bidder in present if bidder.assigned == best]
-        took = [max(0.0, bidder.changed_at - contest.over_at) for bidder in right]
+        delays = [max(0.0, bidder.changed_at - contest.over_at) for bidder in right]
         self.right.append(len(right) / n)
-        self.agreed += took
-        self.last.append(max(took) if len(right) == len(present) and took else math.inf)
+        self.agreed += delays
+        self.last.append(max(delays) if len(right) == len(present) and delays else math.inf)
         contest.end()
 
-    def _passed(self, deputy: Deputy) -> tuple[int, int, int]:
+    def _traffic_since_start(self, deputy: Deputy) -> tuple[int, int, int]:
         """Return a node's datagrams sent and handled since the auction started, and its bytes of requests."""
         sent, handled, volume = self._before.get(deputy.place, (0, 0, 0))
         now_sent, now_handled, now_volume = _counts(deputy)

@@ -114,17 +114,17 @@ class Contest:
         if not self._deputies.lives(bidder.deputy):
             return
         self.began_at = min(self.began_at, self._clock.seconds())
-        bidder.bidding = bidder.deputy.bidding(auction, lambda reports: self._heard(bidder, reports))
+        bidder.bidding = bidder.deputy.bidding(auction, lambda reports: self._on_reports(bidder, reports))
         bidder.bidding.report(Report(bidder.deputy.uuid, bidder.cost))
 
-    def _heard(self, bidder: Bidder, reports: tuple[Report, ...]) -> None:
+    def _on_reports(self, bidder: Bidder, reports: tuple[Report, ...]) -> None:
         consensus = _NEAREST.find(reports)
         if consensus.assigned_agent != bidder.assigned:
             bidder.assigned, bidder.changed_at = consensus.assigned_agent, self._clock.seconds()
         if self._claims:
-            self._line_up(bidder, (consensus.assigned_agent, *consensus.standby))
+            self._claim_or_wait(bidder, (consensus.assigned_agent, *consensus.standby))
 
-    def _line_up(self, bidder: Bidder, order: Sequence[str | None]) -> None:
+    def _claim_or_wait(self, bidder: Bidder, order: Sequence[str | None]) -> None:
         uuid = bidder.deputy.uuid
         rank = order.index(uuid) if uuid in order else HEIRS + 1
         if rank > HEIRS:
@@ -132,7 +132,7 @@ class Contest:
                 bidder.lessee.release()
             return
         if bidder.lessee is None:
-            bidder.lessee = bidder.deputy.lessee(self.task, lambda: self._changed(bidder))
+            bidder.lessee = bidder.deputy.lessee(self.task, lambda: self._on_lease_change(bidder))
         if rank == 0:
             bidder.lessee.want()
         elif bidder.lessee.lease is not None:
@@ -140,7 +140,7 @@ class Contest:
         else:
             bidder.lessee.stand_by(rank)
 
-    def _changed(self, bidder: Bidder) -> None:
+    def _on_lease_change(self, bidder: Bidder) -> None:
         if bidder.lessee is None or bidder.lessee.lease is None:
             return
         others = [one for one in self.holders() if one is not bidder]

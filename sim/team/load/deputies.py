@@ -192,7 +192,7 @@ class Deputies:
         self._rng = team.generator
         self._present: dict[int, Deputy] = {}
         self._lives = 0
-        team.attend(self._born, self._died)
+        team.attend(self._on_birth, self._on_death)
 
     def of(self, place: int) -> Deputy | None:
         """Return the deputy of a place; None if its node does not live."""
@@ -206,12 +206,12 @@ class Deputies:
         """Return whether the deputy's node still lives."""
         return self._present.get(deputy.place) is deputy
 
-    def _born(self, place: int, node: Node) -> None:
+    def _on_birth(self, place: int, node: Node) -> None:
         self._lives += 1
         dice = self._rng(f"rooms/{place}/{self._lives}")
         self._present[place] = Deputy(place, node, self._clock, dice)
 
-    def _died(self, place: int, node: Node) -> None:
+    def _on_death(self, place: int, node: Node) -> None:
         deputy = self._present.get(place)
         if deputy is not None and deputy.node is node:
             del self._present[place]

@@ -78,15 +78,15 @@ class Lookups(Load):
 
     def step(self) -> None:
         """Start the lookups that are due."""
-        self._drop_late()
+        self._count_late()
         for _ in range(self._pace.due()):
             pair = self._residents.any(self._rng, 2)
             if len(pair) == 2:
-                self._look(*pair)
+                self._start_lookup(*pair)
 
     def settled(self) -> None:
         """Look up random keys, with exact results required."""
-        self._drop_late()
+        self._count_late()
         self._is_settled = True
         for _ in range(self._settings.exact if len(self._residents) > 1 else 0):
             place = self._residents.any(self._rng)[0]
@@ -102,7 +102,7 @@ class Lookups(Load):
 
     def figures(self) -> list[Figure]:
         """Return success, exactness, hops, requests and times."""
-        self._drop_late()
+        self._count_late()
         n = self.found + self.missed + self.late
         # Two hops at least: the first names the target, and the second confirms that it is alive.
         most = max(2.0, math.log2(max(2, len(self._residents))) / 2)
@@ -123,7 +123,7 @@ class Lookups(Load):
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
-    def _look(self, place: int, other: int) -> None:
+    def _start_lookup(self, place: int, other: int) -> None:
         life, sought = self._residents.node(place), self._residents.node(other)
         self._begun += 1
         number = self._begun
@@ -160,7 +160,7 @@ class Lookups(Load):
             else:
                 self.missed += 1
 
-    def _drop_late(self) -> None:
+    def _count_late(self) -> None:
         since = self._clock.seconds() - self._settings.limit
         while self._open:
             number, trial = next(iter(self._open.items()))

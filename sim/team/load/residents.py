@@ -114,9 +114,9 @@ class Residents:
         """Return whether ``life`` still lives; a node that returned to its place is another life."""
         return self._lives.get(place) is life
 
-    def any(self, dice: random.Random, count: int = 1) -> list[int]:
+    def any(self, rng: random.Random, count: int = 1) -> list[int]:
         """Return ``count`` different random places, or all if there are fewer."""
-        return dice.sample(self._order, min(count, len(self._order)))
+        return rng.sample(self._order, min(count, len(self._order)))
 
     def places(self) -> list[int]:
         """Return all places."""

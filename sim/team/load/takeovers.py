@@ -102,10 +102,10 @@ class Takeovers(Load):
         task = Task(f"takeover {self._begun}", "none", "nothing", lease_ttl=self._settings.ttl)
         trial = Trial(task, agents)
         self._busy.update(agent.place for agent in agents)
-        Deferred.fromCoroutine(self._stand(trial))
+        Deferred.fromCoroutine(self._prepare(trial))
         return True
 
-    async def _stand(self, trial: Trial) -> None:
+    async def _prepare(self, trial: Trial) -> None:
         """Let the first agent hold the lease and the others be standbys, then schedule the holder's death."""
         try:
             trial.task = await trial.agents[0].pinned(trial.task)
@@ -114,7 +114,7 @@ class Takeovers(Load):
             self.unheld += 1
             return
         for agent in trial.agents:
-            trial.lessees.append(agent.lessee(trial.task, lambda: self._changed(trial)))
+            trial.lessees.append(agent.lessee(trial.task, lambda: self._on_lease_change(trial)))
         for rank, lessee in enumerate(trial.lessees):
             if rank:
                 lessee.stand_by(rank)
@@ -134,9 +134,9 @@ class Takeovers(Load):
         there = sum(member.node_id in self._residents.census for member in trial.task.council)
         trial.has_quorum = 2 * there > len(trial.task.council)
         self._clock.callLater(self._settings.away, self._return, trial.gone.place)
-        self._clock.callLater(PATIENCE, self._too_late, trial)
+        self._clock.callLater(PATIENCE, self._give_up, trial)
 
-    def _changed(self, trial: Trial) -> None:
+    def _on_lease_change(self, trial: Trial) -> None:
         held = [
             lessee
             for agent, lessee in zip(trial.agents, trial.lessees, strict=False)
@@ -151,7 +151,7 @@ class Takeovers(Load):
             trial.died_at = math.inf
             self._clock.callLater(self._settings.ttl, self._end, trial)
 
-    def _too_late(self, trial: Trial) -> None:
+    def _give_up(self, trial: Trial) -> None:
         if trial.died_at == math.inf:
             return
         trial.died_at = math.inf

@@ -95,7 +95,7 @@ class Values(Load):
         self.holders: list[float] = []
         self.copies: list[float] = []
         self.kills = self.read = self.lost = self.missing = self.unread = 0
-        self._found: list[str] = []
+        self._violations: list[str] = []
 
     def step(self) -> None:
         """Store the values that are due."""
@@ -113,7 +113,7 @@ class Values(Load):
 
     def verdict(self) -> list[str]:
         """Return lost values and wrong "not found" answers; with "none" the faults may exceed the tolerance."""
-        return self._found if self._settings.deaths == QUORUM else []
+        return self._violations if self._settings.deaths == QUORUM else []
 
     def figures(self) -> list[Figure]:
         """Return durability, times, and the share of holders that a reader finds."""
@@ -159,7 +159,7 @@ class Values(Load):
         else:
             self._waiting.append(value)
 
-    def _held_by(self, value: Value) -> list[int]:
+    def _holder_places(self, value: Value) -> list[int]:
         """Return the places of living nodes that hold the value."""
         holders = []
         for place in self._residents.places():
@@ -170,7 +170,7 @@ class Values(Load):
 
     def _kill(self, value: Value) -> None:
         """Kill as many of the nodes that acknowledged the value as it must survive."""
-        held = self._held_by(value)
+        held = self._holder_places(value)
         dying = self._rng.sample(held, min(value.acknowledged - 1, len(held) - 1)) if held else []
         for place in dying:
             self.kills += 1
@@ -185,13 +185,13 @@ class Values(Load):
 
     def _count_holders(self, value: Value) -> None:
         """Let a random node look up the holders, and count those that it finds."""
-        held = [self._residents.node(place) for place in self._held_by(value)]
+        held = [self._residents.node(place) for place in self._holder_places(value)]
         life = self._reader()
         if life is None or not held:
             return
         self.copies.append(float(len(held)))
         ids = sorted((one.identity.node_id for one in held), key=lambda id_: distance(id_, value.key))[:K]
-        life.find_node(value.key).addCallbacks(self._counted, _weather, (ids, life))
+        life.find_node(value.key).addCallbacks(self._counted, _ignore_failure, (ids, life))
 
     def _counted(self, contacts: list[Contact], ids: list[bytes], reader: EntangledNode) -> None:
         seen = {contact.node_id for contact in contacts} | {node_id(reader.identity.public)}
@@ -204,7 +204,7 @@ class Values(Load):
             self.unread += 1
         life = self._reader()
         if life is None:
-            self._go_on(value)
+            self._retry_or_give_up(value)
             return
         life.get(value.key).addCallbacks(self._answered, self._unavailable, (value, now), {}, (value,))
 
@@ -222,26 +222,26 @@ class Values(Load):
             self.unread -= 1
             return
         self.missing += 1
-        self._say(f"D1: value {value.number}, acknowledged by {value.acknowledged}, is reported as not found")
-        self._go_on(value)
+        self._add_violation(f"D1: value {value.number}, acknowledged by {value.acknowledged}, is reported as not found")
+        self._retry_or_give_up(value)
 
     def _unavailable(self, failure: Failure, value: Value) -> None:
         failure.trap(EntangledError)
-        self._go_on(value)
+        self._retry_or_give_up(value)
 
-    def _go_on(self, value: Value) -> None:
+    def _retry_or_give_up(self, value: Value) -> None:
         if self._clock.seconds() - value.asked_since < self._settings.patience:
             self._clock.callLater(AGAIN, self._read, value)
             return
         self.lost += 1
         self.unread -= 1
         after = f"after {value.killed} of {value.acknowledged} that acknowledged it died"
-        self._say(f"D1: value {value.number} is lost {after}")
+        self._add_violation(f"D1: value {value.number} is lost {after}")
 
-    def _say(self, line: str) -> None:
-        if len(self._found) < LISTED:
-            self._found.append(line)
+    def _add_violation(self, line: str) -> None:
+        if len(self._violations) < LISTED:
+            self._violations.append(line)
 
 
-def _weather(failure: Failure) -> None:
+def _ignore_failure(failure: Failure) -> None:
     failure.trap(EntangledError)

@@ -107,32 +107,32 @@ class Survey:
     def run(self) -> Sized:
         """Measure all figures; raises ``Ended``."""
         began, sized = time.process_time(), self._sized
-        hashes = [self._far(), self._near()]
+        hashes = [self._measure_lookups(), self._measure_auctions()]
         if self._nodes <= self._settings.swarm_most:
-            hashes.append(self._whole())
+            hashes.append(self._measure_directory())
         sized.hash = hashlib.blake2s("".join(hashes).encode(), digest_size=16).hexdigest()
         sized.cpu = time.process_time() - began
         return sized
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
-    def _far(self) -> str:
+    def _measure_lookups(self) -> str:
         """Measure cost and lookups, with bare nodes on internet links."""
         team = Team(self._scenario, self._settings.seed)
         cost = Traffic(team, TrafficSettings())
         deputies_of(team)  # the services for bids need memory too
         asking = Lookups(team, LookupSettings(rate=self._settings.rate, exact=self._settings.exact))
         self._say("nodes join")
-        self._stand(team)
+        self._form_team(team)
         self._say("nodes in quiet")
-        self._play(team, cost, self._settings.quiet)
+        self._run_workload(team, cost, self._settings.quiet)
         self._sized.figures += cost.figures()
         self._say("nodes look up each other")
-        self._play(team, asking, self._settings.lookups)
+        self._run_workload(team, asking, self._settings.lookups)
         self._finish(team, asking)
         return team.digest()  # without graceful leaves, which would take longer than all lookups
 
-    def _near(self) -> str:
+    def _measure_auctions(self) -> str:
         """Measure auctions and takeovers, with bare nodes and the services for bids."""
         nodes, settings = self._nodes, self._settings
         team = Team(self._scenario, settings.seed)
@@ -142,47 +142,47 @@ class Survey:
         rate = min(5.0, max(0.12, nodes / 200))
         dying = Takeovers(team, TakeoverSettings(count=settings.takeovers, rate=rate, away=AWAY))
         self._say("nodes join for a task")
-        self._stand(team)
+        self._form_team(team)
         self._say("nodes bid")
-        self._play(team, bidding, 4.0 * settings.auctions + STEP)
+        self._run_workload(team, bidding, 4.0 * settings.auctions + STEP)
         self._finish(team, bidding)
         self._say(f"nodes, {settings.takeovers} lease holders are killed")
-        self._play(team, dying, settings.takeovers / rate + 15.0)
+        self._run_workload(team, dying, settings.takeovers / rate + 15.0)
         self._finish(team, dying)
         return team.digest()
 
-    def _whole(self) -> str:
+    def _measure_directory(self) -> str:
         """Measure the directory, with device nodes."""
         scenario = replace(self._scenario, kind="swarm", link=LinkSettings("wifi"))
         team = Team(scenario, self._settings.seed)
         listing = Directory(team, DirectorySettings())
         self._say("devices announce themselves")
-        self._stand(team)
-        self._play(team, listing, 16.0)
+        self._form_team(team)
+        self._run_workload(team, listing, 16.0)
         self._finish(team, listing)
         return team.digest()
 
-    def _stand(self, team: Team) -> None:
-        self._pass(team, team.come())
-        self._pass(team, self._scenario.join.within, team.is_standing)
+    def _form_team(self, team: Team) -> None:
+        self._advance(team, team.come())
+        self._advance(team, self._scenario.join.within, team.is_standing)
         if not team.is_standing():
             self._sized.violations.append(f"join: {len(team.living) - len(team.inside())} nodes have not joined")
-        self._pass(team, self._scenario.join.settle)
+        self._advance(team, self._scenario.join.settle)
 
-    def _play(self, team: Team, workload: Workload, seconds: float) -> None:
+    def _run_workload(self, team: Team, workload: Workload, seconds: float) -> None:
         end = team.clock.seconds() + seconds
         while team.clock.seconds() < end - 1e-9:
             workload.step()
-            self._pass(team, STEP)
+            self._advance(team, STEP)
         workload.step()
 
     def _finish(self, team: Team, workload: Workload) -> None:
         workload.settled()
-        self._pass(team, 5.0)
+        self._advance(team, 5.0)
         self._sized.figures += workload.figures()
         self._sized.violations += workload.verdict()
 
-    def _pass(self, team: Team, seconds: float, until: Callable[[], bool] = lambda: False) -> None:
+    def _advance(self, team: Team, seconds: float, until: Callable[[], bool] = lambda: False) -> None:
         end = team.clock.seconds() + seconds
         while team.clock.seconds() < end - 1e-9 and not until():
             team.run(min(SLICE, end - team.clock.seconds()))

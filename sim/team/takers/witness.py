@@ -34,40 +34,42 @@ class Witness:
 
     def stored(self, record: Record) -> None:
         """Record a tuple that a replica holds."""
-        said = posting(record)
-        if isinstance(said, Posted):
-            if said.place not in self.posted:
-                seats = [(member.contact.public, member.incarnation) for member in said.council]
-                self._history.note(event.Posted, said.place, said.fields, *map(tuple, zip(*seats, strict=True)))
-            self.posted[said.place] = said
+        content = posting(record)
+        if isinstance(content, Posted):
+            if content.place not in self.posted:
+                seats = [(member.contact.public, member.incarnation) for member in content.council]
+                self._history.note(event.Posted, content.place, content.fields, *map(tuple, zip(*seats, strict=True)))
+            self.posted[content.place] = content
 
     def attend(self, seat: Seat, expose: Callable[..., object], member: bytes) -> None:
         """Wrap the answers of the council member ``member`` to record the takes that it accepts."""
         confirm: Callable[..., Any] = seat.answer_confirm
         claim: Callable[..., Any] = seat.answer_claim
 
-        def told(asked: Event, key: bytes, places: list[object], answers: list[object]) -> list[tuple[Place, Reply]]:
+        def parse_answers(
+            asked: Event, key: bytes, places: list[object], answers: list[object]
+        ) -> list[tuple[Place, Reply]]:
             pairs = [(place_unpacked(key, p), unpack_reply(a, asked)) for p, a in zip(places, answers, strict=True)]
             return [(place, reply) for place, reply in pairs if place is not None and reply is not None]
 
         def confirmed(peer: Contact, key: bytes, places: list[object], incarnation: bytes, *ballot: Any) -> Any:
-            def noted(answers: list[object]) -> list[object]:
-                for place, reply in told(Event.ACCEPT, key, places, answers):
+            def note_accepted(answers: list[object]) -> list[object]:
+                for place, reply in parse_answers(Event.ACCEPT, key, places, answers):
                     if reply.kind is Kind.GRANTED:
                         self.accepted(place, ballot, member)
                 return answers
 
-            return maybeDeferred(confirm, peer, key, places, incarnation, *ballot).addCallback(noted)
+            return maybeDeferred(confirm, peer, key, places, incarnation, *ballot).addCallback(note_accepted)
 
         def claimed(peer: Contact, key: bytes, places: list[object], *rest: Any) -> Any:
-            def noted(answers: list[object]) -> list[object]:
+            def note_accepted(answers: list[object]) -> list[object]:
                 # A member whose disk was full when it accepted reports the acceptance with a later answer.
-                for place, reply in told(Event.PREPARE, key, places, answers):
+                for place, reply in parse_answers(Event.PREPARE, key, places, answers):
                     if reply.accepted != NONE:
                         self.accepted(place, (*reply.accepted, reply.value), member)
                 return answers
 
-            return maybeDeferred(claim, peer, key, places, *rest).addCallback(noted)
+            return maybeDeferred(claim, peer, key, places, *rest).addCallback(note_accepted)
 
         seat.answer_confirm, seat.answer_claim = confirmed, claimed  # type: ignore[method-assign, assignment]
         expose("decree.confirm", confirmed, changes=True)
