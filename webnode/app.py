@@ -1,7 +1,7 @@
 """Serve the page and every route of the table with Flask.
 
 Handlers run on worker threads.  They read a finished state and check the request.  The route's answer runs on the
-reactor's thread; the worker thread waits for it for a bounded time.
+reactor's thread; the worker thread waits at most for its time limit.
 """
 
 from __future__ import annotations

@@ -142,7 +142,7 @@ def read(pem: bytes) -> Leaf:
 
 
 def leaf(signer: Authority, title: str, names: Collection[str], now: float, rng: random.Random) -> Leaf:
-    """Sign a certificate for the node called ``title``, for those of ``names`` that the authority may sign."""
+    """Sign a certificate for the node called ``title``, for the ``names`` that the authority may sign."""
     key = _key(rng.randbytes(32), b"leaf")
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, title)])
     since = min(max(_to_datetime(now) - EARLIER, FROM), UNTIL - LASTS)
@@ -158,7 +158,7 @@ def leaf(signer: Authority, title: str, names: Collection[str], now: float, rng:
 
 
 def nameable(names: Collection[str]) -> list[str]:
-    """Return those of ``names`` for which the authority may sign, in canonical form; includes localhost."""
+    """Return the ``names`` for which the authority may sign, in canonical form; includes localhost."""
     usual = (plain(name) for name in ("localhost", "127.0.0.1", "::1", *names))
     return list(dict.fromkeys(name for name in usual if name))[:MOST]
 

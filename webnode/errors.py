@@ -17,7 +17,7 @@ class WebError(Exception):
 class Refusal(WebError):
     """A rejected request.
 
-    ``field`` says where, ``problem`` what is wrong, ``remedy`` what to do; ``status`` is the HTTP status code.
+    ``field`` is the place of the ``problem``, ``remedy`` the advice to the client, ``status`` the HTTP status code.
     """
 
     def __init__(self, field: str, problem: str, remedy: str, status: int = 400) -> None:

@@ -133,7 +133,7 @@ class FaultControl:
             if device.uuid not in self._asked:
                 self._asked.add(device.uuid)
                 self._learn(device.uuid, record)
-        # A device that returns may have other settings and is asked again; the previous reply holds until then.
+        # A device that returns may have other settings and is queried again; the previous reply holds until then.
         self._asked &= {device.uuid for device, _ in devices}
         if len(self._names) > REMEMBERED:
             self._names = {device.uuid: device.name for device, _ in devices}

@@ -41,7 +41,7 @@ def best_first(urls: Iterable[str]) -> list[str]:
 
 
 class TeamInvites:
-    """The URLs of this node's page, read anew at each call of ``urls``; ``authority`` is empty without TLS."""
+    """The URLs of this node's page, evaluated at each call of ``urls``; ``authority`` is empty without TLS."""
 
     def __init__(
         self, urls: Callable[[], Iterable[str]], authority: bytes, fingerprint: str, reactor: Any, pool: Any

@@ -1,6 +1,6 @@
 """Serve the state (server-sent events) and the cameras (long polling) as native Twisted resources.
 
-A WSGI worker would be occupied as long as a stream lasts, so streams bypass Flask.  Nothing is queued for a client that
+A stream would occupy a WSGI worker until its end, so streams bypass Flask.  Nothing is queued for a client that
 reads slowly: it is skipped, and later gets the changes that it missed, or the whole state if that is smaller.
 """
 
@@ -35,7 +35,7 @@ SPARED = 4
 CHECK_S = 1.0
 """Interval in seconds at which the sessions of open streams are checked."""
 LEAD_S = 3600.0
-"""Seconds before the end of a session at which the page is told to renew it."""
+"""Seconds before the end of a session at which the page is asked to renew it."""
 IDLE_S = 1.0
 """Interval of reading the state without any stream, for the chronicle and to expire departed devices."""
 MAX_VIEWERS = 256
@@ -53,7 +53,7 @@ Watch = Callable[[str, OnFrame], Callable[[], None]]
 class Viewer:
     """One open event stream; the transport pauses it while its client reads too slowly.
 
-    ``heard`` is the number of the last change sent, ``entry`` that of the last chronicle entry.
+    ``heard`` is the number of the last change sent, ``entry`` the number of the last chronicle entry.
     """
 
     def __init__(self, request: Request, is_whole: bool = False, heard: int = 0, ticket: str = "") -> None:
@@ -325,7 +325,7 @@ class Shots(JsonResource):
 
     @property
     def watched(self) -> list[str]:
-        """The devices whose cameras are streamed now."""
+        """The devices with an open camera stream."""
         return list(self._cameras)
 
     def getChild(self, path: bytes, request: Request) -> Resource:

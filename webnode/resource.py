@@ -1,4 +1,4 @@
-"""Answer errors of native resources as JSON, like those of Flask's routes."""
+"""Answer errors of native resources as JSON, as Flask's routes do."""
 
 from __future__ import annotations
 

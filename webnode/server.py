@@ -288,7 +288,7 @@ class WebService(Service):
         return next((int(getattr(door.getHost(), "port", 0)) for door in self._open), 0)
 
     def urls(self, names: Collection[str]) -> list[str]:
-        """Return the URLs of the page; ``names`` are those of this machine, for a page at all addresses."""
+        """Return the URLs of the page; ``names`` are this machine's, for a page at all addresses."""
         doors = urls_at(self._host, self.secure_port, names, is_secure=True) if self.secure_port else []
         return [*urls_at(self._host, self.port, names), *doors]
 

@@ -1,6 +1,6 @@
 """Hold a network namespace open by a process.
 
-A namespace has no name that other processes could see: it exists as long as its holder, and its interfaces end with it.
+A namespace has no name that other processes could see: it ends with its holder, and so do its interfaces.
 The holder ends at the end of its input, so nothing remains however this process ends, and two runs cannot conflict.
 Without privileges the first room creates a user namespace that contains all others.
 """

@@ -129,7 +129,7 @@ class Disk(Memory):
 def next_life(store: Memory, later: Memory, now: float) -> Memory:
     """Fill ``later`` with the content that survives the node with ``store``: team records and notes, but no leases.
 
-    Team records expire a whole ttl after ``now``, as a file cannot know how long it was unused.
+    Team records expire a whole ttl after ``now``, as a file does not know the time since its last use.
     """
     records, notes = store.kept()
     later.origin = "kept"

@@ -1,4 +1,4 @@
-"""Simulate nodes whose stores are real SQLite files and lose power between any two instructions.
+"""Simulate nodes with stores in real SQLite files that lose power between any two instructions.
 
 The writer has no thread: it commits at times of the simulated clock, so that a run follows from its seed.  A kill
 leaves the files as they are, possibly with a torn commit at their end; the next life opens a copy.

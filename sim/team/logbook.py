@@ -49,7 +49,7 @@ def entries(text: str, file: str) -> list[Entry]:
 
 
 def missing(seeds: range, logged: Iterable[Entry], what: str) -> list[int]:
-    """Return those of ``seeds`` that no entry with the same workloads has, whatever its commit."""
+    """Return the ``seeds`` that no entry with the same workloads has, whatever its commit."""
     done = {seed for one in logged if one.what == what for seed in range(one.first, one.first + one.count)}
     return [seed for seed in seeds if seed not in done]
 

@@ -49,7 +49,7 @@ def sweep(seeds: Sequence[int], one: Callable[[int], T], jobs: int, scheduler: s
 
 
 def spare_the_collector() -> None:
-    """Collect garbage rarely, as most objects of a run live as long as the run."""
+    """Collect garbage rarely, as most objects of a run live until its end."""
     gc.freeze()
     gc.set_threshold(200_000, 20, 20)
 

@@ -1,7 +1,7 @@
 // Panels: each part of the page is a panel in its own module, which registers it here.
 //
 // place    header, devices, device, groups, tasks, task, cameras, map, network, events, more
-// order    0: the view itself, whose root is the place; others are added below it in their own roots, sorted by order
+// order    0: the view itself, with the place as its root; others follow in their own roots, sorted by order
 // title    name for people
 // needs    { role, has }: shown to visitors of that role, if the node has that service (model.me.role, model.has)
 // make     make(root, { model, get, ask, go }) fills the root and returns handlers, all optional:

@@ -26,7 +26,7 @@ export function remember(told, passes, here) {
   try {
     localStorage.setItem(KEPT, JSON.stringify(told));
   } catch {
-    // Without storage the list lasts as long as the page.
+    // Without storage the list is lost with the page.
   }
 }
 

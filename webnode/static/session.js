@@ -19,7 +19,7 @@ function put(sessions) {
   try {
     localStorage.setItem(KEY, JSON.stringify(held));
   } catch {
-    // Without storage the session lasts as long as the page.
+    // Without storage the session is lost with the page.
   }
 }
 

@@ -3,7 +3,7 @@ import { at } from "./element.js";
 import { panels } from "./panel.js";
 
 const AGAIN = 3000;
-// A phone may see what a viewer sees.
+// A phone sees the same as a viewer.
 const RANKS = { anyone: 0, viewer: 1, phone: 2, operator: 3 };
 const shown = new Map();
 let shared = {};

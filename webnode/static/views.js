@@ -11,7 +11,7 @@ function choose(theme) {
   try {
     localStorage.setItem(KEPT, theme);
   } catch {
-    // Without storage the choice lasts as long as the page.
+    // Without storage the choice is lost with the page.
   }
 }
 

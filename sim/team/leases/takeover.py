@@ -1,7 +1,7 @@
 """Takeover trials: one lease holder and its standbys on a link of one-way 20 ms + Exp(10 ms), with clocks off by 1 %.
 
 ``python -m sim.team.leases.takeover [--trials 500] [--hours 24]`` prints the results of leases alone; ``make
-bench-takeover`` prints those of whole teams.
+bench-takeover`` prints the results of whole teams.
 """
 
 from __future__ import annotations

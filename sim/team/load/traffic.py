@@ -26,7 +26,7 @@ class TrafficSettings:
     """``[load.traffic]``: the sampled nodes."""
 
     sample: Annotated[int, Meta(ge=1, le=100_000)] = 200
-    """Number of nodes whose contacts are counted at the end; bytes are counted for all nodes."""
+    """Number of nodes with counted contacts at the end; bytes are counted for all nodes."""
 
 
 def resident_bytes() -> int:

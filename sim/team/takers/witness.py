@@ -63,7 +63,7 @@ class Witness:
 
         def claimed(peer: Contact, key: bytes, places: list[object], *rest: Any) -> Any:
             def note_accepted(answers: list[object]) -> list[object]:
-                # A member whose disk was full when it accepted reports the acceptance with a later answer.
+                # A member with a full disk reports an acceptance only with a later answer.
                 for place, reply in parse_answers(Event.PREPARE, key, places, answers):
                     if reply.accepted != NONE:
                         self.accepted(place, (*reply.accepted, reply.value), member)
