@@ -97,7 +97,7 @@ class Events(JsonResource):
     Events are ``state`` (``state.state_of``; ``resync`` is true if it replaces missed changes), ``change``
     (``journal.Change``), ``yard`` (the map of the simulator, or null), ``pages`` (the URLs of the team's pages),
     ``event`` (entries of the chronicle), ``ticket`` (the session expires at ``until`` and can be renewed) and ``beat``
-    (``now`` in unix seconds, ``skipped``: the number of changes that this client was too slow for).  ``since``, or the
+    (``now`` in unix seconds, ``skipped``: the number of updates skipped for this slow client).  ``since``, or the
     header ``Last-Event-ID``, is the last id received: later changes are sent if they are still kept and smaller than
     the whole state.  With ``whole`` each change is a ``state``.  A stream ends with its session.
 

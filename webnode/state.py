@@ -114,9 +114,8 @@ def group_view(task: str, title: str, members: Sequence[Fields], known: Mapping[
     """Return the consensus point of one group: the winner that each agent computed, and whether they agree.
 
     The point is the agent named most often (of equals, the lowest uuid).  ``differ`` lists the members that named
-    another agent, ``undecided`` the members without a choice yet.  ``known`` names devices without
-    a report (uuid to name).
-    ``share`` is the cost (metres) relative to the largest.
+    another agent, ``undecided`` the members without a choice yet.  ``known`` names devices without a report (uuid to
+    name).  ``share`` is the cost (metres) relative to the largest.
     """
     views = [_member_view(member) for member in members]
     views.sort(key=lambda view: (view["name"], view["uuid"]))

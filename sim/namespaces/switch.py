@@ -110,7 +110,7 @@ class Switch:
 
     def _carry(self, lines: list[Line], port: Port, frame: bytes, now: float) -> None:
         if frame[12:14] == ARP:
-            # ARP is exempt from impairments, as real long-distance links have none and a retry takes a second.
+            # ARP is exempt unless the line is cut: real long-distance lines have none, and a retry takes a second.
             if not any(line.weather.loss == 100.0 for line in lines):
                 self._leave(port, frame)
             return

@@ -25,8 +25,8 @@ MOST_VIOLATIONS = 1000
 NONE = 1e-9
 """Tolerance in seconds for rounding errors of summed steps."""
 LONG, SHORT, LEAST_GRAIN = 0.5, 0.1, 1e-4
-"""Real seconds that a user waits for an update at most, about: above ``LONG`` the grain becomes finer, below ``SHORT``
-coarser; and the finest grain in seconds of the team's time."""
+"""Real seconds for one grain: above ``LONG`` the grain becomes finer, so that a user can stop the run soon, and below
+``SHORT`` coarser.  ``LEAST_GRAIN`` is the finest one in seconds of the team's time."""
 
 Phase = str
 JOINING, SETTLING, RUNNING, REPAIRING, ASKING, DONE = "joining", "settling", "running", "repairing", "asking", "done"

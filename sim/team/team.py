@@ -54,7 +54,7 @@ class Place:
         self.home: Nat | None = None
         self.machine: Machine | None = None
         self.entered: list[Deferred[bool]] | None = None
-        """Callbacks waiting for the node to join; None if it has joined."""
+        """Deferreds that wait for the node to join; None if it has joined."""
 
 
 class Team(World):
