@@ -36,7 +36,7 @@ MARK, HEAD = b"bid.", 64
 
 
 class Tally:
-    """An ``auctions.Wire`` over ``endpoint`` that counts bidding datagrams; ``sent`` and ``received`` are their numbers.
+    """An ``auctions.Wire`` over ``endpoint`` that counts the datagrams of bidding, ``sent`` and ``received``.
 
     Nodes also send heartbeats, pings and answers, often in step, so the total traffic does not show the cost of an
     auction.
