@@ -1,1 +1,1 @@
-"""Simulation: ``robots`` stands in for robots, ``team`` for whole teams of nodes, ``namespaces`` for the internet."""
+"""Simulators: ``robots`` simulates robots, ``team`` teams of nodes in one process, ``namespaces`` an internet."""

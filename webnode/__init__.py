@@ -1,6 +1,6 @@
-"""The page: what the node's data store knows, and an operator's wishes on their way back.
+"""The web page of a node: the state of the team, and the HTTP API through which operators change it.
 
-``state`` makes the view, ``app`` is the Flask side (page and JSON), ``live`` the native streams (state and cameras),
-``server`` puts both on one port inside Twisted, ``desk`` is what an operator can ask for.  This room knows no robot
-and no peer.
+``state`` builds the view, ``app`` serves the page and JSON with Flask, ``live`` serves the native streams (state and
+cameras), ``server`` puts both on one port inside Twisted, and ``team`` carries out an operator's requests.  This
+package knows nothing of robots and peers.
 """

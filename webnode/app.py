@@ -1,7 +1,7 @@
-"""The Flask side: the page, and every route of the table, over a state and a board that are handed in.
+"""Serve the page and every route of the table with Flask.
 
-Handlers run on worker threads.  They read a finished state and check what came; the answer itself is called on the
-reactor's thread, and what it waits for is waited for here, for a bounded time.
+Handlers run on worker threads.  They read a finished state and check the request.  The route's answer runs on the
+reactor's thread; the worker thread waits at most for its time limit.
 """
 
 from __future__ import annotations
@@ -28,41 +28,41 @@ MAX_ID = 64
 OnReactor = Callable[..., Any]
 
 
-def _here(wish: Callable[..., Any], *arguments: Any, limit_s: float | None = None) -> Any:
-    told = wish(*arguments)
-    if not isinstance(told, Deferred):
-        return told
-    came: list[Any] = []
-    told.addBoth(came.append)
-    if not came:
+def _call_directly(call: Callable[..., Any], *arguments: Any, limit_s: float | None = None) -> Any:
+    result = call(*arguments)
+    if not isinstance(result, Deferred):
+        return result
+    outcomes: list[Any] = []
+    result.addBoth(outcomes.append)
+    if not outcomes:
         raise Refusal("node", "it did not answer in time", "look at the state, then try again", 503)
-    if isinstance(came[0], Failure):
-        came[0].raiseException()
-    return came[0]
+    if isinstance(outcomes[0], Failure):
+        outcomes[0].raiseException()
+    return outcomes[0]
 
 
 def create_app(
     read: Callable[[], State],
     board: Board,
-    on_reactor: OnReactor = _here,
+    on_reactor: OnReactor = _call_directly,
     hosts: Collection[str] = (),
     wall: Callable[[], float] = lambda: 0.0,
 ) -> Flask:
-    """The application.
+    """Return the Flask application.
 
-    ``read`` returns the newest state and may be called from any thread; ``on_reactor(f, *arguments)`` calls ``f``
-    on the reactor's thread and returns what it returns (``server.caller`` makes one; the default calls at once, for
-    tests); ``hosts`` are names of this machine beside its addresses and local names; ``wall`` is unix time.
+    ``read`` returns the newest state and may be called from any thread.  ``on_reactor(f, *arguments)`` calls ``f`` on
+    the reactor's thread and returns its result (``server.caller`` makes one; the default calls directly, for tests).
+    ``hosts`` are names of this machine in addition to its addresses and local names.  ``wall`` returns unix time.
     """
     app = Flask("webnode", static_folder=None)
     app.config["MAX_CONTENT_LENGTH"] = MAX_BODY
     app.json.sort_keys = False  # type: ignore[attr-defined]
 
-    # A phone whose page is being closed can still send a last word, but no header with it.
+    # navigator.sendBeacon, which a phone uses when its page is closed, cannot set headers.
     unmarked = {(str(route.method), _rule(route.path)) for route in TABLE if route.role == "phone"}
     lets_in = partial(on_reactor, board.fallbacks.lets_in)
-    _guard(app, lets_in, hosts, lambda: (request.method, str(request.url_rule)) not in unmarked)
-    _explain(app)
+    _add_checks(app, lets_in, hosts, lambda: (request.method, str(request.url_rule)) not in unmarked)
+    _add_error_handlers(app)
     _serve_page(app, read)
     dispatch = Dispatch()
 
@@ -72,10 +72,10 @@ def create_app(
             who = on_reactor(board.sessions.visitor, _token(), now)
             guarded(route.role, who)
             given = checked(route, path, request.args, {} if route.method == "GET" else _body())
-            ask = Ask(given, who, board, read(), _id(), request.remote_addr or "", now, TABLE)
-            told = on_reactor(dispatch.carry_out, route, ask, limit_s=route.limit_s)
-            is_content = isinstance(told, Content)
-            response = app.response_class(told.body, content_type=told.kind) if is_content else jsonify(told)
+            ask = Ask(given, who, board, read(), _idempotency_key(), request.remote_addr or "", now, TABLE)
+            result = on_reactor(dispatch.carry_out, route, ask, limit_s=route.limit_s)
+            is_content = isinstance(result, Content)
+            response = app.response_class(result.body, content_type=result.kind) if is_content else jsonify(result)
             response.status_code = route.status
             return response
 
@@ -87,8 +87,8 @@ def create_app(
     return app
 
 
-def _guard(app: Flask, lets_in: LetsIn, hosts: Collection[str], needs_mark: Callable[[], bool]) -> None:
-    """Let in who comes by a name of this machine and from a page of the team, and send the headers that keep it so."""
+def _add_checks(app: Flask, lets_in: LetsIn, hosts: Collection[str], needs_mark: Callable[[], bool]) -> None:
+    """Check ``Host`` and ``Origin`` of each request, and set the security headers of each response."""
 
     @app.before_request
     def admit() -> Response | None:
@@ -99,7 +99,7 @@ def _guard(app: Flask, lets_in: LetsIn, hosts: Collection[str], needs_mark: Call
         problem = refusal(request.method, host, origin, marked, hosts, lambda _: is_let_in)
         if problem is not None:
             raise problem
-        # A browser asks first before it lets a page of another node give an order.
+        # OPTIONS is the preflight request (CORS) for a page of another web node.
         return app.response_class(status=204) if request.method == "OPTIONS" else None
 
     @app.after_request
@@ -109,17 +109,17 @@ def _guard(app: Flask, lets_in: LetsIn, hosts: Collection[str], needs_mark: Call
         return response
 
 
-def _explain(app: Flask) -> None:
-    """Answer whatever goes wrong with what, where, and what to do."""
+def _add_error_handlers(app: Flask) -> None:
+    """Answer every error as JSON with field, problem and remedy."""
 
     @app.errorhandler(Refusal)
     def refused(error: Refusal) -> tuple[Response, int]:
         return jsonify(error.fields), error.status
 
     @app.errorhandler(HTTPException)
-    def unlawful(error: HTTPException) -> tuple[Response, int]:
+    def http_error(error: HTTPException) -> tuple[Response, int]:
         code = error.code or 500
-        remedy = "send less" if code == 413 else "look at docs/reference/http-api.md for what can be asked"
+        remedy = "send a smaller body" if code == 413 else "see docs/reference/http-api.md for the routes and methods"
         response = jsonify(Refusal(request.path, error.name.lower(), remedy).fields)
         allowed = getattr(error, "valid_methods", None)
         if allowed:
@@ -129,7 +129,7 @@ def _explain(app: Flask) -> None:
     @app.errorhandler(Exception)
     def broken(error: Exception) -> tuple[Response, int]:
         app.logger.error("%s %s failed", request.method, request.path, exc_info=error)
-        return jsonify(Refusal(request.path, "the web node failed", "try again; its log says why").fields), 500
+        return jsonify(Refusal(request.path, "internal error", "try again; the node's log has the cause").fields), 500
 
 
 def _serve_page(app: Flask, read: Callable[[], State]) -> None:
@@ -150,11 +150,11 @@ def _token() -> str:
     return token_of(request.headers.get("Authorization", ""), request.args.get("ticket", ""))
 
 
-def _id() -> str:
-    words = request.headers.get("Idempotency-Key", "")
-    if len(words) > MAX_ID or not words.isprintable():
-        raise Refusal("Idempotency-Key", "it is no name for an order", f"give at most {MAX_ID} characters")
-    return words
+def _idempotency_key() -> str:
+    value = request.headers.get("Idempotency-Key", "")
+    if len(value) > MAX_ID or not value.isprintable():
+        raise Refusal("Idempotency-Key", "invalid value", f"send at most {MAX_ID} printable characters")
+    return value
 
 
 def _body() -> object:

@@ -1,4 +1,4 @@
-"""Audit: who changed what through the page, one line of JSON each, in a file beside the node's store."""
+"""Write an audit log: one JSON line per change made through the page, in a file next to the node's store."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from webnode.field import Json
 from webnode.visitor import Visitor
 
 AUDITED = 200
-"""Lines of which the newest are told."""
+"""Number of newest lines kept in memory."""
 MOST = 1 << 20
-"""Bytes of the file; then it is put aside as ``.1`` and a new one begun, so there are at most two."""
+"""Size limit of the file in bytes; a full file is renamed to ``.1``, so there are at most two."""
 TAIL = 1 << 16
 QUIET_S, KNOWN = 60.0, 256
-"""The same from the same stranger is one line in so many seconds, and of so many strangers that is known."""
+"""Seconds within which equal requests of a client without a session are one line, and the number of clients kept."""
 
 
 class Audit:
-    """Lines in the file at ``path``, or in memory alone where that is None; ``wall`` is unix time in seconds.
+    """The audit log in the file at ``path``, or only in memory if that is None; ``wall`` returns unix time in seconds.
 
-    A file that cannot be written is told of once in the log; the page goes on.
+    If the file cannot be written, the log says so once and the page continues to work.
     """
 
     _log = Logger()
@@ -34,16 +34,16 @@ class Audit:
         self._path = path
         self._wall = wall
         self._most = most
-        self._newest: deque[dict[str, Json]] = deque([] if path is None else _tail(path), maxlen=AUDITED)
+        self._newest: deque[dict[str, Json]] = deque([] if path is None else _read_tail(path), maxlen=AUDITED)
         self._counts: Counter[tuple[str, str]] = Counter()
         self._strangers: OrderedDict[tuple[str, str, str], list[float]] = OrderedDict()
         self._is_failing = False
 
     def note(self, who: Visitor, source: str, route: str, target: str, outcome: str) -> None:
-        """Keep one line: ``route`` is method and path, ``target`` what its path named, ``outcome`` the status."""
+        """Write one line: ``route`` is method and path, ``target`` the path parameters, ``outcome`` the status."""
         self._counts[who.role, outcome[:3]] += 1
         now = self._wall()
-        repeated = self._repeated((source, route, outcome), now) if who.role == "anyone" else 0
+        repeated = self._count_repetitions((source, route, outcome), now) if who.role == "anyone" else 0
         if repeated is None:
             return
         line: dict[str, Json] = {"at": round(now, 3), "who": who.name, "role": who.role, "from": source}
@@ -57,21 +57,21 @@ class Audit:
             _write(self._path, json.dumps(line) + "\n", self._most)
         except OSError as error:
             if not self._is_failing:
-                self._log.warn("the audit {path} cannot be written: {error}", path=self._path, error=error)
+                self._log.warn("cannot write the audit log {path}: {error}", path=self._path, error=error)
             self._is_failing = True
         else:
             self._is_failing = False
 
     def newest(self, count: int) -> list[dict[str, Json]]:
-        """The newest lines, the newest first; at most ``AUDITED``."""
+        """Return the newest lines, newest first; at most ``AUDITED``."""
         return list(self._newest)[:count]
 
     def counts(self) -> Mapping[tuple[str, str], int]:
-        """How many there were since the start, by role and status, those that are no line of their own included."""
+        """Return the number of changes since the start by role and status, suppressed repetitions included."""
         return self._counts
 
-    def _repeated(self, what: tuple[str, str, str], now: float) -> int | None:
-        """How often it was left out since its last line; None where it is to be left out again."""
+    def _count_repetitions(self, what: tuple[str, str, str], now: float) -> int | None:
+        """Return the number of repetitions suppressed since the last line; None if this one is suppressed as well."""
         known = self._strangers.get(what)
         if known is not None and 0.0 <= now - known[0] < QUIET_S:
             known[1] += 1
@@ -94,8 +94,8 @@ def _write(path: Path, line: str, most: int) -> None:
         _write(path, line[:most], most)
 
 
-def _tail(path: Path) -> list[dict[str, Json]]:
-    """The newest lines of the file, the newest first."""
+def _read_tail(path: Path) -> list[dict[str, Json]]:
+    """Return the newest lines of the file, newest first."""
     try:
         with path.open("rb") as file:
             file.seek(max(0, path.stat().st_size - TAIL))

@@ -1,4 +1,4 @@
-"""The board: all that the answers of the page's routes may use.  Everything is called on the reactor's thread."""
+"""Collect the services that the answers of routes use.  All of them are called on the reactor's thread."""
 
 from __future__ import annotations
 
@@ -22,39 +22,40 @@ from webnode.visitor import Sessions
 
 @dataclass(frozen=True)
 class Wanted:
-    """What a phone is asked for: so many pictures a second, and words for who holds it."""
+    """The reply to a phone's picture: requested pictures per second, and a text to show on the phone."""
 
     fps: float
     say: str = ""
 
 
 class Phones(Protocol):
-    """Phones that take part as devices, with this node as their way into the team."""
+    """Phones that take part as devices; this node connects them to the team."""
 
     def join(self, secret: bytes, name: str, can: Mapping[str, Any]) -> Deferred[str]:
-        """Let a phone take part; fires with its uuid, which is the same for the same secret at every web node.
+        """Register a phone; fires with its uuid, which is the same for the same secret at every web node.
 
-        ``can`` is what it has: ``width`` and ``height`` of its pictures in pixels, and whether it tells ``orientation``
-        and ``position``.  Fails with ``Refusal`` 409 or 429 where it may not, 503 where that cannot be.
+        ``can`` has the ``width`` and ``height`` of its pictures in pixels, and whether the phone measures
+        ``orientation`` and ``position``.  Fails with ``Refusal`` 409 or 429 if the phone is not accepted, 503 if phones
+        are not available here.
         """
 
     def look(self, uuid: str, jpeg: bytes, values: Mapping[str, float]) -> Wanted:
-        """Take what it sees and measures.
+        """Take a picture and measured values from a phone.
 
-        Raises ``Refusal`` 400 where it is no picture that is used, 404 where the phone takes no part here, 429 where it
-        looks too often.
+        Raises ``Refusal`` 400 if the picture cannot be used, 404 if the phone is not registered here, 429 if it sends
+        too often.
         """
 
     def leave(self, uuid: str) -> None:
-        """Let it go; one that is not here has gone already."""
+        """Remove a phone; does nothing if it is not registered here."""
 
     def close(self) -> Deferred[Any]:
-        """Let all of them go; fires when they have."""
+        """Remove all phones; fires when they have left."""
 
 
 @dataclass
 class Board:
-    """All that the answers may use; None is a part that the node lacks, which the page, told by ``has``, leaves out."""
+    """The services of one web node; a service that the node lacks is None, and ``has`` tells the page so."""
 
     desk: TeamDesk
     sessions: Sessions
@@ -70,7 +71,7 @@ class Board:
 
     @property
     def has(self) -> list[str]:
-        """What this node has beyond what every web node has, for the page."""
+        """Return the names of the optional services that this node has, for the page."""
         parts = ("survey", "halts", "faults", "phones", "invites")
         yard = ["yard"] if self.desk.yard() is not None else []
         return yard + [name for name in parts if getattr(self, name) is not None]

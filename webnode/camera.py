@@ -1,4 +1,4 @@
-"""Cameras: the newest picture of a device, and who waits for the next one; streams exist while somebody looks."""
+"""Serve the newest picture of each device by long polling; an upstream is open only while a browser watches."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ Question = tuple[Request, bytes, IDelayedCall]
 
 
 class Camera:
-    """The newest picture of one device, and who waits for the next; ends itself two seconds after the last question.
+    """The newest picture of one device, and the requests that wait for the next one.
 
-    ``watch`` opens the upstream (and may raise ``Refusal``).  An upstream that is silent for ``POLL_S`` is opened anew:
-    its device may have come back at another address.
+    ``watch`` opens the upstream and may raise ``Refusal``.  An upstream that is silent for ``POLL_S`` is reopened, as
+    the device may have a new address.  A camera ends two seconds after its last request.
     """
 
     def __init__(self, clock: IReactorTime, watch: Callable[[OnFrame], Callable[[], None]], on_end: Callable[[], None]):
@@ -33,14 +33,14 @@ class Camera:
         self._on_end = on_end
         self._opened_at = clock.seconds()
         self._newest: tuple[int, bytes, float] | None = None
-        self._came_at = -POLL_S
+        self._received_at = -POLL_S
         self._linger: IDelayedCall | None = None
-        self._ended = False
+        self._is_ended = False
         self.waiting: list[Question] = []
         self._stop_upstream = watch(self.on_frame)
 
     def wait(self, request: Request) -> None:
-        """Answer ``request`` with the first picture that is news to it."""
+        """Answer ``request`` with the first picture that its viewer has not seen."""
         viewer = argument(request, b"viewer")
         for entry in [entry for entry in self.waiting if viewer and entry[1] == viewer]:
             self._release(entry)
@@ -49,26 +49,26 @@ class Camera:
             self._linger = None
         if self._newest is not None and argument(request, b"after") != str(self._newest[0]).encode():
             self._send(request)
-            self._rest()
+            self._start_linger()
             return
         entry = (request, viewer, self._clock.callLater(POLL_S, lambda: self._give_up(entry)))
         self.waiting.append(entry)
         request.notifyFinish().addErrback(lambda _: self._forget(entry))
 
     def on_frame(self, seq: int, jpeg: bytes, age: float) -> None:
-        """Take the next picture, taken ``age`` seconds ago; a late or far too large one, or no JPEG, is dropped."""
-        if self._ended or len(jpeg) > MAX_FRAME or size_of(jpeg) is None:
+        """Take a picture that is ``age`` seconds old; drop it if it is late, too large or no JPEG."""
+        if self._is_ended or len(jpeg) > MAX_FRAME or size_of(jpeg) is None:
             return
         now = self._clock.seconds()
-        self._newest, self._came_at = (seq, jpeg, now - age), now
+        self._newest, self._received_at = (seq, jpeg, now - age), now
         waiting, self.waiting = self.waiting, []
         for request, _, deadline in waiting:
             deadline.cancel()
             self._send(request)
-        self._rest()
+        self._start_linger()
 
     def close(self) -> None:
-        """Answer whoever waits with 204 and end the upstream now."""
+        """Answer waiting requests with 204 and end the upstream."""
         for entry in list(self.waiting):
             self._release(entry)
         if self._linger is not None:
@@ -88,7 +88,7 @@ class Camera:
 
     def _give_up(self, entry: Question) -> None:
         self._release(entry)
-        if self._clock.seconds() - max(self._came_at, self._opened_at) < POLL_S:
+        if self._clock.seconds() - max(self._received_at, self._opened_at) < POLL_S:
             return
         self._stop_upstream()
         self._stop_upstream = lambda: None
@@ -108,14 +108,14 @@ class Camera:
             self.waiting.remove(entry)
         if entry[2].active():
             entry[2].cancel()
-        self._rest()
+        self._start_linger()
 
-    def _rest(self) -> None:
+    def _start_linger(self) -> None:
         if not self.waiting and self._linger is None:
             self._linger = self._clock.callLater(LINGER_S, self._end)
 
     def _end(self) -> None:
         self._linger = None
-        self._ended = True
+        self._is_ended = True
         self._stop_upstream()
         self._on_end()

@@ -1,8 +1,8 @@
-"""Certificate: a web node's authority, and what it signs for the node's page to be served over TLS.  Pure.
+"""Create the certificate authority of a web node and the TLS certificates that it signs.  Pure.
 
-Each web node has an authority of its own, which follows from random bytes that the node keeps, so that it is the same
-after each start; no member of the team can make it of what members share.  It can vouch for addresses and names of a
-local network and for nothing else: a web node cannot pass for a site of the internet before the phones that trust it.
+Each web node derives its authority from random bytes in its store, so the authority is the same after each start and
+no other member of the team can derive it.  Name constraints limit it to addresses and names of a local network: a web
+node cannot impersonate an internet site to phones that trust its authority.
 """
 
 from __future__ import annotations
@@ -29,50 +29,50 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 PERSON = b"swarm-page-tls"
 ORDER = 0xFFFFFFFF00000000FFFFFFFFFFFFFFFFBCE6FAADA7179E84F3B9CAC2FC632551
-"""How many points the group of P-256 has; a private key is a number below it."""
+"""Order of the group of P-256; a private key is a number below it."""
 FROM, UNTIL = datetime(2025, 1, 1, tzinfo=UTC), datetime(2049, 12, 31, tzinfo=UTC)
-"""When the authority is valid: said here, as it must be the same after each start, whatever the clock says."""
+"""Validity of the authority; constant, as the certificate is the same after each start, whatever the clock says."""
 LASTS = timedelta(days=365)
-"""Of a node's certificate; phones take none that lasts longer than 825 days."""
+"""Validity of a node's certificate; phones reject certificates that are valid for more than 825 days."""
 EARLIER = timedelta(days=2)
-"""A node's certificate is valid from so long ago, as clocks differ."""
+"""A node's certificate is valid from this long before its creation, to tolerate clock differences."""
 LEFT = timedelta(days=30)
-"""With less than this to come a new one is made."""
+"""A certificate with less remaining validity is replaced."""
 NETWORKS = (
     *("10.0.0.0/8", "172.16.0.0/12", "192.168.0.0/16", "100.64.0.0/10", "169.254.0.0/16", "127.0.0.0/8"),
     *("fc00::/7", "fe80::/10", "::1/128"),
 )
 DOMAINS = ("localhost", "local", "lan", "internal", "home.arpa")
 MOST = 32
-"""Names in one certificate."""
+"""Maximum number of names in one certificate."""
 
 
 @dataclass(frozen=True)
 class Credential:
-    """A private key, and the certificate that says whose it is."""
+    """A private key and its certificate."""
 
     key: ec.EllipticCurvePrivateKey
     certificate: x509.Certificate
 
     @property
     def pem(self) -> bytes:
-        """The certificate, which everybody may have."""
+        """The certificate in PEM; public."""
         return bytes(self.certificate.public_bytes(Encoding.PEM))
 
 
 class Authority(Credential):
-    """What signs for a web node."""
+    """The key and certificate that sign for a web node."""
 
     @property
     def fingerprint(self) -> str:
-        """What a person compares: the SHA-256 hash of the certificate, as phones show it."""
+        """The SHA-256 hash of the certificate as phones show it, for comparison by a person."""
         return bytes(self.certificate.fingerprint(SHA256())).hex(":").upper()
 
 
 def authority(secret: bytes, title: str) -> Authority:
-    """The authority of the node that keeps this secret, and that people call ``title``."""
+    """Return the authority of the node with the secret ``secret`` and the display name ``title``."""
     key = _key(secret, b"authority")
-    # A phone lists authorities by name: those of two nodes should be told apart.
+    # A phone lists authorities by name, so names of different nodes must differ.
     mark = hashlib.blake2s(_point(key), digest_size=3).hexdigest()
     name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, f"Swarm {title} {mark}")])
     constraints = x509.NameConstraints(
@@ -82,13 +82,15 @@ def authority(secret: bytes, title: str) -> Authority:
         ],
         None,
     )
-    made = (
-        _begun(name, name, key, int.from_bytes(hashlib.blake2b(_point(key), digest_size=15).digest()), FROM, UNTIL)
+    builder = (
+        _start_builder(
+            name, name, key, int.from_bytes(hashlib.blake2b(_point(key), digest_size=15).digest()), FROM, UNTIL
+        )
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
         .add_extension(_usage(signs_certificates=True), critical=True)
         .add_extension(constraints, critical=True)
     )
-    return Authority(key, made.sign(key, SHA256(), ecdsa_deterministic=True))
+    return Authority(key, builder.sign(key, SHA256(), ecdsa_deterministic=True))
 
 
 class Leaf(Credential):
@@ -96,14 +98,14 @@ class Leaf(Credential):
 
     @property
     def pem_with_key(self) -> bytes:
-        """Both, to be kept where nobody else reads them."""
+        """Both in PEM; secret."""
         return bytes(self.key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())) + self.pem
 
     def flaw(self, signer: Authority, names: Collection[str], now: float) -> str:
-        """Why it cannot serve the page at ``names`` at the unix time ``now``; empty where it can."""
-        certificate, moment = self.certificate, _moment(now)
+        """Return why the certificate cannot serve ``names`` at the unix time ``now``; empty if it can."""
+        certificate, moment = self.certificate, _to_datetime(now)
         if _point(self.key) != certificate.public_key().public_bytes(Encoding.X962, PublicFormat.UncompressedPoint):
-            return "its key is another one's"
+            return "its key does not match"
         try:
             certificate.verify_directly_issued_by(signer.certificate)
         except (InvalidSignature, ValueError, TypeError):
@@ -111,13 +113,13 @@ class Leaf(Credential):
         if moment < certificate.not_valid_before_utc:
             return "it is not valid yet"
         if moment > certificate.not_valid_after_utc - LEFT:
-            return "it runs out"
+            return "it expires soon"
         missing = [name for name in nameable(names) if name not in self.names]
         return f"it lacks {', '.join(missing)}" if missing else ""
 
     @property
     def names(self) -> list[str]:
-        """The addresses and names for which it stands."""
+        """The addresses and names for which it is valid."""
         try:
             found = self.certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
         except x509.ExtensionNotFound:
@@ -126,7 +128,7 @@ class Leaf(Credential):
 
 
 def read(pem: bytes) -> Leaf:
-    """The leaf whose ``pem_with_key`` this is; raises ``ValueError`` where it is none."""
+    """Parse a leaf from its ``pem_with_key``; raises ``ValueError`` if that is invalid."""
     try:
         key = load_pem_private_key(pem, None)
         certificate = x509.load_pem_x509_certificate(pem)
@@ -135,50 +137,50 @@ def read(pem: bytes) -> Leaf:
     if not isinstance(key, ec.EllipticCurvePrivateKey) or not isinstance(
         certificate.public_key(), ec.EllipticCurvePublicKey
     ):
-        raise ValueError("its key is of another kind")
+        raise ValueError("its key is not an elliptic curve key")
     return Leaf(key, certificate)
 
 
 def leaf(signer: Authority, title: str, names: Collection[str], now: float, rng: random.Random) -> Leaf:
-    """A certificate for the node that people call ``title``, for those of ``names`` that may be in one."""
+    """Sign a certificate for the node called ``title``, for the ``names`` that the authority may sign."""
     key = _key(rng.randbytes(32), b"leaf")
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, title)])
-    since = min(max(_moment(now) - EARLIER, FROM), UNTIL - LASTS)
+    since = min(max(_to_datetime(now) - EARLIER, FROM), UNTIL - LASTS)
     serial = int.from_bytes(rng.randbytes(15)) or 1
-    made = (
-        _begun(subject, signer.certificate.subject, key, serial, since, since + LASTS, signer)
+    builder = (
+        _start_builder(subject, signer.certificate.subject, key, serial, since, since + LASTS, signer)
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
         .add_extension(_usage(signs_certificates=False), critical=True)
         .add_extension(x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH]), critical=False)
-        .add_extension(x509.SubjectAlternativeName([_named(name) for name in nameable(names)]), critical=False)
+        .add_extension(x509.SubjectAlternativeName([_general_name(name) for name in nameable(names)]), critical=False)
     )
-    return Leaf(key, made.sign(signer.key, SHA256(), ecdsa_deterministic=True))
+    return Leaf(key, builder.sign(signer.key, SHA256(), ecdsa_deterministic=True))
 
 
 def nameable(names: Collection[str]) -> list[str]:
-    """Those of ``names`` for which the authority may sign, addresses as they are usually written; never none."""
+    """Return the ``names`` for which the authority may sign, in canonical form; includes localhost."""
     usual = (plain(name) for name in ("localhost", "127.0.0.1", "::1", *names))
     return list(dict.fromkeys(name for name in usual if name))[:MOST]
 
 
 def plain(name: str) -> str:
-    """The usual way to write an address or name; empty for one for which the authority must not sign."""
+    """Return the canonical form of an address or name; empty if the authority must not sign for it."""
     try:
         address = ipaddress.ip_address(name)
     except ValueError:
         lower = name.rstrip(".").lower()
         labels = lower.split(".")
-        is_lawful = all(0 < len(label) < 64 and label.replace("-", "").isalnum() for label in labels)
-        is_ours = is_lawful and lower.isascii() and len(lower) < 254
-        return lower if is_ours and any(lower == end or lower.endswith(f".{end}") for end in DOMAINS) else ""
+        is_valid = all(0 < len(label) < 64 and label.replace("-", "").isalnum() for label in labels)
+        is_hostname = is_valid and lower.isascii() and len(lower) < 254
+        return lower if is_hostname and any(lower == end or lower.endswith(f".{end}") for end in DOMAINS) else ""
     if isinstance(address, ipaddress.IPv6Address):
         address = address.ipv4_mapped or address
-    # A zone such as fe80::1%eth0 means something on one machine alone.
+    # A zone such as fe80::1%eth0 is valid on one machine only.
     fits = any(address in ipaddress.ip_network(network) for network in NETWORKS) and "%" not in str(address)
     return str(address) if fits else ""
 
 
-def _named(name: str) -> x509.GeneralName:
+def _general_name(name: str) -> x509.GeneralName:
     try:
         return x509.IPAddress(ipaddress.ip_address(name))
     except ValueError:
@@ -186,7 +188,7 @@ def _named(name: str) -> x509.GeneralName:
 
 
 def _key(secret: bytes, use: bytes) -> ec.EllipticCurvePrivateKey:
-    """The private key that belongs to a secret; 64 bytes are hashed, so that each key is as likely as any other."""
+    """Derive a private key from a secret; the hash of 64 bytes keeps the distribution of keys uniform."""
     number = int.from_bytes(hashlib.blake2b(secret, digest_size=64, key=use, person=PERSON).digest())
     return ec.derive_private_key(1 + number % (ORDER - 1), ec.SECP256R1())
 
@@ -195,15 +197,15 @@ def _point(key: ec.EllipticCurvePrivateKey) -> bytes:
     return bytes(key.public_key().public_bytes(Encoding.X962, PublicFormat.UncompressedPoint))
 
 
-def _moment(now: float) -> datetime:
-    """A unix time as cryptography has it; a clock that is far off is at the nearest moment that can be written."""
+def _to_datetime(now: float) -> datetime:
+    """Convert unix time to a datetime, clamped to the validity of the authority."""
     try:
         return min(max(datetime.fromtimestamp(now, UTC), FROM), UNTIL)
     except (ValueError, OverflowError, OSError):
         return FROM
 
 
-def _begun(
+def _start_builder(
     subject: x509.Name,
     issuer: x509.Name,
     key: ec.EllipticCurvePrivateKey,

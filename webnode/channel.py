@@ -1,7 +1,8 @@
-"""Channel: one connection to the page, and what it keeps to before anybody is asked; it knows no routes.
+"""One HTTP connection with deadlines and limits per address; it knows nothing of routes.
 
-Twisted ends a connection that is idle, and a client that sends a byte now and then never is.  So each part of a request
-has a time in which it is complete, an address may have so many that are not, and who reads nothing is let go.
+Twisted's idle timeout does not end a connection that sends a byte now and then (Slowloris).  So each part of a request
+has a deadline, an address has a limit of incomplete requests, and a client that does not read its response is
+disconnected.
 """
 
 from __future__ import annotations
@@ -21,27 +22,27 @@ from webnode.limits import AddressLimits, Kept
 from webnode.visitor import Visitor
 
 HEAD_S = 10.0
-"""A request's lines are complete so long after its first byte, or after the connection was made."""
+"""Deadline for a request's headers, after its first byte or after the connection was made."""
 KEEP_S = 15.0
-"""A connection waits so long for its next request."""
+"""Time that an idle connection stays open for its next request."""
 GRACE_S, PACE = 2.0, 1000.0
-"""After so long a body has come with at least so many bytes a second."""
+"""Grace period of a request body, and the minimum rate afterwards in bytes per second."""
 STALL_S = 30.0
-"""An answer of which nothing is taken for so long is given up."""
+"""Time after which a response that the client does not read is aborted."""
 CLOSE_S = 2.0
-"""A refused client has so long to read why."""
+"""Time for a refused client to read the reason."""
 STATUS = {400: "Bad Request", 408: "Request Timeout", 413: "Content Too Large", 503: "Service Unavailable"}
 
 TOO_LARGE = Refusal("body", "it is too large", "send at most 64 KiB", 413)
-UNREADABLE = Refusal("request", "it is no HTTP that can be read", "send HTTP/1.1, with at most 16 KiB of headers", 400)
-LATE_HEAD = Refusal("request", "it was not complete in time", f"send its head within {HEAD_S:g} s", 408)
-LATE_BODY = Refusal("body", "it comes too slowly", f"send at least {PACE:g} bytes a second", 408)
-TOO_MANY = Refusal("request", "too many from this address are unfinished", "finish those first", 503)
-TOO_BUSY = Refusal("request", "too many from this address are being answered", "close some, then try again", 503)
+UNREADABLE = Refusal("request", "it is not valid HTTP", "send HTTP/1.1, with at most 16 KiB of headers", 400)
+LATE_HEAD = Refusal("request", "headers not complete in time", f"send all headers within {HEAD_S:g} s", 408)
+LATE_BODY = Refusal("body", "it arrives too slowly", f"send at least {PACE:g} bytes a second", 408)
+TOO_MANY = Refusal("request", "too many incomplete requests from this address", "complete those first", 503)
+TOO_BUSY = Refusal("request", "too many open requests from this address", "close some, then try again", 503)
 
 
 def raw(refusal: Refusal) -> bytes:
-    """The whole answer of a refusal that nobody else can give, as bytes of HTTP."""
+    """Return the complete HTTP response to a request that does not reach Flask."""
     body = json.dumps(refusal.fields).encode()
     lines = [f"HTTP/1.1 {refusal.status} {STATUS[refusal.status]}", "Content-Type: application/json"]
     lines += [f"{name}: {value}" for name, value in HEADERS.items()]
@@ -50,38 +51,38 @@ def raw(refusal: Refusal) -> bytes:
 
 
 class CappedRequest(SiteRequest):
-    """A request whose body is never kept beyond ``guard.MAX_BODY``: answered with 413 and cut off.
+    """A request whose body is limited to ``guard.MAX_BODY``; a larger one is answered with 413 and disconnected.
 
-    ``who`` asks, where a native resource is asked.
+    ``who`` is the authenticated client of a request to a native resource.
     """
 
     who = Visitor()
     _taken = 0
-    _cut = False
+    _is_cut = False
 
     def gotLength(self, length: int | None) -> None:  # noqa: N802
-        """Refuse a body that announces itself as too large."""
+        """Refuse a body whose Content-Length is too large."""
         super().gotLength(0 if length is not None and length > MAX_BODY else length)
         if length is not None and length > MAX_BODY:
             self._refuse()
 
     def handleContentChunk(self, data: bytes) -> None:  # noqa: N802
-        """Take a piece of the body, or refuse the rest."""
+        """Take a chunk of the body, or refuse the rest."""
         self._taken += len(data)
         if self._taken > MAX_BODY:
             self._refuse()
-        if not self._cut:
+        if not self._is_cut:
             super().handleContentChunk(data)
 
     def requestReceived(self, command: bytes, path: bytes, version: bytes) -> None:  # noqa: N802
-        """Go on, unless the body was refused."""
-        if not self._cut:
+        """Process the request, unless its body was refused."""
+        if not self._is_cut:
             super().requestReceived(command, path, version)
 
     def _refuse(self) -> None:
-        if self._cut or self.channel is None:
+        if self._is_cut or self.channel is None:
             return
-        self._cut = True
+        self._is_cut = True
         channel: Any = self.channel
         if isinstance(channel, Channel):
             channel.refuse(TOO_LARGE)
@@ -91,58 +92,58 @@ class CappedRequest(SiteRequest):
 
 
 class Channel(HTTPChannel):
-    """A connection with deadlines; ``factory`` is a site that was ``limited``."""
+    """A connection with deadlines; ``factory`` is a site that was passed to ``limited``."""
 
     factory: Any
     transport: Any
     limits: AddressLimits
     _phase = "idle"
-    _due: IDelayedCall | None = None
-    _stalled: IDelayedCall | None = None
+    _deadline: IDelayedCall | None = None
+    _stall_deadline: IDelayedCall | None = None
     _counted: Kept | None = None
     _open = False
-    _over = False
-    _came = 0
+    _is_over = False
+    _received_bytes = 0
     _since = 0.0
 
     def connectionMade(self) -> None:  # noqa: N802
-        """Wait for a request, unless its address has far too many connections."""
+        """Wait for a request; abort if the address has too many connections."""
         super().connectionMade()
         self.limits = self.factory.limits
         self._address = str(getattr(self.getPeer(), "host", ""))
         if not self.limits.may("open", self._address):
-            self._over = True
+            self._is_over = True
             self.transport.abortConnection()
             return
         self.limits.count("open", self._address, 1)
         self._open = True
-        self._within(HEAD_S, self._close)
+        self._set_deadline(HEAD_S, self._close)
 
     def dataReceived(self, data: bytes) -> None:  # noqa: N802
-        """Take bytes, and see what they complete."""
-        if self._over:
+        """Take bytes and update the request's phase."""
+        if self._is_over:
             return
         if self._phase == "idle":
-            self._begin()
-        self._came += len(data)
+            self._start_request()
+        self._received_bytes += len(data)
         super().dataReceived(data)
-        self._weigh()
+        self._count_incomplete()
 
     def allHeadersReceived(self) -> None:  # noqa: N802
-        """From here the body has its own pace."""
-        if self._over:
+        """Start the deadline of the body."""
+        if self._is_over:
             return
         self._phase, self._since = "body", self._now()
-        self._within(GRACE_S, self._pace)
+        self._set_deadline(GRACE_S, self._check_pace)
         super().allHeadersReceived()
 
     def allContentReceived(self) -> None:  # noqa: N802
-        """From here it is ours to answer."""
-        if self._over:
+        """End the deadline, and count the request as being answered."""
+        if self._is_over:
             return
         self._phase = "answer"
-        self._end(self._due)
-        self._due = None
+        self._cancel(self._deadline)
+        self._deadline = None
         if not self.limits.may("stream", self._address):
             self.refuse(TOO_BUSY)
             return
@@ -150,76 +151,76 @@ class Channel(HTTPChannel):
         super().allContentReceived()
 
     def requestDone(self, request: Any) -> None:  # noqa: N802
-        """The answer is out; the next request may have come already, or begun to."""
+        """Wait for the next request, of which bytes may have arrived already."""
         self._count(None)
         self._phase = "idle"
         waits = bool(self._dataBuffer)
-        self._within(KEEP_S, self._close)
+        self._set_deadline(KEEP_S, self._close)
         if waits:
-            self._begin()
+            self._start_request()
         super().requestDone(request)
-        self._weigh()
+        self._count_incomplete()
 
     def pauseProducing(self) -> None:  # noqa: N802
-        """The client does not take what it asked for."""
+        """Start the deadline for a client that does not read its response."""
         super().pauseProducing()
-        if self._stalled is None and not self._over:
-            self._stalled = self.callLater(STALL_S, self._abort)
+        if self._stall_deadline is None and not self._is_over:
+            self._stall_deadline = self.callLater(STALL_S, self._abort)
 
     def resumeProducing(self) -> None:  # noqa: N802
-        """It does again."""
+        """End the deadline for the client to read."""
         super().resumeProducing()
-        self._end(self._stalled)
-        self._stalled = None
+        self._cancel(self._stall_deadline)
+        self._stall_deadline = None
 
     def connectionLost(self, reason: Failure) -> None:  # type: ignore[override]  # noqa: N802
-        """Forget all of it."""
-        self._over = True
+        """Cancel all deadlines and counts."""
+        self._is_over = True
         self._count(None)
         if self._open:
             self.limits.count("open", self._address, -1)
             self._open = False
-        for each in (self._due, self._stalled):
-            self._end(each)
-        self._due = self._stalled = None
+        for each in (self._deadline, self._stall_deadline):
+            self._cancel(each)
+        self._deadline = self._stall_deadline = None
         super().connectionLost(reason)
 
     def refuse(self, refusal: Refusal) -> None:
-        """Answer what is no whole request, and end the connection."""
-        if self._over:
+        """Answer an invalid or incomplete request, and end the connection."""
+        if self._is_over:
             return
-        self._over = True
+        self._is_over = True
         self._count(None)
         self.transport.write(raw(refusal))
         self.loseConnection()
-        self._within(CLOSE_S, self._abort)
+        self._set_deadline(CLOSE_S, self._abort)
 
     def lineLengthExceeded(self, line: bytes) -> None:  # noqa: N802
-        """Refuse a line that is longer than all headers may be."""
+        """Refuse a line that exceeds the limit for all headers."""
         self.refuse(UNREADABLE)
 
     def _respondToBadRequestAndDisconnect(self) -> None:  # noqa: N802
-        # Twisted's own name: it would answer without a body and without the headers that all answers have.
+        # Twisted's method sends neither a body nor the security headers.
         self.refuse(UNREADABLE)
 
-    def _begin(self) -> None:
-        self._phase, self._came = "head", 0
-        self._within(HEAD_S, lambda: self.refuse(LATE_HEAD))
+    def _start_request(self) -> None:
+        self._phase, self._received_bytes = "head", 0
+        self._set_deadline(HEAD_S, lambda: self.refuse(LATE_HEAD))
 
-    def _weigh(self) -> None:
-        """Count a request that is not complete for now; most are, with the bytes that they begin with."""
-        if self._over or self._phase not in ("head", "body") or self._counted:
+    def _count_incomplete(self) -> None:
+        """Count a request that is not complete; a request that arrives whole is not counted."""
+        if self._is_over or self._phase not in ("head", "body") or self._counted:
             return
         if not self.limits.may("unfinished", self._address):
             self.refuse(TOO_MANY)
             return
         self._count("unfinished")
 
-    def _pace(self) -> None:
-        if self._came < PACE * (self._now() - self._since - GRACE_S):
+    def _check_pace(self) -> None:
+        if self._received_bytes < PACE * (self._now() - self._since - GRACE_S):
             self.refuse(LATE_BODY)
         else:
-            self._within(1.0, self._pace)
+            self._set_deadline(1.0, self._check_pace)
 
     def _count(self, kind: Kept | None) -> None:
         if self._counted != kind:
@@ -229,11 +230,11 @@ class Channel(HTTPChannel):
                 self.limits.count(kind, self._address, 1)
             self._counted = kind
 
-    def _within(self, seconds: float, late: Any) -> None:
-        self._end(self._due)
-        self._due = self.callLater(seconds, late)
+    def _set_deadline(self, seconds: float, late: Any) -> None:
+        self._cancel(self._deadline)
+        self._deadline = self.callLater(seconds, late)
 
-    def _end(self, call: IDelayedCall | None) -> None:
+    def _cancel(self, call: IDelayedCall | None) -> None:
         if call is not None and call.active():
             call.cancel()
 
@@ -241,20 +242,20 @@ class Channel(HTTPChannel):
         return float(self.factory.reactor.seconds())
 
     def _close(self) -> None:
-        self._over = True
+        self._is_over = True
         self.loseConnection()
-        self._within(CLOSE_S, self._abort)
+        self._set_deadline(CLOSE_S, self._abort)
 
     def _abort(self) -> None:
-        self._over = True
+        self._is_over = True
         self.transport.abortConnection()
 
 
 def limited(site: Site, limits: AddressLimits) -> None:
-    """Have the connections of ``site`` keep to ``limits`` and to the deadlines above."""
+    """Apply ``limits`` and the deadlines of this module to the connections of ``site``."""
     held: Any = site
     held.protocol = Channel
     held.limits = limits
     held.timeOut = None
-    # A channel of this kind speaks nothing newer, whatever is installed.
+    # Channel implements HTTP/1.1 only, also if the package h2 is installed.
     held.acceptableProtocols = lambda: [b"http/1.1"]

@@ -1,7 +1,7 @@
-"""Chronicle: what happened in the team, told from one state to the next.  Pure.
+"""Derive events from successive states of the team.  Pure.
 
-Two states in, entries out: who came and went, what became of each task, on whom a group agreed, and how long a takeover
-took.  It begins when its node begins to look, and knows nothing of what was before.
+Events: a device arrives or leaves, a task changes its status, a group agrees on an agent, and a takeover with its
+duration.  The chronicle starts with its node and knows nothing earlier.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ from typing import Any
 from webnode.state import GONE, State
 
 KEPT = 2000
-"""Entries that are remembered: an hour of a lively team."""
+"""Maximum number of entries: about an hour of a busy team."""
 DOUBTED_S = 60.0
-"""Seconds after which a fault that took nobody away explains no takeover any more."""
+"""Seconds after an injected fault within which a takeover is attributed to it, if the device did not leave."""
 EXECUTING = "EXECUTING"
 DECIDED = ("COMPLETED", "FAILED", "CANCELLED")
 
 
 @dataclass(frozen=True)
 class Entry:
-    """Something that happened: ``n`` counts them, ``at`` is unix seconds, ``seconds`` how long it took (or None)."""
+    """An event: ``n`` is its number, ``at`` unix seconds, ``seconds`` its duration or None."""
 
     n: int
     at: float
@@ -36,7 +36,7 @@ class Entry:
 
 @dataclass
 class _Loss:
-    """Who was acting on a task when something befell it, and when that was."""
+    """The device that acted on a task when a fault or its departure occurred, and the time."""
 
     uuid: str
     name: str
@@ -45,10 +45,10 @@ class _Loss:
 
 
 class TeamChronicle:
-    """The newest entries, forgotten when the node ends.
+    """The newest entries, in memory only.
 
-    A takeover is timed from the moment at which whoever acted was seen to be gone, or, where the fault was caused on
-    purpose, from that.
+    A takeover is timed from the moment at which the acting device was seen to be gone, or from the injected fault if
+    there was one.
     """
 
     def __init__(self, kept: int = KEPT) -> None:
@@ -59,30 +59,30 @@ class TeamChronicle:
         self._lost: dict[str, _Loss] = {}
 
     def saw(self, state: State, now: float) -> None:
-        """Take the next state, seen at ``now`` (unix seconds)."""
+        """Compare the next state, read at ``now`` (unix seconds), with the one before."""
         before, self._before = self._before, state
         if not before:
-            self._add(now, "start", text=f"{state.get('node') or 'this node'} begins to look")
+            self._add(now, "start", text=f"{state.get('node') or 'this node'} starts to observe")
         self._devices(_by(before, "devices", "uuid"), _rows(state, "devices"), now)
         titles = {task["id"]: task["title"] for task in _rows(state, "tasks")}
         self._tasks(_by(before, "tasks", "id"), _rows(state, "tasks"), now)
         ended = {task["id"] for task in _rows(state, "tasks") if task["status"] in DECIDED}
-        # The reports on a task that has ended go one by one, and those left agree on nothing.
+        # Reports on a task that has ended expire one after another; agreement among the rest means nothing.
         confer = [group for group in _rows(state, "groups") if group["task"] not in ended]
         self._groups(_by(before, "groups", "task"), confer, now)
         self._takeovers(state, titles, ended, now)
         self._stops(before, state, now)
 
     def faulted(self, uuid: str, kind: str, now: float) -> None:
-        """Remember that a fault was caused on purpose, so that the takeover is timed from it."""
+        """Record an injected fault, so that the takeover is timed from it."""
         name = _by(self._before, "devices", "uuid").get(uuid, {}).get("name", uuid[:8])
         task = next((task for task, acting in self._acting.items() if uuid in acting), "")
         if task:
             self._lost[task] = _Loss(uuid, name, now, False)
-        self._add(now, "fault", uuid, task, f"{name}: {kind}, caused on purpose")
+        self._add(now, "fault", uuid, task, f"{name}: {kind} (injected fault)")
 
     def since(self, number: int, about: str = "") -> list[Entry]:
-        """The entries after ``number``, those about one device or task where ``about`` names it."""
+        """Return the entries after ``number``; only those about the device or task ``about`` if given."""
         if number >= self._n:
             return []
         return [entry for entry in self._entries if entry.n > number and about in ("", entry.uuid, entry.task)]
@@ -96,13 +96,13 @@ class TeamChronicle:
         self._entries.append(Entry(self._n, at, kind, uuid, task, text, seconds))
 
     def _stops(self, before: State, state: State, now: float) -> None:
-        """Who stopped the team, when all of its robots stood, and when it went on."""
+        """Add an entry for each stop, for the standstill of all robots, and for the release."""
         known = {stop["id"] for stop in before.get("halt", {}).get("stops", ())}
         stops = state.get("halt", {}).get("stops", ())
         for by in dict.fromkeys(stop["by"] for stop in stops if stop["id"] not in known and stop["by"]):
             self._add(now, "halt", text=f"{by} stops the team")
         if bool(state.get("halted")) != bool(before.get("halted")):
-            lost = "not every robot stands" if stops else "the team goes on"
+            lost = "not every robot stands still" if stops else "the team is released"
             self._add(now, "halt", text="the team is halted" if state.get("halted") else lost)
 
     def _devices(self, before: Mapping[str, State], devices: Iterable[State], now: float) -> None:
@@ -137,19 +137,19 @@ class TeamChronicle:
                     change += f" by {result['by']}" + (f" in {took:.1f} s" if took else "")
                 self._add(now, "task", "", name, f"{title}: {change}", took)
             elif old and old["paused"] != task["paused"]:
-                self._add(now, "task", "", name, f"{title}: {'paused' if task['paused'] else 'goes on'}")
+                self._add(now, "task", "", name, f"{title}: {'paused' if task['paused'] else 'resumed'}")
             elif task["note"] and task["note"] != old.get("note"):
                 self._add(now, "task", "", name, f"{title}: {task['note']}")
 
     def _groups(self, before: Mapping[str, State], groups: Iterable[State], now: float) -> None:
         for group in groups:
             agreed = bool(group["assigned_uuid"]) and group["agree"] == group["of"]
-            if agreed and _point(group) != _point(before.get(group["task"], {})):
+            if agreed and _consensus_point(group) != _consensus_point(before.get(group["task"], {})):
                 bids = ", ".join(f"{m['name']} {m['cost']:.2f} m" for m in group["members"] if m["cost"] is not None)
-                told = f"{group['agree']} of {group['of']} agree on {group['assigned']}" + (
+                change = f"{group['agree']} of {group['of']} agree on {group['assigned']}" + (
                     f" ({bids})" if bids else ""
                 )
-                self._add(now, "agreed", group["assigned_uuid"], group["task"], told)
+                self._add(now, "agreed", group["assigned_uuid"], group["task"], change)
 
     def _takeovers(self, state: State, titles: Mapping[str, str], ended: set[str], now: float) -> None:
         names = {device["uuid"]: device["name"] for device in _rows(state, "devices")}
@@ -164,29 +164,29 @@ class TeamChronicle:
                     at = loss.at if loss is not None and loss.uuid == device["uuid"] else now
                     self._lost[task] = _Loss(device["uuid"], device["name"], at, True)
         for task, uuids in acting.items():
-            self._followed(task, titles.get(task, task), uuids, names, now)
+            self._record_takeover(task, titles.get(task, task), uuids, names, now)
         for task in [*self._lost]:
             if task in ended or (not self._lost[task].is_gone and now - self._lost[task].at > DOUBTED_S):
                 del self._lost[task]
-        # Between two who act there may be nobody for a while: whoever was last is remembered until somebody is.
+        # Between two acting devices there may be none for some time: keep the last one until the next acts.
         self._acting = {**{task: who for task, who in self._acting.items() if task not in ended}, **acting}
 
-    def _followed(self, task: str, title: str, uuids: set[str], names: Mapping[str, str], now: float) -> None:
+    def _record_takeover(self, task: str, title: str, uuids: set[str], names: Mapping[str, str], now: float) -> None:
         before, loss = self._acting.get(task, set()), self._lost.get(task)
         fresh = sorted(uuids - before)
         if loss is not None and loss.is_gone and loss.uuid in uuids:
-            del self._lost[task]  # it came back before anybody took over
+            del self._lost[task]  # it returned before a takeover
         elif fresh and loss is not None and loss.uuid not in uuids:
             took = round(now - loss.at, 2)
-            told = f"{names[fresh[0]]} takes over {title} from {loss.name}: {took:.1f} s"
-            self._add(now, "takeover", fresh[0], task, told, took)
+            change = f"{names[fresh[0]]} takes over {title} from {loss.name}: {took:.1f} s"
+            self._add(now, "takeover", fresh[0], task, change, took)
             del self._lost[task]
         elif fresh and before and not before & uuids:
-            left = names.get(min(before), "one that left")
-            self._add(now, "handover", fresh[0], task, f"{names[fresh[0]]} goes on with {title} in place of {left}")
+            left = names.get(min(before), "a device that left")
+            self._add(now, "handover", fresh[0], task, f"{names[fresh[0]]} continues {title} in place of {left}")
 
 
-def _point(group: Mapping[str, Any]) -> tuple[Any, ...]:
+def _consensus_point(group: Mapping[str, Any]) -> tuple[Any, ...]:
     return group.get("assigned_uuid"), group.get("agree"), group.get("of")
 
 

@@ -1,4 +1,4 @@
-"""Delay: who has guessed wrong too often waits, ever longer; nobody else does.  Pure."""
+"""Delay sign-in attempts of an address with too many failures, with exponential backoff.  Pure."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ SOURCES = 4096
 
 
 class Delays:
-    """Tries that went wrong, by the address that they came from; ``now`` is in seconds.
+    """Failed attempts per source address; ``now`` is in seconds.
 
-    Ten are free; then 4 s, 8 s and so on up to an hour pass before the next: at most 20 guesses in an hour.  An address
-    that has been quiet for a day is forgotten, and so is the one that is quiet for longest where there are too many.
-    Other numbers than these can be given.
+    Ten attempts are free; then the pause before the next doubles from 4 s up to an hour, which limits guesses to 20 in
+    the first hour.  An address is forgotten after a day without an attempt; if there are too many addresses, the one
+    idle for longest is forgotten first.  The arguments replace these defaults.
     """
 
     def __init__(self, free: int = FREE, longest_s: float = LONGEST_S, forgotten_s: float = FORGOTTEN_S) -> None:
@@ -26,16 +26,16 @@ class Delays:
         self._tries: OrderedDict[str, tuple[int, float]] = OrderedDict()
 
     def wait(self, source: str, now: float) -> float:
-        """Seconds until ``source`` may try again; 0 where it may now."""
+        """Return the seconds until ``source`` may try again; 0 if it may now."""
         count, last = self._tries.get(network_of(source), (0, 0.0))
         if count < self._free or now - last >= self._forgotten_s:
             return 0.0
         pause = min(self._longest_s, FIRST_S * 2.0 ** min(count - self._free, 20))
-        # A clock that was set back must not make anybody wait for longer than the pause.
+        # If the clock was set back, the wait must not exceed the pause.
         return max(0.0, min(pause, last + pause - now))
 
     def tried(self, source: str, now: float) -> None:
-        """Count a try; before its outcome is known, so that a hundred at once are a hundred."""
+        """Count an attempt before its outcome is known, so that concurrent attempts all count."""
         key = network_of(source)
         count, last = self._tries.pop(key, (0, now))
         self._tries[key] = (1 if now - last >= self._forgotten_s else count + 1, now)
@@ -43,11 +43,11 @@ class Delays:
             self._tries.popitem(last=False)
 
     def held(self, source: str) -> None:
-        """Forget the tries of ``source``: one was right."""
+        """Forget the attempts of ``source`` after a success."""
         self._tries.pop(network_of(source), None)
 
     def undo(self, source: str) -> None:
-        """Take the last try of ``source`` back: it was right, and says nothing of the others."""
+        """Uncount the last attempt of ``source``: it succeeded, which says nothing about the earlier ones."""
         key = network_of(source)
         if key in self._tries:
             count, last = self._tries[key]
@@ -55,7 +55,7 @@ class Delays:
 
 
 def network_of(source: str) -> str:
-    """What counts as one address: whoever has one of IPv6 has 2^64 of them."""
+    """Return the network that counts as one source: the /64 of an IPv6 address, since a client owns all of it."""
     try:
         address = ipaddress.ip_address(source.partition("%")[0])
     except ValueError:

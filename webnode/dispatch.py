@@ -1,4 +1,4 @@
-"""Dispatch: a route's answer, called once for what is asked once, with a line in the audit for each change."""
+"""Call a route's answer once per idempotency key, and write each change to the audit log."""
 
 from __future__ import annotations
 
@@ -12,52 +12,52 @@ from webnode.errors import Refusal
 from webnode.route import Ask, Route
 
 REMEMBERED = 256
-"""Orders that are known again when they are repeated."""
+"""Number of answers kept for repeated requests."""
 
 
 class Dispatch:
-    """Carries out what is asked of routes; on the reactor's thread."""
+    """Calls the answers of routes; on the reactor's thread."""
 
     def __init__(self) -> None:
         self._answers: OrderedDict[tuple[str, str, str], _Answer] = OrderedDict()
 
     def carry_out(self, route: Route, ask: Ask) -> Deferred[Any]:
-        """The answer; one that was given to the same id from the same visitor is given again."""
-        # What a viewer may ask changes nothing, whatever its method.
+        """Return the answer; a repeated id of the same session gets the first answer again."""
+        # A route that a viewer may call changes nothing, whatever its method.
         if route.method == "GET" or route.role == "viewer":
-            return self._called(route, ask)
-        # Whoever has not signed in is nobody in particular: what one was answered is not another's to hear.
+            return self._call(route, ask)
+        # Unauthenticated clients share one identity: a stored answer must not reach another client.
         if not ask.id or route.role == "anyone":
-            return self._noted(route, ask)
+            return self._call_audited(route, ask)
         key = ask.who.token_id, route.name, ask.id
         known = self._answers.get(key)
         if known is None:
             known = self._answers[key] = _Answer()
             while len(self._answers) > REMEMBERED:
                 self._answers.popitem(last=False)
-            self._noted(route, ask).addBoth(known.came)
+            self._call_audited(route, ask).addBoth(known.set_outcome)
         return known.wait()
 
-    def _called(self, route: Route, ask: Ask) -> Deferred[Any]:
+    def _call(self, route: Route, ask: Ask) -> Deferred[Any]:
         assert route.answer is not None
         return maybeDeferred(route.answer, ask)
 
-    def _noted(self, route: Route, ask: Ask) -> Deferred[Any]:
+    def _call_audited(self, route: Route, ask: Ask) -> Deferred[Any]:
         def note(outcome: Any) -> Any:
-            told = str(route.status)
+            result = str(route.status)
             if isinstance(outcome, Failure):
                 refusal = outcome.value
-                told = f"{refusal.status} {refusal.problem}" if isinstance(refusal, Refusal) else "500"
+                result = f"{refusal.status} {refusal.problem}" if isinstance(refusal, Refusal) else "500"
             named = {name for name in ask.given if f"{{{name}}}" in route.path}
             target = " ".join(str(ask.given[name]) for name in sorted(named))
-            ask.board.audit.note(ask.who, ask.source, route.name, target, told)
+            ask.board.audit.note(ask.who, ask.source, route.name, target, result)
             return outcome
 
-        return self._called(route, ask).addBoth(note)
+        return self._call(route, ask).addBoth(note)
 
 
 class _Answer:
-    """What came, or who waits for it."""
+    """The outcome of a route's answer, and the requests that wait for it."""
 
     def __init__(self) -> None:
         self._outcome: list[Any] = []
@@ -71,7 +71,7 @@ class _Answer:
             self._waiting.append(waiter)
         return waiter
 
-    def came(self, outcome: Any) -> None:
+    def set_outcome(self, outcome: Any) -> None:
         self._outcome.append(outcome)
         waiting, self._waiting = self._waiting, []
         for waiter in waiting:

@@ -1,23 +1,23 @@
-"""Every exception of this room.
+"""Exceptions of the package ``webnode``.
 
 ::
 
     WebError
-      Refusal     the visitor's fault, or a lawful no: answered as JSON that says field, problem and remedy
-      PortTaken   our caller's fault: the page cannot be served there; ``str()`` is one line for a person
+      Refusal     a request is rejected: answered as JSON with field, problem and remedy
+      PortTaken   the page cannot be served at the given port; ``str()`` is one line for the operator
 """
 
 from __future__ import annotations
 
 
 class WebError(Exception):
-    """The root of what the web node raises."""
+    """Base class of the errors of this package."""
 
 
 class Refusal(WebError):
-    """A wish that is not granted.
+    """A rejected request.
 
-    ``field`` is where, ``problem`` what, ``remedy`` what to do about it; ``status`` is the HTTP code.
+    ``field`` is the place of the ``problem``, ``remedy`` the advice to the client, ``status`` the HTTP status code.
     """
 
     def __init__(self, field: str, problem: str, remedy: str, status: int = 400) -> None:
@@ -29,9 +29,9 @@ class Refusal(WebError):
 
     @property
     def fields(self) -> dict[str, dict[str, str]]:
-        """The body of the answer."""
+        """The JSON body of the response."""
         return {"error": {"field": self.field, "problem": self.problem, "remedy": self.remedy}}
 
 
 class PortTaken(WebError):
-    """Another program holds the port of the page, or the address is not one of this machine."""
+    """The port is used by another program, or the address does not belong to this machine."""

@@ -1,8 +1,8 @@
-"""Fallback: the other web nodes of the team, to which a page goes when its own is lost.
+"""Keep the URLs of the team's other web nodes, to which a page switches when its own node fails.
 
-Each web node says in its device record at which URLs it serves the page.  Any member can say so of itself; in a closed
-team a page follows those alone that have the role ``gateway`` at this moment, as certified by the operator.  What a URL
-may be is checked all the same.
+Each web node publishes its URLs in its device record.  Any member can publish such URLs; in a closed team a page uses
+only URLs of nodes that currently have the role ``gateway``, certified by the operator.  The URLs are validated in any
+case.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from middleware.node import SwarmNode
 from webnode.guard import is_local_name
 
 REMEMBERED_S = 3600.0
-"""How long a page may come from a web node that is gone: it still runs in the visitor's browser."""
+"""Seconds for which the origin of a web node that left is still accepted: its page may still run in a browser."""
 MAX_URL = 100
 MAX_URLS = 4
 MAX_GONE = 256
-"""Pages that are gone and remembered, the newest."""
+"""Maximum number of pages of departed web nodes that are kept, the newest."""
 PORTS = {"http": 80, "https": 443}
 ANY = ("0.0.0.0", "::", "")
 
@@ -40,28 +40,28 @@ class Page:
 
 
 class Fallbacks:
-    """The web nodes of the team; this one knows those that it was made with, and hears of no others."""
+    """A fixed list of the team's web nodes."""
 
     def __init__(self, *pages: Page) -> None:
         self.pages = list(pages)
 
     def here(self) -> list[Page]:
-        """Where the page is served now."""
+        """Return the pages that are served now."""
         return self.pages
 
     def serves(self, urls: Iterable[str]) -> None:
-        """Tell the team that this node serves the page at ``urls``, too; call it when the port is open."""
+        """Publish that this node also serves the page at ``urls``; call it when the port is open."""
         self.pages += [Page("here", url, url.startswith("https:"), True) for url in urls]
 
     def lets_in(self, origin: str) -> bool:
-        """Whether a page that came from ``origin`` may ask here: it is, or was a short while ago, one of the team's."""
+        """Return whether ``origin`` is, or recently was, the origin of a page of the team."""
         return origin in [page.url for page in self.pages]
 
 
 def origin_of(url: str) -> str:
-    """The origin of the page at ``url`` as browsers name it, or "" where no page of a team can be there.
+    """Return the origin of the page at ``url`` as browsers name it; "" if the URL is not valid for a page of a team.
 
-    ``localhost`` and the addresses that mean the same become one.
+    ``localhost`` and all loopback addresses become 127.0.0.1.
     """
     if not 0 < len(url) <= MAX_URL or not url.isascii() or not url.isprintable():
         return ""
@@ -78,7 +78,7 @@ def origin_of(url: str) -> str:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether ``host`` means the machine that asks."""
+    """Return whether ``host`` is a loopback name or address."""
     if host == "localhost":
         return True
     try:
@@ -88,7 +88,7 @@ def is_loopback(host: str) -> bool:
 
 
 def pages_of(devices: Iterable[Device], own: str = "") -> list[Page]:
-    """Where ``devices`` serve the page, in their order; ``own`` is the uuid of the node that asks."""
+    """Return the pages that ``devices`` serve, in their order; ``own`` is the uuid of this node."""
     return [
         Page(device.uuid, url, url.startswith("https:"), device.uuid == own)
         for device in devices
@@ -98,7 +98,7 @@ def pages_of(devices: Iterable[Device], own: str = "") -> list[Page]:
 
 
 def urls_at(host: str, port: int, names: Iterable[str], is_secure: bool = False) -> list[str]:
-    """The URLs of a page that is served at ``host`` and ``port``; ``names`` are the machine's, for any host."""
+    """Return the URLs of a page at ``host`` and ``port``; ``names`` replace a wildcard host."""
     hosts = [name for name in names if name] if host in ANY else [host]
     scheme = "https" if is_secure else "http"
     return [f"{scheme}://{f'[{name}]' if ':' in name else name}:{port}" for name in hosts][:MAX_URLS]
@@ -106,7 +106,7 @@ def urls_at(host: str, port: int, names: Iterable[str], is_secure: bool = False)
 
 @dataclass(frozen=True)
 class _Served:
-    """A page that was heard of, by the node with the key ``public``; ``end`` is when it is forgotten."""
+    """A page published by the node with the key ``public``; ``end`` is the time when it is forgotten."""
 
     public: bytes
     page: Page
@@ -116,8 +116,8 @@ class _Served:
 class TeamFallbacks(Fallbacks):
     """The web nodes of a running team; ``clock`` counts seconds.
 
-    Those that count are gateways: in a closed team whoever has that role now, in an open one, where everybody may do
-    everything, whoever serves the page or did within the hour.
+    Only gateways count: in a closed team the nodes that have this role now; in an open team every node that serves the
+    page or did so within the last hour.
     """
 
     def __init__(self, node: SwarmNode, clock: Callable[[], float]) -> None:
@@ -128,28 +128,28 @@ class TeamFallbacks(Fallbacks):
         self._watch = node.watch_devices(self._follow, keep=True)
 
     def serves(self, urls: Iterable[str]) -> None:
-        """Tell the team that this node serves the page at ``urls``, too; call it when the port is open."""
+        """Publish that this node also serves the page at ``urls``; call it when the port is open."""
         pages = [*self._node.presence.device.pages, *urls]
         self._node.presence.change(pages=tuple(dict.fromkeys(pages))[:MAX_URLS])
         self._follow(self._watch.records)
 
     def here(self) -> list[Page]:
-        """Where gateways serve the page now, this node's own first."""
+        """Return the pages that gateways serve now, this node's pages first."""
         here = [each for each in self._served if each.end == inf]
         may = {public for public in {each.public for each in here} if self.may_vouch(public) or public == self._own}
         return [each.page for each in here if each.public in may]
 
     def may_vouch(self, public: bytes) -> bool:
-        """Whether the node with that key may let people in, at this moment."""
+        """Return whether the node with the key ``public`` may currently authenticate visitors."""
         if self._node.team is not None:
             return GATEWAY in self._node.team.door.roles_of(public)
         now = self._clock()
         return public == self._own or any(each.public == public and each.end > now for each in self._served)
 
     def lets_in(self, origin: str) -> bool:
-        """Whether a gateway serves the page at ``origin``, or did within the hour.
+        """Return whether ``origin`` belongs to a page of a gateway, now or within the last hour.
 
-        A page that was opened at ``localhost`` comes from the port of one, and from this machine.
+        A loopback origin is accepted if its scheme and port match, as its page comes from this machine.
         """
         asked, now = origin_of(origin), self._clock()
         if not asked:

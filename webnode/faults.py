@@ -1,4 +1,4 @@
-"""Faults that the page injects into devices of the team that allow it, with the time of each takeover."""
+"""Inject faults into devices of the team that allow it, and measure the takeovers."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from webnode.errors import Refusal
 from webnode.field import Json, text
 
 PATIENCE_S = 1.5
-"""Seconds for which a device may think about an order; whoever gave it waits for two."""
+"""Timeout of a device's reply in seconds; the browser waits for two."""
 TOLD_S = 60.0
-"""Seconds for which one still tells of a fault that is over."""
+"""Seconds for which a fault that has ended is still listed."""
 KEPT = 50
 REMEMBERED = 1000
-"""Devices beyond which one forgets those that are not here."""
+"""Maximum number of devices known; beyond it, absent devices are forgotten."""
 
 
 @dataclass
@@ -37,7 +37,7 @@ class _Caused:
 
 
 class FaultControl:
-    """The faults that were caused through this node; ``clock`` gives seconds that only go forward."""
+    """The faults injected through this node; ``clock`` returns monotonic seconds."""
 
     _log = Logger()
 
@@ -52,14 +52,14 @@ class FaultControl:
         self._watch = node.watch_devices(self._changed)
 
     def kinds(self, uuid: str) -> Sequence[str]:
-        """What can be caused there; nothing as long as it has not said so."""
+        """Return the fault kinds that the device allows; empty until it has reported them."""
         return self._kinds.get(uuid, ())
 
     def cause(self, uuid: str, kind: str, seconds: float, amount: float | None) -> Deferred[None]:
-        """Cause one, without an ``amount`` as much as is usual; fires when the device has said that it will.
+        """Inject a fault, by default with the usual ``amount``; fires when the device has accepted it.
 
-        Fails with ``Refusal``: 400 names the field, 409 and 504 the device.  The clock runs from when the device said
-        that it would begin.
+        Fails with ``Refusal``: 400 for an invalid field, 409 and 504 for the device.  The takeover is timed from the
+        beginning that the device announced.
         """
         try:
             fault = parse_fault(kind, seconds, amount)
@@ -72,11 +72,11 @@ class FaultControl:
         name = self._names.get(uuid, "it")
         if kind not in self.kinds(uuid):
             can = ", ".join(self.kinds(uuid))
-            remedy = f"choose one of {can}" if can else 'write "allow = true" below [faults] of its settings'
+            remedy = f"choose one of {can}" if can else 'set "allow = true" below [faults] in its settings'
             return fail(Refusal("kind" if can else "device", f"{name} does not allow {kind}", remedy, 409))
         task = acting(device for device, _ in devices_of(self._watch.records)).get(uuid, "")
 
-        def taken(answer: object) -> None:
+        def add_fault(answer: object) -> None:
             now = self._clock() + begins_in(answer)
             self._count += 1
             self._caused.insert(0, _Caused(self._count, fault, name, Takeover(uuid, task, now, now + fault.seconds)))
@@ -87,19 +87,19 @@ class FaultControl:
             if failure.check(NoAnswer):
                 raise Refusal("device", f"{name} does not answer", "wait until it is back", 504)
             problem = text(failure.getErrorMessage(), "it refused")
-            raise Refusal("device", f"{name}: {problem}", "look at its settings", 409)
+            raise Refusal("device", f"{name}: {problem}", "check its settings", 409)
 
         asked = self._node.entangled.call(
             contact, CAUSE, fault.kind, fault.seconds, amount, timeout=PATIENCE_S, changes=True
         )
-        return asked.addCallbacks(taken, refused)
+        return asked.addCallbacks(add_fault, refused)
 
     def active(self) -> list[dict[str, Json]]:
-        """Those that go on or ended a short while ago, the newest first, and what came of each.
+        """Return the faults that are active or ended recently, newest first.
 
-        ``n`` counts them; ``left_s`` and ``since_s`` are its seconds to come and gone; ``task`` is what the device was
-        at; ``takeover_s`` and ``to`` are the seconds until another (by name) acted on that task, None and empty until
-        then; ``watched`` says whether the clock runs.
+        ``n`` is the number of the fault; ``left_s`` and ``since_s`` are its remaining and elapsed seconds; ``task`` is
+        the task on which the device acted; ``takeover_s`` is the time until another device acted on that task and
+        ``to`` the name of that device, None and empty before; ``watched`` says whether the takeover is still measured.
         """
         now = self._clock()
         self._caused = [each for each in self._caused if now < each.clock.until + TOLD_S]
@@ -133,7 +133,7 @@ class FaultControl:
             if device.uuid not in self._asked:
                 self._asked.add(device.uuid)
                 self._learn(device.uuid, record)
-        # Who comes back may have other settings, and is asked again; until then what it said before holds.
+        # A device that returns may have other settings and is queried again; the previous reply holds until then.
         self._asked &= {device.uuid for device, _ in devices}
         if len(self._names) > REMEMBERED:
             self._names = {device.uuid: device.name for device, _ in devices}
@@ -144,17 +144,17 @@ class FaultControl:
         if contact is None:
             return
 
-        def told(answer: Any) -> None:
+        def store_kinds(answer: Any) -> None:
             kinds = answer.get("kinds") if isinstance(answer, dict) else None
             if isinstance(kinds, list):
                 self._kinds[uuid] = tuple(kind for kind in KINDS if kind in kinds)
 
-        def untold(failure: Any) -> None:
+        def handle_failure(failure: Any) -> None:
             failure.trap(EntangledError)
             if failure.check(NoAnswer):
-                self._asked.discard(uuid)  # once more at the next change of any device
+                self._asked.discard(uuid)  # ask again at the next change of any device
             else:
                 self._kinds.pop(uuid, None)
 
-        asked = self._node.entangled.call(contact, ASKED).addCallbacks(told, untold)
-        asked.addErrback(lambda failure: self._log.failure("while asking for faults", failure))
+        asked = self._node.entangled.call(contact, ASKED).addCallbacks(store_kinds, handle_failure)
+        asked.addErrback(lambda failure: self._log.failure("cannot read which faults a device allows", failure))

@@ -1,6 +1,6 @@
-"""Lawful values out of foreign ones: records come from other nodes, so nothing in them is believed.
+"""Sanitize values from records of other nodes, which are not trusted.
 
-Each function returns a value that JSON can carry and a page can show; what cannot be one becomes the fallback.
+Each function returns a value that JSON can carry and a page can show, or the fallback for an invalid value.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ Json = None | bool | int | float | str | list["Json"] | dict[str, "Json"]
 
 
 def text(value: object, fallback: str = "", limit: int = MAX_TEXT) -> str:
-    """``value`` where it is text, without control characters and lone surrogates, at most ``limit`` characters."""
+    """Return ``value`` if it is text, without control characters and lone surrogates, cut to ``limit`` characters."""
     if not isinstance(value, str):
         return fallback
     shown = value[:limit]
@@ -25,7 +25,7 @@ def text(value: object, fallback: str = "", limit: int = MAX_TEXT) -> str:
 
 
 def number(value: object, fallback: float = 0.0) -> float:
-    """``value`` where it is a finite number (JSON has no NaN)."""
+    """Return ``value`` if it is a finite number (JSON has no NaN)."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return fallback
     try:
@@ -36,37 +36,37 @@ def number(value: object, fallback: float = 0.0) -> float:
 
 
 def count(value: object, fallback: int = 0) -> int:
-    """``value`` where it is a whole number that a browser keeps exactly."""
+    """Return ``value`` if it is an integer that JavaScript represents exactly."""
     return value if type(value) is int and abs(value) < 2**53 else fallback
 
 
 def distance(value: object) -> float | None:
-    """``value`` where it is a finite length of zero or more, else None: nothing was measured."""
+    """Return ``value`` if it is a finite length of zero or more, else None: not measured."""
     length = number(value, -1.0)
     return length if length >= 0.0 else None
 
 
 def texts(value: object) -> list[str]:
-    """The lawful texts of a list."""
+    """Return the valid texts of a list."""
     if not isinstance(value, list | tuple):
         return []
     return [entry for entry in (text(each) for each in value[:MAX_ENTRIES]) if entry]
 
 
 def properties(value: object) -> dict[str, dict[str, str | float]]:
-    """Capability names to properties, each a number or a text; properties that are neither are left out."""
+    """Map capability names to properties, each a number or a text; other properties are left out."""
     found: dict[str, dict[str, str | float]] = {}
     if not isinstance(value, Mapping):
         return found
     for name, entries in list(value.items())[:MAX_ENTRIES]:
         if not text(name):
             continue
-        kept: dict[str, str | float] = {}
+        valid: dict[str, str | float] = {}
         if isinstance(entries, Mapping):
             for key, entry in list(entries.items())[:MAX_ENTRIES]:
                 if isinstance(entry, str) and text(key):
-                    kept[text(key)] = text(entry)
+                    valid[text(key)] = text(entry)
                 elif isinstance(entry, int | float) and math.isfinite(number(entry, math.inf)) and text(key):
-                    kept[text(key)] = number(entry)
-        found[text(name)] = kept
+                    valid[text(key)] = number(entry)
+        found[text(name)] = valid
     return found

@@ -1,9 +1,9 @@
-"""The guard: which requests a page on a LAN may answer, and the headers that keep a browser strict.  Pure.
+"""Check which requests a page on a LAN may answer, and set strict security headers.  Pure.
 
-The page has no cookies, so a foreign site gains nothing but what a visitor's browser reaches for it: it is stopped
-at three doors.  ``Host`` must be an address or a name of this machine (against rebinding of names), ``Origin`` must be
-the page's own or that of another web node of the team, and a request that changes something must be of a kind that a
-foreign form cannot send.
+The page uses no cookies, so another site can only send requests through a visitor's browser.  Three checks stop them:
+``Host`` must be an address or a name of this machine (against DNS rebinding), ``Origin`` must be the page's own or
+belong to another web node of the team, and a request that changes something must be of a kind that an HTML form cannot
+send.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from webnode.errors import Refusal
 MAX_BODY = 64 * 1024
 LOCAL_ENDS = (".localhost", ".local", ".lan", ".internal", ".home.arpa")
 HEADERS = {
-    # A page that has lost its node goes on with another of the team, whose address this one need not have known.
+    # A page that has lost its node connects to other web nodes of the team, whose addresses this node may not know.
     "Content-Security-Policy": (
         "default-src 'self'; connect-src 'self' http: https:; "
         "object-src 'none'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -34,29 +34,29 @@ SHARED = {
     "Access-Control-Expose-Headers": "X-Age, X-Seq",
     "Access-Control-Max-Age": "600",
 }
-"""What lets a page of another web node ask here."""
+"""CORS headers that allow requests from the page of another web node."""
 
 LetsIn = Callable[[str], bool]
 
 
 def is_local_name(host: str) -> bool:
-    """Whether a ``Host`` header can name a machine of the local network: an address, or a name from no outside."""
-    name = _name_of(host)
+    """Return whether a ``Host`` header can name a machine of the local network: an address or a local name."""
+    name = _hostname_of(host)
     is_plain = bool(name) and all(c.isalnum() or c in "-_" for c in name)
     return is_plain or name.endswith(LOCAL_ENDS) or _is_address(name)
 
 
 def is_own_host(host: str, names: Collection[str] = ()) -> bool:
-    """Whether a ``Host`` header names this machine: by address, as localhost, or by one of ``names``.
+    """Return whether a ``Host`` header names this machine: by address, as localhost, or by one of ``names``.
 
-    Any machine of a LAN can have itself called by a name such as evil.local, and have it mean this machine a moment
-    later; an address it cannot.
+    Other local names are not accepted: any machine of a LAN can register a name such as evil.local and then let it
+    resolve to this machine's address (DNS rebinding).
     """
-    name = _name_of(host)
+    name = _hostname_of(host)
     return name == "localhost" or name.endswith(".localhost") or _is_address(name) or name in names
 
 
-def _name_of(host: str) -> str:
+def _hostname_of(host: str) -> str:
     name = host.rsplit("]", 1)[0].lstrip("[") if host.startswith("[") else host.rsplit(":", 1)[0]
     return name.rstrip(".").lower()
 
@@ -70,38 +70,39 @@ def _is_address(name: str) -> bool:
 
 
 def is_own_origin(origin: str | None, host: str) -> bool:
-    """Whether ``Origin`` is absent (no browser) or is that of the page itself."""
+    """Return whether ``Origin`` is absent (not sent by a browser) or the page's own."""
     return origin is None or origin.split("://", 1)[-1].lower() == host.lower()
 
 
 def refusal(
     method: str, host: str, origin: str | None, is_marked: bool, names: Collection[str], lets_in: LetsIn
 ) -> Refusal | None:
-    """Why a request is not let in, or None.
+    """Return why a request is rejected, or None.
 
-    ``is_marked``: it carries what no form of a foreign site can send.  ``lets_in`` knows the team's other web nodes.
+    ``is_marked``: the request carries a header or content type that an HTML form cannot send.  ``lets_in`` accepts the
+    origins of the team's other web nodes.
     """
     if not is_own_host(host, names):
         return Refusal(
-            "Host", "this name is not one of the node's", "use its address, or add the name to [web] names", 403
+            "Host", "unknown name of this node", "use the node's address, or add the name to [web] names", 403
         )
     if method in ("GET", "HEAD"):
         return None
     if not is_own_origin(origin, host) and not lets_in(origin or ""):
-        return Refusal("Origin", "another site asked for this", "use the node's own page", 403)
+        return Refusal("Origin", "request from another site", "use the node's own page", 403)
     if method != "OPTIONS" and not is_marked:
         return Refusal("X-Swarm", "the header is missing", "send 'X-Swarm: 1' or JSON with its content type", 403)
     return None
 
 
 def headers(host: str, origin: str | None, lets_in: LetsIn) -> dict[str, str]:
-    """The headers of an answer to ``origin``."""
+    """Return the security headers of a response to ``origin``."""
     if origin is None or is_own_origin(origin, host) or not lets_in(origin):
         return HEADERS
     return {**HEADERS, **SHARED, "Access-Control-Allow-Origin": origin}
 
 
 def token_of(authorization: str, ticket: str) -> str:
-    """What a visitor shows: the token of the header, or else the ticket of the query, or nothing."""
+    """Return the token of the Authorization header, else the ticket of the query, else an empty text."""
     kind, _, token = authorization.partition(" ")
     return token.strip() if kind.lower() == "bearer" and token.strip() else ticket

@@ -1,4 +1,4 @@
-"""Halting: the button that stops the whole team."""
+"""Stop and release the whole team from the page."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from webnode.errors import Refusal
 
 
 class TeamHalts:
-    """Stops the whole team through ``client``; answers map each uuid to ``stands``, or to why it does not."""
+    """Stops the whole team through ``client``; results map each uuid to ``stands`` or to the reason why it does not."""
 
     def __init__(self, client: TeamClient) -> None:
         self._client = client
 
     def halt(self, by: str) -> Deferred[dict[str, str]]:
-        """Let everything stand, and stay."""
+        """Stop all robots until a release."""
         return self._client.stop_all(by)
 
     def release(self, by: str, stops: Sequence[str] | None = None) -> Deferred[dict[str, str]]:
-        """End these stops, or all that this node knows and all that a device says it obeys; raises ``Refusal``."""
+        """End the stops ``stops``, or else all that this node or a device knows; raises ``Refusal`` for a bad id."""
         named = self._known() if stops is None else [_id(stop) for stop in stops]
         return self._client.release(named, by)
 
@@ -34,11 +34,11 @@ class TeamHalts:
 
 
 def is_id(stop: str) -> bool:
-    """Whether ``stop`` is the id of a stop in hex."""
+    """Return whether ``stop`` is the id of a stop in hex."""
     return re.fullmatch(f"[0-9a-f]{{{2 * ID_BYTES}}}", stop) is not None
 
 
 def _id(stop: object) -> bytes:
     if not isinstance(stop, str) or not is_id(stop):
-        raise Refusal("stops", "this is no id of a stop", "name those of /api/v1/state, or leave it out")
+        raise Refusal("stops", "invalid id of a stop", "use ids of /api/v1/state, or leave it out")
     return bytes.fromhex(stop)

@@ -1,4 +1,4 @@
-"""Invite: where others find the page, and that as a code which a phone's camera reads."""
+"""List the URLs of this node's page for invitations, and draw them as QR codes."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from twisted.internet.threads import deferToThreadPool
 from webnode.fallback import is_loopback
 
 MARGIN = 4
-"""Modules of white around a code; scanners want them."""
+"""Width of the quiet zone around a QR code, in modules."""
 
 
 def code(text: str) -> str:
-    """A QR code of ``text`` as an SVG, black on nothing; empty where there is no text or no library to draw it with."""
+    """Return a QR code of ``text`` as SVG; empty for an empty text or without the library segno."""
     try:
         import segno
     except ModuleNotFoundError:
@@ -32,7 +32,7 @@ def code(text: str) -> str:
 
 
 def best_first(urls: Iterable[str]) -> list[str]:
-    """``urls`` in the order in which to offer them: those that others can reach first, then those over TLS."""
+    """Sort ``urls`` for an invitation: URLs that other machines can reach first, then those over TLS."""
 
     def rank(url: str) -> tuple[bool, bool]:
         return is_loopback(urlsplit(url).hostname or ""), not url.startswith("https:")
@@ -41,7 +41,7 @@ def best_first(urls: Iterable[str]) -> list[str]:
 
 
 class TeamInvites:
-    """Where the page of this node is; ``urls`` says it as it is now, ``authority`` is empty where there is no TLS."""
+    """The URLs of this node's page, evaluated at each call of ``urls``; ``authority`` is empty without TLS."""
 
     def __init__(
         self, urls: Callable[[], Iterable[str]], authority: bytes, fingerprint: str, reactor: Any, pool: Any
@@ -53,9 +53,9 @@ class TeamInvites:
         self._pool = pool
 
     def urls(self) -> list[str]:
-        """Where this node serves the page, the best for others first."""
+        """Return the URLs at which this node serves the page, the most reachable first."""
         return best_first(self._urls())
 
     def drawn(self, text: str) -> Deferred[str]:
-        """A QR code, drawn beside the reactor's thread: a small device takes a tenth of a second for it."""
+        """Draw a QR code on a worker thread, as it takes a small device a tenth of a second."""
         return deferToThreadPool(self._reactor, self._pool, code, text)

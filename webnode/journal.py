@@ -1,7 +1,7 @@
-"""Journal: what changed from one state of the team to the next, numbered, and kept for a while.  Pure.
+"""Number the changes between successive states of the team, and keep the newest.  Pure.
 
-A page that was away for a moment is told what it missed; one that was away for longer, or that comes from another
-node, is told everything anew.  Numbers hold for one node and one start of it, which ``epoch`` names.
+A page that reconnects after a short interruption gets the changes that it missed; otherwise it gets the whole state.
+Change numbers are valid for one node and one run of it, named by ``epoch``.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from typing import Any
 from webnode.state import State
 
 KEPT = 64
-"""Changes that are kept; who missed more is better served with the whole state."""
+"""Number of changes kept; a page that missed more gets the whole state."""
 KEYS: Mapping[str, str] = {"devices": "uuid", "tasks": "id", "groups": "task"}
-"""The parts of a state that are lists, each with what tells its rows apart."""
+"""The parts of a state that are lists, each with the key that identifies its rows."""
 
 
 @dataclass(frozen=True)
 class Change:
-    """What is different: rows that are new or other, ids of those that are gone, and values that are no lists.
+    """The difference between two states: new and changed rows, ids of removed rows, and changed values.
 
-    ``words`` is the ``content`` as JSON, made once for all who are told.
+    ``words`` is ``content`` as JSON, encoded once for all pages.
     """
 
     n: int
@@ -43,9 +43,9 @@ class Journal:
         self._rows: dict[str, dict[str, str]] = {name: {} for name in KEYS}
 
     def take(self, state: State) -> Change | None:
-        """Take the next state; returns what is different, or None.
+        """Store the next state and return its difference, or None if it is equal.
 
-        Raises ``ValueError`` where JSON cannot carry it; then nothing is taken.
+        Raises ``ValueError`` if JSON cannot represent it; then the journal does not change.
         """
         rows = {name: {row[key]: dumped(row) for row in state.get(name, ())} for name, key in KEYS.items()}
         content: dict[str, Any] = {}
@@ -69,22 +69,22 @@ class Journal:
         return change
 
     def id(self, n: int) -> str:
-        """What a page is told that it knows, having heard everything up to ``n``."""
+        """Return the event id of a page that has received all changes up to ``n``."""
         return f"{self._epoch}-{n}"
 
     def number(self, name: str) -> int:
-        """What ``name`` stands for; 0, nothing heard, where it is of another node, another start or no id at all."""
+        """Return the change number of an event id; 0 if it is invalid or belongs to another node or run."""
         epoch, _, n = name.rpartition("-")
         is_ours = epoch == self._epoch and n.isascii() and n.isdigit() and len(n) < 18
         return int(n) if is_ours and int(n) <= self.n else 0
 
     def since(self, n: int) -> list[Change] | None:
-        """The changes after ``n``, or None where not all of them are kept."""
+        """Return the changes after ``n``, or None if some of them are no longer kept."""
         if n <= 0 or (self._changes and n < self._changes[0].n - 1):
             return None
         return [change for change in self._changes if change.n > n]
 
 
 def dumped(content: object) -> str:
-    """JSON in as few bytes as it takes; raises ``ValueError`` where there is none."""
+    """Encode compact JSON; raises ``ValueError`` if that is not possible."""
     return json.dumps(content, separators=(",", ":"), allow_nan=False)

@@ -1,4 +1,4 @@
-"""Keyfile: a file with a private key in it, which nobody but the node's user may read."""
+"""Read and write a private key file that only the node's user can access."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ MOST = 64 * 1024
 
 
 class Unsafe(Exception):
-    """The file is there and must not be used; the message says why."""
+    """The file exists and must not be used; the message says why."""
 
 
 def kept(path: Path) -> bytes | None:
-    """What the file holds, None where there is none; raises ``Unsafe`` where others could have read or put it there."""
+    """Read the file, None if it does not exist; raises ``Unsafe`` if other users could have read or written it."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
     except FileNotFoundError:
@@ -25,18 +25,18 @@ def kept(path: Path) -> bytes | None:
     try:
         about = os.fstat(descriptor)
         if not stat.S_ISREG(about.st_mode):
-            raise Unsafe("it is no plain file")
+            raise Unsafe("it is not a regular file")
         if about.st_uid not in (os.geteuid(), 0):
             raise Unsafe("it belongs to another user")
         if about.st_mode & 0o077:
-            raise Unsafe(f"others may read or write it (mode {stat.S_IMODE(about.st_mode):o})")
+            raise Unsafe(f"other users can read or write it (mode {stat.S_IMODE(about.st_mode):o})")
         return os.read(descriptor, MOST)
     finally:
         os.close(descriptor)
 
 
 def keep(path: Path, content: bytes) -> None:
-    """Put ``content`` there, for the node's user alone, as a whole or not at all; raises ``OSError``."""
+    """Write ``content`` atomically, readable by the node's user only; raises ``OSError``."""
     fresh = path.with_name(f"{path.name}.new")
     with suppress(FileNotFoundError):
         fresh.unlink()

@@ -1,6 +1,6 @@
-"""Ledger: what the data store says of the team, as the state that the page shows (thesis, Algorithm 4.3).
+"""Build the state that the page shows from the records of the team (thesis, Algorithm 4.3).
 
-Flask's threads read the SQLite file, the live stream reads what the node watches; both make the same state.
+Flask's threads read the SQLite file, the live stream reads the watched records; both build the same state.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from webnode.state import GONE, Departed, State, state_of
 
 TASKS_SHOWN = 20
 STOPS_NAMED = 64
-"""Stops that the page names; when these are released it names the next ones."""
+"""Maximum number of stops listed; when these are released, the next ones are listed."""
 FRESH_S = 0.1
-"""A state as old as this will do: nobody can tell, and a hundred who ask at once are answered by ten."""
+"""Maximum age of a cached state in seconds; it bounds the work when many clients ask at once."""
 
 
 class Glance:
-    """The newest state for whoever asks, on any thread, read at most each ``FRESH_S``."""
+    """A cache of the newest state for callers on any thread, refreshed at most every ``FRESH_S``."""
 
     def __init__(self, read: Callable[[], State], clock: Callable[[], float]) -> None:
         self._read = read
@@ -31,7 +31,7 @@ class Glance:
         self._seen: tuple[float, State] = (-FRESH_S, {})
 
     def __call__(self) -> State:
-        """Return it; it is shared, and nobody writes in it."""
+        """Return the state; it is shared and must not be modified."""
         now, (at, state) = self._clock(), self._seen
         if not state or now - at >= FRESH_S:
             state = self._read()
@@ -40,7 +40,7 @@ class Glance:
 
 
 def state_from(read: Read, departed: Departed, node: str, now: float) -> State:
-    """The whole state at ``now`` (unix s); ``departed`` remembers who left, ``node`` is the name of who serves."""
+    """Return the state at ``now`` (unix s); ``departed`` keeps devices that left, ``node`` is the serving node."""
     view = TeamView(read)
     devices = view.devices
     names = {device.uuid: device.name for device in devices}
@@ -68,12 +68,12 @@ def _task_row(task: Task, progress: Progress, view: TeamView) -> dict[str, Any]:
     elif members:
         status = "ASSIGNED"
         if not (progress.paused_by or any(m.available for m in members)):
-            note = "nobody is free for it: " + "; ".join(f"{m.name} {m.why}" for m in members)
+            note = "no device is free: " + "; ".join(f"{m.name} {m.why}" for m in members)
     else:
         status = "OPEN"
         unable, devices = view.unable(task), view.devices
         if not devices:
-            note = "no device is here"
+            note = "no devices in the team"
         elif len(unable) == len(devices):
             note = "no device can do it: " + "; ".join(f"{name} {', '.join(why)}" for name, why in unable.items())
     return {
@@ -96,16 +96,16 @@ def _task_row(task: Task, progress: Progress, view: TeamView) -> dict[str, Any]:
 
 
 def _stopped_view(stops: Mapping[str, str], devices: Iterable[State]) -> State:
-    """``halted``, and in ``halt`` the stops, how many robots stand, and what the others say.
+    """Return ``halted``, and in ``halt`` the stops, the robots that stand still, and the reports of the others.
 
-    ``halted`` is true only where every robot says that it stands for every stop in force: a stop that was ordered and
-    not confirmed is shown as such, and so is a robot that has not heard a release.
-    ``stops`` (id to operator) are those that the team knows; ``devices`` are the rows of the page.  What a robot said
-    before it left counts, as it stands until it hears a release.
+    ``halted`` is true only if every robot confirms that it stands still for every stop in force.  A stop that is
+    ordered but not confirmed is shown as such, and so is a robot that has not received a release.  ``stops`` (id to
+    operator) are the stops that the team knows; ``devices`` are the rows of the page.  The last report of a robot that
+    left counts, as it stands still until it receives a release.
     """
     robots = [row for row in devices if row["capabilities"]]
     standing = [row for row in robots if _stands(row, stops)]
-    # A robot may obey a stop whose records are gone: the page has to name it, or no operator could release it.
+    # A robot may obey a stop whose records have expired: it is listed, as otherwise no operator could release it.
     known = {**dict.fromkeys((stop for row in robots for stop in row["stops"]), ""), **stops}
     others = [{"name": row["name"], "says": _says(row)} for row in robots if row not in standing]
     return {
@@ -126,5 +126,5 @@ def _stands(row: Mapping[str, Any], stops: Mapping[str, str]) -> bool:
 
 def _says(row: Mapping[str, Any]) -> str:
     if row["status"] == GONE:
-        return "is gone and has not confirmed"
+        return "has left and has not confirmed"
     return "has not confirmed" if row["obeys"] in ("", STANDS) else str(row["obeys"])

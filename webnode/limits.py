@@ -1,4 +1,4 @@
-"""Limits: how much one address may have open at once; whoever opens something counts it, and again when it ends."""
+"""Limit the connections and requests that one address may have open at once."""
 
 from __future__ import annotations
 
@@ -6,28 +6,28 @@ from collections import Counter
 from typing import Literal
 
 Kept = Literal["unfinished", "stream", "open"]
-"""Requests that are not complete, answers that are under way (streams and long polls among them), connections."""
+"""Incomplete requests, responses in progress (streams and long polls included), and connections."""
 MOST: dict[Kept, int] = {"unfinished": 16, "stream": 128, "open": 256}
-"""A browser sends its requests whole; so 16 that are not are many, even of a classroom that comes by one address."""
+"""A browser sends requests whole, so 16 incomplete ones are many even for a classroom behind one address."""
 
 
 class AddressLimits:
-    """Counts what each address has open."""
+    """Counts the open connections and requests of each address."""
 
     def __init__(self, most: dict[Kept, int] = MOST) -> None:
         self._most = most
         self._counts: Counter[tuple[Kept, str]] = Counter()
 
     def may(self, kind: Kept, address: str) -> bool:
-        """Whether it may have one more."""
+        """Return whether the address may open one more."""
         return self._counts[kind, address] < self._most[kind]
 
     def count(self, kind: Kept, address: str, by: int) -> None:
-        """Count one more (1), or one less (-1); nothing is kept of an address that has none."""
+        """Add 1 or -1 to the count of the address; addresses with a count of 0 are not stored."""
         self._counts[kind, address] += by
         if not self._counts[kind, address]:
             del self._counts[kind, address]
 
     def total(self, kind: Kept) -> int:
-        """How many there are of all addresses."""
+        """Return the total of all addresses."""
         return sum(count for (each, _), count in self._counts.items() if each == kind)

@@ -1,7 +1,7 @@
-"""The live side: native resources beside Flask, for the state (server-sent events) and the cameras (long polls).
+"""Serve the state (server-sent events) and the cameras (long polling) as native Twisted resources.
 
-A stream that goes through a WSGI worker holds it for good, so none does.  A client that reads slowly is put off and
-counted, never queued for: what it gets next is what it missed, or the newest where that is too much.
+A stream would occupy a WSGI worker until its end, so streams bypass Flask.  Nothing is queued for a client that
+reads slowly: it is skipped, and later gets the changes that it missed, or the whole state if that is smaller.
 """
 
 from __future__ import annotations
@@ -31,29 +31,29 @@ from webnode.state import State
 BEAT_S = 0.2
 PACE_S = 0.1
 SPARED = 4
-"""Of a team of thousands the state takes long to make: it is made again after so many times as long at the earliest."""
+"""For a large team, pause between two readings of the state as a multiple of the time that one takes."""
 CHECK_S = 1.0
-"""How often it is looked whether who hears a stream is still signed in."""
+"""Interval in seconds at which the sessions of open streams are checked."""
 LEAD_S = 3600.0
-"""So long before a session runs out the page is told, so that it can have it renewed."""
+"""Seconds before the end of a session at which the page is asked to renew it."""
 IDLE_S = 1.0
-"""How often the state is looked at when nobody does: for the chronicle, and because the departed are forgotten."""
+"""Interval of reading the state without any stream, for the chronicle and to expire departed devices."""
 MAX_VIEWERS = 256
 MAX_WAITING = 256
 ENTRIES = 100
-"""Of the chronicle, for a page that is opened."""
+"""Number of chronicle entries sent to a new page."""
 SENT_AHEAD, SYSTEM_AHEAD = 4096, 16384
-"""Bytes that may wait for a slow client here, and in the system: seconds of a slow line would be the past."""
+"""Send buffer limits in bytes for a slow client, here and in the kernel: buffered data would be seconds old."""
 
 Watch = Callable[[str, OnFrame], Callable[[], None]]
-"""Looks through the camera of a device until what is returned is called; raises ``Refusal`` where it has none."""
+"""Streams the camera of a device until the returned function is called; raises ``Refusal`` if it has none."""
 
 
 @implementer(IPushProducer)
 class Viewer:
-    """One open event stream; the transport pauses it while its client does not keep up.
+    """One open event stream; the transport pauses it while its client reads too slowly.
 
-    ``heard`` is the number of the last change that it was told, ``entry`` that of the chronicle.
+    ``heard`` is the number of the last change sent, ``entry`` the number of the last chronicle entry.
     """
 
     def __init__(self, request: Request, is_whole: bool = False, heard: int = 0, ticket: str = "") -> None:
@@ -68,22 +68,22 @@ class Viewer:
         self.seen: dict[str, str] = {}
 
     def pauseProducing(self) -> None:
-        """Stop writing: the client is behind."""
+        """Pause: the client reads too slowly."""
         self.paused = True
 
     def resumeProducing(self) -> None:
-        """Go on writing."""
+        """Resume writing."""
         self.paused = False
 
     def stopProducing(self) -> None:
-        """Stop writing for good."""
+        """Stop writing; the connection has ended."""
         self.paused = True
 
     def narrow(self) -> None:
-        """Let little wait between this node and a slow client."""
+        """Shrink the send buffers of the connection."""
         transport: Any = getattr(self.request.channel, "transport", None)
         if isinstance(transport, ProtocolWrapper):
-            # Over TLS the socket lies one floor below.
+            # Over TLS the socket belongs to the wrapped transport.
             transport = transport.transport
         handle = transport.getHandle() if hasattr(transport, "getHandle") else None
         if isinstance(handle, socket.socket):
@@ -92,16 +92,16 @@ class Viewer:
 
 
 class Events(JsonResource):
-    """``/events?since=ID&whole=1``: the state, then each change, at most ten a second; a ``beat`` five times a second.
+    """``/events?since=ID&whole=1``: the state, then changes, at most ten per second; a ``beat`` five times a second.
 
-    Events are ``state`` (``state.state_of``, with ``resync``: whether it replaces changes that were missed), ``change``
-    (``journal.Change``), ``yard`` (the overhead snapshot, or null), ``pages`` (where the team serves the page),
-    ``event`` (entries of the chronicle), ``ticket`` (the session runs out ``until`` then, and can be renewed) and
-    ``beat`` (``now`` in unix seconds, ``skipped``: how often this slow client was put off).  ``since``, or the header
-    ``Last-Event-ID``, is the last id that was heard: what came after it is told, where it is still kept and less than
+    Events are ``state`` (``state.state_of``; ``resync`` is true if it replaces missed changes), ``change``
+    (``journal.Change``), ``yard`` (the map of the simulator, or null), ``pages`` (the URLs of the team's pages),
+    ``event`` (entries of the chronicle), ``ticket`` (the session expires at ``until`` and can be renewed) and ``beat``
+    (``now`` in unix seconds, ``skipped``: the number of updates skipped for this slow client).  ``since``, or the
+    header ``Last-Event-ID``, is the last id received: later changes are sent if they are still kept and smaller than
     the whole state.  With ``whole`` each change is a ``state``.  A stream ends with its session.
 
-    ``version`` is asked instead of reading the state again: while it is the same nothing has changed.
+    ``version`` avoids reading the state: an equal value means that nothing has changed.
     """
 
     isLeaf = True
@@ -139,18 +139,18 @@ class Events(JsonResource):
 
     @property
     def viewers(self) -> int:
-        """How many streams are open."""
+        """The number of open streams."""
         return len(self._viewers)
 
     def open(self) -> None:
-        """Look at the state from now on, for the chronicle, also while nobody else does."""
+        """Start to read the state for the chronicle, also without any stream."""
         self._is_open = True
         self._schedule(IDLE_S)
 
     def render_GET(self, request: Request) -> int | bytes:
         """Open a stream."""
         if len(self._viewers) >= MAX_VIEWERS:
-            return answer(request, Refusal("events", "too many pages are open", "close one and try again", 503))
+            return answer(request, Refusal("events", "too many open pages", "close one and try again", 503))
         request.setHeader("Content-Type", "text/event-stream; charset=utf-8")
         request.setHeader("Cache-Control", "no-store")
         request.setHeader("X-Accel-Buffering", "no")
@@ -161,9 +161,9 @@ class Events(JsonResource):
         request.notifyFinish().addBoth(lambda _: self._close(viewer))
         viewer.narrow()
         request.registerProducer(viewer, True)
-        self._look()
-        words = ["retry: 1000\n\n", self._missed(viewer, bool(since)), self._offered(viewer, self._news())]
-        request.write("".join([*words, self._beat(viewer)]).encode())
+        self._read_state()
+        text = ["retry: 1000\n\n", self._backlog(viewer, bool(since)), self._latest_events(viewer, self._news())]
+        request.write("".join([*text, self._beat(viewer)]).encode())
         if len(self._viewers) == 1:
             self._beat_at = self._clock.seconds() + BEAT_S
             self._schedule(PACE_S)
@@ -183,7 +183,7 @@ class Events(JsonResource):
 
     def _tick(self) -> None:
         self._schedule(PACE_S if self._viewers else IDLE_S)
-        self._look()
+        self._read_state()
         if not self._viewers:
             return
         news, is_beat = self._news(), self._clock.seconds() >= self._beat_at
@@ -198,12 +198,16 @@ class Events(JsonResource):
             if viewer.paused:
                 viewer.skipped += viewer.heard < self._journal.n
                 continue
-            words = self._missed(viewer, True) + self._offered(viewer, news) + (self._beat(viewer) if is_beat else "")
-            if words:
-                viewer.request.write(words.encode())
+            text = (
+                self._backlog(viewer, True)
+                + self._latest_events(viewer, news)
+                + (self._beat(viewer) if is_beat else "")
+            )
+            if text:
+                viewer.request.write(text.encode())
 
     def _may_stay(self, viewer: Viewer) -> bool:
-        """End the stream of who is signed in no more; tell who will be so soon, and may have it put off."""
+        """End the stream of an expired session; announce the expiry of one that can be renewed."""
         now = self._wall()
         who = self._board.sessions.visitor(viewer.ticket, now)
         if who.role == "anyone":
@@ -218,8 +222,8 @@ class Events(JsonResource):
         viewer.request.unregisterProducer()
         viewer.request.finish()
 
-    def _look(self) -> None:
-        """Take the state, where it may have changed."""
+    def _read_state(self) -> None:
+        """Read the state, if it may have changed."""
         now = self._clock.seconds()
         if now - self._read_at < SPARED * self._took:
             return
@@ -227,56 +231,60 @@ class Events(JsonResource):
         if version is not None and version == self._known and now - self._read_at < IDLE_S:
             return
         self._known, self._read_at = version, now
-        with_state = self._sound("state", lambda: self._journal.take(self._read()))
+        with_state = self._call_logged("state", lambda: self._journal.take(self._read()))
         if with_state:
             self._board.chronicle.saw(self._journal.state, self._wall())
         self._took = self._clock.seconds() - now
 
-    def _missed(self, viewer: Viewer, is_again: bool) -> str:
-        """What a viewer was not told of the state, as changes or whole, whichever is less, and of the chronicle."""
-        journal, words = self._journal, []
+    def _backlog(self, viewer: Viewer, is_again: bool) -> str:
+        """Return the missed changes or the whole state, whichever is smaller, and the missed chronicle entries."""
+        journal, text = self._journal, []
         missed = None if viewer.is_whole else journal.since(viewer.heard)
-        if missed is not None and len(missed) > 1 and sum(len(each.words) for each in missed) > len(self._written()):
+        if (
+            missed is not None
+            and len(missed) > 1
+            and sum(len(each.words) for each in missed) > len(self._encoded_state())
+        ):
             missed = None
         if missed is not None:
-            words = [f"id: {journal.id(each.n)}\nevent: change\ndata: {each.words}\n\n" for each in missed]
+            text = [f"id: {journal.id(each.n)}\nevent: change\ndata: {each.words}\n\n" for each in missed]
         elif viewer.heard < journal.n:
             start = "true," if is_again and not viewer.is_whole else "false,"
-            words = [f'id: {journal.id(journal.n)}\nevent: state\ndata: {{"resync":{start}{self._written()}\n\n']
+            text = [f'id: {journal.id(journal.n)}\nevent: state\ndata: {{"resync":{start}{self._encoded_state()}\n\n']
         viewer.heard = journal.n
         entries = self._board.chronicle.since(viewer.entry)[-ENTRIES:]
         if entries:
             viewer.entry = entries[-1].n
-            words.append(_event("event", dumped([asdict(entry) for entry in entries])))
-        return "".join(words)
+            text.append(_event("event", dumped([asdict(entry) for entry in entries])))
+        return "".join(text)
 
-    def _written(self) -> str:
-        """The whole state as JSON without its first brace, written once for all who need it."""
+    def _encoded_state(self) -> str:
+        """Return the whole state as JSON without its first brace, encoded once for all viewers."""
         if self._whole[0] != self._journal.n:
             self._whole = (self._journal.n, dumped(self._journal.state)[1:])
         return self._whole[1]
 
-    def _offered(self, viewer: Viewer, news: Mapping[str, str]) -> str:
-        """Of what only the newest counts, that which a viewer has not seen."""
-        fresh = {event: words for event, words in news.items() if viewer.seen.get(event) != words}
+    def _latest_events(self, viewer: Viewer, news: Mapping[str, str]) -> str:
+        """Return the events of which only the newest counts, if the viewer has not received them yet."""
+        fresh = {event: text for event, text in news.items() if viewer.seen.get(event) != text}
         viewer.seen |= fresh
-        return "".join(_event(event, words) for event, words in fresh.items())
+        return "".join(_event(event, text) for event, text in fresh.items())
 
     def _beat(self, viewer: Viewer) -> str:
         return _event("beat", dumped({"now": round(self._wall(), 3), "skipped": viewer.skipped}))
 
     def _news(self) -> dict[str, str]:
-        told = {event: self._sound(event, partial(_read_out, source)) for event, source in self._newest.items()}
-        return {event: words for event, words in told.items() if words is not None}
+        encoded = {event: self._call_logged(event, partial(_encode, source)) for event, source in self._newest.items()}
+        return {event: text for event, text in encoded.items() if text is not None}
 
-    def _sound(self, event: str, made: Callable[[], Any]) -> Any:
-        """What ``made`` makes, or None where it fails, which is logged once."""
+    def _call_logged(self, event: str, produce: Callable[[], Any]) -> Any:
+        """Call ``produce`` and return its result, or None if it fails; consecutive failures are logged once."""
         try:
-            found = made()
+            found = produce()
         except Exception:
-            # The sources are the front door's; a store that cannot be read for a moment must not end the streams.
+            # A store that cannot be read for a moment must not end the streams.
             if not self._failing.get(event):
-                self._log.failure("the page's {event} cannot be read; the streams go on without", event=event)
+                self._log.failure("cannot read the page's {event}; the streams continue without it", event=event)
             self._failing[event] = True
             return None
         self._failing[event] = False
@@ -288,16 +296,16 @@ class Events(JsonResource):
             self._schedule(IDLE_S if self._is_open else None)
 
 
-def _read_out(source: Callable[[], Any]) -> str:
+def _encode(source: Callable[[], Any]) -> str:
     return dumped(source())
 
 
-def _event(event: str, words: str) -> str:
-    return f"event: {event}\ndata: {words}\n\n"
+def _event(event: str, text: str) -> str:
+    return f"event: {event}\ndata: {text}\n\n"
 
 
 def shown(request: Request) -> str:
-    """The token or ticket that a request shows."""
+    """Return the token or ticket of a request."""
     tickets: list[bytes] = (request.args or {}).get(b"ticket", [b""])
     return token_of(request.getHeader("authorization") or "", tickets[0].decode("ascii", "replace"))
 
@@ -305,9 +313,8 @@ def shown(request: Request) -> str:
 class Shots(JsonResource):
     """``/shot/<device>?after=N&viewer=V``: the newest picture whose number is not N, as soon as there is one.
 
-    The answer carries ``X-Seq``, the number to give as ``after`` next.  204 after five seconds without a new
-    picture.  A viewer that asks again while its last question is open gets the older one answered with 204: one
-    picture in flight, never a queue.
+    The response has the number in ``X-Seq``, to be used as the next ``after``; it is 204 after five seconds without a
+    new picture.  A second request of the same viewer ends its first with 204, so one picture is in flight per viewer.
     """
 
     def __init__(self, watch: Watch, clock: IReactorTime) -> None:
@@ -318,15 +325,15 @@ class Shots(JsonResource):
 
     @property
     def watched(self) -> list[str]:
-        """The devices whose pictures are wanted now."""
+        """The devices with an open camera stream."""
         return list(self._cameras)
 
     def getChild(self, path: bytes, request: Request) -> Resource:
-        """The camera of one device."""
+        """Return the resource of one device's camera."""
         return _Shot(self, path.decode("ascii", "replace"))
 
     def ask(self, uuid: str, request: Request) -> int | bytes:
-        """Answer at once if the newest picture is news, else when the next one comes."""
+        """Answer at once if the newest picture is new to the viewer, else with the next one."""
         camera = self._cameras.get(uuid)
         if camera is None:
             try:
@@ -335,12 +342,12 @@ class Shots(JsonResource):
                 return answer(request, refusal)
             self._cameras[uuid] = camera
         if len(camera.waiting) >= MAX_WAITING:
-            return answer(request, Refusal("shot", "too many look at this camera", "close one and try again", 503))
+            return answer(request, Refusal("shot", "too many viewers of this camera", "close one and try again", 503))
         camera.wait(request)
         return NOT_DONE_YET
 
     def close(self) -> None:
-        """End every question and every upstream."""
+        """End every request and every upstream."""
         for camera in list(self._cameras.values()):
             camera.close()
 

@@ -1,8 +1,8 @@
-"""Password: the hash of one, made and checked; and the code to sign in with where the settings name none.
+"""Hash and verify the page's password, and draw a sign-in code for settings without one.
 
-scrypt with N = 2^14, r = 8, p = 5 takes 16 MiB, which a small device has, and is one of the choices of the OWASP
-Password Storage Cheat Sheet, beside N = 2^17, p = 1 with 128 MiB.  It takes some tenths of a second, so it never runs
-on the reactor's thread.
+scrypt with N = 2^14, r = 8, p = 5 takes 16 MiB, which a small device has; the OWASP Password Storage Cheat Sheet lists
+it as equivalent to N = 2^17, p = 1 with 128 MiB.  It takes some tenths of a second, so it never runs on the reactor's
+thread.
 """
 
 from __future__ import annotations
@@ -16,34 +16,34 @@ LOG_N, R, P = 14, 8, 5
 MEMORY = 64 * 1024 * 1024
 SALT, SIZE = 16, 32
 LEAST, MOST = 8, 200
-"""Characters of a password."""
+"""Length limits of a password, in characters."""
 LETTERS = "abcdefghjkmnpqrstuvwxyz"
-"""Of a code: none looks like another, or like a digit."""
+"""Letters of a code; none resembles another or a digit."""
 
 
 def draw_code(rng: random.Random) -> str:
-    """A code to sign in with."""
+    """Draw a sign-in code."""
     letters = "".join(rng.choice(LETTERS) for _ in range(8))
     return f"{letters[:4]}-{letters[4:]}"
 
 
 def hashed(password: str, salt: bytes, log_n: int = LOG_N) -> str:
-    """The text to put into the settings; ``salt`` are 16 random bytes."""
+    """Return the hash for the settings; ``salt`` are 16 random bytes."""
     digest = _scrypt(password, salt, log_n, R, P)
     return "$".join(("scrypt", str(log_n), str(R), str(P), _text(salt), _text(digest)))
 
 
 def is_password(text: str, password: str) -> bool:
-    """Whether ``text`` is the hash of ``password``; raises ``ValueError`` where it is no hash."""
+    """Return whether ``text`` is the hash of ``password``; raises ``ValueError`` if it is not a valid hash."""
     log_n, r, p, salt, digest = read(text)
     return hmac.compare_digest(_scrypt(password, salt, log_n, r, p), digest)
 
 
 def read(text: str) -> tuple[int, int, int, bytes, bytes]:
-    """The parts of a hash; raises ``ValueError`` where it is none, or one that takes too much memory."""
+    """Parse a hash; raises ``ValueError`` if it is invalid or needs too much memory."""
     kind, *figures, salt, digest = text.split("$")
     if kind != "scrypt" or len(figures) != 3:
-        raise ValueError("it does not begin with scrypt and three numbers")
+        raise ValueError("it does not start with scrypt and three numbers")
     log_n, r, p = (int(figure) for figure in figures)
     if not (1 <= log_n <= 20 and 1 <= r <= 32 and 1 <= p <= 16 and 128 * r * 2**log_n <= MEMORY // 2):
         raise ValueError("its numbers are out of range")

@@ -1,4 +1,4 @@
-"""Resource: what the native resources have in common: whatever they refuse is JSON, as Flask's refusals are."""
+"""Answer errors of native resources as JSON, as Flask's routes do."""
 
 from __future__ import annotations
 
@@ -11,24 +11,20 @@ from webnode.errors import Refusal
 
 
 class JsonResource(Resource):
-    """A resource that answers GET; every other method, and every path below it, is refused in JSON."""
+    """A resource that answers ``methods``; other methods and unknown paths below it are refused as JSON."""
 
     methods: tuple[bytes, ...] = (b"GET",)
-    """What it answers; a stream leaves HEAD out, as nobody would end it."""
+    """The supported methods; streams leave out HEAD, as such a request would not end."""
 
     def getChild(self, path: bytes, request: Request) -> Resource:
-        """There is nothing below."""
-        return Refused(
-            Refusal(path_of(request), "not found", "look at docs/reference/http-api.md for what can be asked", 404)
-        )
+        """Refuse a path below this resource."""
+        return Refused(Refusal(path_of(request), "not found", "see docs/reference/http-api.md for the routes", 404))
 
     def render(self, request: Request) -> int | bytes:
-        """Answer with one of ``methods``."""
+        """Answer a request with one of ``methods``."""
         is_there = self.isLeaf or hasattr(self, "render_GET") or request.method not in (b"GET", b"HEAD")
         if not is_there or (self.isLeaf and getattr(request, "postpath", None)):
-            refusal = Refusal(
-                path_of(request), "not found", "look at docs/reference/http-api.md for what can be asked", 404
-            )
+            refusal = Refusal(path_of(request), "not found", "see docs/reference/http-api.md for the routes", 404)
             return answer(request, refusal)
         if request.method not in self.methods:
             request.setHeader("Allow", b", ".join(self.methods).decode())
@@ -39,7 +35,7 @@ class JsonResource(Resource):
 
 
 class Refused(Resource):
-    """A resource that is refused, whatever is asked of it."""
+    """A resource that answers every request with the same refusal."""
 
     isLeaf = True
 
@@ -48,12 +44,12 @@ class Refused(Resource):
         self._refusal = refusal
 
     def render(self, request: Request) -> bytes:
-        """Say why."""
+        """Answer with the refusal."""
         return answer(request, self._refusal)
 
 
 def answer(request: Request, refusal: Refusal) -> bytes:
-    """The body of a native resource's refusal, with its status and type set."""
+    """Set status and type of a refusal, and return its JSON body."""
     request.setResponseCode(refusal.status)
     request.setHeader("Content-Type", "application/json")
     request.setHeader("Cache-Control", "no-store")
@@ -61,12 +57,12 @@ def answer(request: Request, refusal: Refusal) -> bytes:
 
 
 def argument(request: Request, name: bytes) -> bytes:
-    """The first value of that name in the query, at most 40 bytes of it; empty where there is none."""
+    """Return the first value of a query parameter, cut to 40 bytes; empty if it is missing."""
     values: list[bytes] = (request.args or {}).get(name, [b""])
     return values[0][:40]
 
 
 def path_of(request: Request) -> str:
-    """The path that was asked for, for people: without its query, which may hold a ticket, and not too long."""
+    """Return the requested path for messages: cut, and without its query, which may contain a ticket."""
     path: bytes = request.path or b""
     return path.decode("ascii", "replace")[:100]

@@ -1,7 +1,7 @@
-"""Revocation: the sessions that were ended before their time, as every web node of the team knows them.
+"""Share the sessions that were ended early among the web nodes of the team.
 
-Each web node keeps one record with those that were ended at it, so that all others hear of them at once, and a web node
-that starts later reads them.
+Each web node keeps one record with the sessions that ended there; the others watch these records, and a web node that
+starts later reads them.
 """
 
 from __future__ import annotations
@@ -19,57 +19,57 @@ from middleware.node import SwarmNode
 REVOKED = hashed_key("signed-out")
 SLOT = "signed-out"
 MOST = 60
-"""Sessions in one record, the newest: it has to fit into a datagram."""
+"""Maximum number of sessions in one record, the newest; the record has to fit into a datagram."""
 REMEMBERED = 4096
 ID_BYTES = 8
 
 
 class Revocations:
-    """Sessions that were ended here, known to no other node; ``has`` may be asked on any thread."""
+    """The revoked sessions of one web node, not shared; ``has`` may be called on any thread."""
 
     def __init__(self) -> None:
         self._known: dict[str, float] = {}
 
     def has(self, token_id: str) -> bool:
-        """Whether it was ended."""
+        """Return whether the session is revoked."""
         return token_id in self._known
 
     def add(self, token_id: str, until: float) -> None:
-        """End it; whatever was made of it runs out ``until`` then, in unix seconds."""
+        """Revoke a session; it and all tokens derived from it expire at ``until``, in unix seconds."""
         self._known = _newest({**self._known, token_id: until}, REMEMBERED)
 
 
 class TeamRevocations(Revocations):
-    """Those that were ended at any web node of the team of ``node``."""
+    """The sessions revoked at any web node of the team of ``node``."""
 
     def __init__(self, node: SwarmNode) -> None:
         super().__init__()
         self._node = node
         self._own: dict[str, float] = {}
-        self._watch = node.entangled.watch(REVOKED, self._heard, keep=True)
+        self._watch = node.entangled.watch(REVOKED, self._on_records, keep=True)
 
     def add(self, token_id: str, until: float) -> None:
-        """End it here at once, and tell the others."""
+        """Revoke a session here, and publish that to the other web nodes."""
         self._learn({token_id: until})
         own = {each: end for each, end in self._own.items() if end > self._node.wall()}
         self._own = _newest({**own, token_id: until}, MOST)
         ends = {bytes.fromhex(each): int(min(end, LARGEST)) for each, end in self._own.items()}
-        self._node.entangled.put(REVOKED, SLOT, bounded(bytes(msgpack.packb(ends))), "team").addErrback(_untold)
+        self._node.entangled.put(REVOKED, SLOT, bounded(bytes(msgpack.packb(ends))), "team").addErrback(_ignore_failure)
 
-    def _heard(self, records: list[Record]) -> None:
+    def _on_records(self, records: list[Record]) -> None:
         for record in records:
             self._learn(revoked_in(record))
 
     def _learn(self, ends: Mapping[str, float]) -> None:
-        # What was ended stays so, though who told it is gone; and a new table each time: whoever looks on another
-        # thread has the old one in hand.
+        # A revocation stays valid when its publisher leaves.  The table is replaced, never modified, as other threads
+        # read it.
         now = self._node.wall()
         known = {each: end for each, end in self._known.items() if end > now}
         self._known = _newest({**known, **{each: end for each, end in ends.items() if end > now}}, REMEMBERED)
 
 
 def revoked_in(record: Record) -> Mapping[str, float]:
-    """The sessions that a record ends, by id, with when each would have run out; none where its value is no such."""
+    """Return the sessions that a record revokes, by id with their time of expiry; empty if it is invalid."""
     content: dict[Any, Any] | None = mapping_of(record) if record.name == SLOT else None
     return {
         each.hex(): float(end)
@@ -82,6 +82,6 @@ def _newest(ends: Mapping[str, float], most: int) -> dict[str, float]:
     return dict(list(ends.items())[-most:])
 
 
-def _untold(failure: Any) -> None:
-    """Nobody could be told now: it holds here."""
+def _ignore_failure(failure: Any) -> None:
+    """Ignore that no replica could be reached: the revocation is valid here."""
     failure.trap(EntangledError)

@@ -1,7 +1,7 @@
-"""Route: one line of the API as data, from which it is checked, guarded, carried out and documented.  Pure.
+"""Describe a route of the API as data, and check requests against it.  Pure.
 
-A route says what may stand in its path, its query and its body; ``checked`` turns what came into what was asked for, or
-refuses it in words that name the field.  An answer gets an ``Ask`` and knows neither HTTP nor Flask.
+A route lists the fields of its path, query and body.  ``checked`` converts a request or refuses it with the name of the
+field.  An answer gets an ``Ask`` and knows neither HTTP nor Flask.
 """
 
 from __future__ import annotations
@@ -22,28 +22,28 @@ from webnode.visitor import Role, Visitor
 API = "/api/v1"
 MAX_NUMBER = 1e9
 REQUIRED: Any = object()
-"""Stands for the default of a field that has none."""
+"""The default of a field that has to be given."""
 ALLOWED: Mapping[Role, tuple[Role, ...]] = {
     "anyone": ("anyone", "viewer", "operator", "phone"),
     "viewer": ("viewer", "operator", "phone"),
     "operator": ("operator",),
     "phone": ("phone", "operator"),
 }
-"""For each role that a route wants, the roles that have it."""
+"""For each role that a route requires, the roles that satisfy it."""
 
 Kind = Literal["text", "number", "whole", "flag", "choice", "table", "list"]
 Answer = Callable[["Ask"], Any]
 """Called on the reactor's thread; returns JSON or ``Content``, or a Deferred of it, and raises ``Refusal``."""
 Native = Callable[[Board, Any], Any]
-"""Makes the Twisted resource of a route from the board and the reactor, once, when the page is opened."""
+"""Makes the Twisted resource of a route from the board and the reactor, once, when the service is created."""
 
 
 @dataclass(frozen=True)
 class Field:
-    """One value that a route takes.
+    """One parameter of a route.
 
-    ``least`` and ``most`` bound a number, the characters of a text (1 to 300 where they are not given) or the entries
-    of a list.  ``default`` holds where the field is missing; without one it has to be given.
+    ``least`` and ``most`` bound a number, the characters of a text (default 1 to 300) or the entries of a list.
+    ``default`` is used if the field is missing; a field without a default is required.
     """
 
     name: str
@@ -62,10 +62,10 @@ DEVICE = Field("uuid", "text", "the device", "path", most=64)
 
 @dataclass(frozen=True)
 class Ask:
-    """What is asked of a route, checked.
+    """A checked request for a route.
 
-    ``id`` is the client's own name for it (header ``Idempotency-Key``), empty where it gave none: what is asked twice
-    by one id is done once.  ``source`` is the address that it came from, ``now`` unix seconds, ``table`` every route.
+    ``id`` is the client's ``Idempotency-Key`` or empty: repeated requests with one id are carried out once.  ``source``
+    is the client's address, ``now`` unix seconds, ``table`` all routes.
     """
 
     given: Mapping[str, Any]
@@ -80,7 +80,7 @@ class Ask:
 
 @dataclass(frozen=True)
 class Content:
-    """An answer that is no JSON."""
+    """An answer that is not JSON."""
 
     body: bytes
     kind: str
@@ -88,10 +88,10 @@ class Content:
 
 @dataclass(frozen=True)
 class Route:
-    """One line of the API.
+    """One route of the API.
 
-    ``answer`` None: the route is not Flask's but a Twisted resource's, made by ``native`` or by the front door.
-    ``limit_s`` is for answers that may take longer than the others; ``takes`` is the media type of a native body.
+    With ``answer`` None the route is served by a Twisted resource, made by ``native`` or by ``server``, instead of
+    Flask.  ``limit_s`` replaces the usual time limit of an answer; ``takes`` is the media type of a native body.
     """
 
     method: Literal["GET", "POST", "PUT", "DELETE"]
@@ -113,24 +113,24 @@ class Route:
 
 
 def guarded(role: Role, who: Visitor) -> None:
-    """Let ``who`` ask what wants ``role``, or raise ``Refusal``."""
+    """Check that ``who`` has the role ``role``; raises ``Refusal`` otherwise."""
     if who.role in ALLOWED[role]:
         return
     if who.role == "anyone":
         remedy = f"sign in at POST {API}/session, and send 'Authorization: Bearer TOKEN' or ?ticket=TICKET"
-        raise Refusal("Authorization", "nobody is signed in", remedy, 401)
+        raise Refusal("Authorization", "not signed in", remedy, 401)
     raise Refusal("Authorization", f"a {who.role} may not do this", f"sign in as {role}", 403)
 
 
 def checked(route: Route, path: Mapping[str, str], query: Mapping[str, str], body: object) -> dict[str, Any]:
-    """What was asked for, by field name; raises ``Refusal`` with the field, the problem and the remedy."""
+    """Return the values by field name; raises ``Refusal`` with the field, the problem and the remedy."""
     if not isinstance(body, Mapping):
         raise Refusal("body", "it is not a JSON object", 'send something like {"name": "value"}')
     places: dict[str, Mapping[str, Any]] = {"path": path, "query": query, "body": body}
     known = {field.name for field in route.fields if field.where == "body"}
     for name in body:
         if name not in known:
-            raise Refusal(text(name, "body", 64), "there is no such field", _nearest(name, known))
+            raise Refusal(text(name, "body", 64), "unknown field", _nearest(name, known))
     given: dict[str, Any] = dict(path)
     for field in route.fields:
         place = places[field.where]
@@ -145,10 +145,10 @@ def checked(route: Route, path: Mapping[str, str], query: Mapping[str, str], bod
 
 
 def device(ask: Ask) -> State:
-    """The device that the path names by ``uuid``; raises ``Refusal`` 404 where there is none, 409 where it is gone."""
+    """Return the device of the path's ``uuid``; raises ``Refusal`` 404 if it is unknown, 409 if it has left."""
     found = [each for each in ask.state["devices"] if each["uuid"] == ask.given["uuid"]]
     if not found:
-        raise Refusal("device", "there is no such device", f"choose one of {API}/devices", 404)
+        raise Refusal("device", "unknown device", f"choose one of {API}/devices", 404)
     if found[0]["status"] == GONE:
         raise Refusal("device", f"{found[0]['name']} has left the network", "wait until it is back", 409)
     return dict(found[0])
@@ -160,7 +160,7 @@ def _nearest(name: object, known: Collection[str]) -> str:
 
 
 def _read(field: Field, word: str) -> object:
-    """What the text of a path or query stands for, or the text itself, of which the check then complains."""
+    """Convert the text of a path or query field; an invalid text stays as it is and fails the check."""
     if field.kind in ("number", "whole"):
         try:
             return float(word)
@@ -170,10 +170,10 @@ def _read(field: Field, word: str) -> object:
 
 
 def hint_of(field: Field) -> Any:
-    """The type of a field with its bounds, by which it is converted and documented."""
+    """Return the type of a field with its bounds, for conversion and documentation."""
     least, most = field.least, field.most
     match field.kind:
-        case "text":  # perhaps a password, so no error repeats it
+        case "text":  # may be a password, so errors must not repeat it
             return Annotated[
                 str, Meta(min_length=int(1 if least is None else least), max_length=_longest(field)), Secret()
             ]

@@ -1,6 +1,6 @@
-"""The web node's port: Flask for the page and JSON, native resources for the streams and files, in one ``Site``.
+"""Serve Flask (page and JSON) and native resources (streams and files) on one port with one ``Site``.
 
-The only module of this room that touches the world: a listening port and a pool of worker threads.
+The only module of this package with side effects: it opens a port and starts a pool of worker threads.
 """
 
 from __future__ import annotations
@@ -51,19 +51,19 @@ Door = Callable[[Site], IListeningPort]
 
 
 def caller(reactor: Any, usual_s: float = LIMIT_S) -> OnReactor:
-    """What Flask's workers call the desk with: run on the reactor's thread, wait at most ``limit_s`` for the answer.
+    """Return the function with which Flask's workers call code on the reactor's thread.
 
-    Without ``limit_s`` it is ``usual_s``.  A Deferred is waited for.  Where no answer comes in time a ``Refusal`` with
-    status 503 is raised; the wish may still be granted.
+    It waits at most ``limit_s`` (default ``usual_s``) for the result, also of a Deferred.  After that it raises a
+    ``Refusal`` with status 503; the call may still succeed.
     """
 
-    def on_reactor(wish: Callable[..., Any], *arguments: Any, limit_s: float | None = None) -> Any:
+    def on_reactor(call: Callable[..., Any], *arguments: Any, limit_s: float | None = None) -> Any:
         answers: SimpleQueue[Any] = SimpleQueue()
-        reactor.callFromThread(lambda: maybeDeferred(wish, *arguments).addBoth(answers.put))
+        reactor.callFromThread(lambda: maybeDeferred(call, *arguments).addBoth(answers.put))
         try:
             outcome = answers.get(timeout=usual_s if limit_s is None else limit_s)
         except Empty:
-            raise Refusal("node", "it did not answer in time", "look at the state, then try again", 503) from None
+            raise Refusal("node", "no answer in time", "check the state, then try again", 503) from None
         if isinstance(outcome, Failure):
             outcome.raiseException()
         return outcome
@@ -72,9 +72,9 @@ def caller(reactor: Any, usual_s: float = LIMIT_S) -> OnReactor:
 
 
 class Files(JsonResource):
-    """``/static``: the page's few files, read and packed once; revalidated by ETag, so an update shows at once.
+    """``/static``: the files of the page, read and compressed once, revalidated by ETag.
 
-    ``files.json`` has the paths of all of them, for a browser that keeps the page.
+    ``files.json`` lists all paths, for the service worker.
     """
 
     def __init__(self, folder: Path = STATIC) -> None:
@@ -92,7 +92,7 @@ class _File(JsonResource):
 
     def __init__(self, name: str, content: bytes) -> None:
         super().__init__()
-        # Packed by the same hand at every node: no time of day in it, so the tag holds everywhere.
+        # mtime=0 makes the compressed bytes, and so the tag, equal at every node.
         packed = gzip.compress(content, 9, mtime=0)
         self._forms = {"": content, "gzip": packed} if len(packed) < len(content) else {"": content}
         self._tag = hashlib.blake2s(content, digest_size=8).hexdigest()
@@ -112,13 +112,13 @@ class _File(JsonResource):
 
 
 def sent(path: Path) -> bytes:
-    """What is sent of a file: of a script, its comments are empty lines, so that all others keep their number."""
+    """Return the content to send; comment lines of scripts become empty lines, which keeps line numbers."""
     content = path.read_bytes()
     return re.sub(rb"^ *//.*$", b"", content, flags=re.MULTILINE) if path.suffix == ".js" else content
 
 
 def _takes_gzip(accepted: str) -> bool:
-    """Whether an ``Accept-Encoding`` header names gzip, and not with a weight of zero."""
+    """Return whether an ``Accept-Encoding`` header accepts gzip with a weight above zero."""
     for entry in accepted.split(","):
         name, _, weight = entry.replace(" ", "").partition(";q=")
         if name == "gzip":
@@ -127,9 +127,9 @@ def _takes_gzip(accepted: str) -> bool:
 
 
 class Root(Resource):
-    """Who answers what: a native resource where its route begins the path, Flask everything else.
+    """Dispatch a request to the native resource of its path, or to Flask.
 
-    Native routes are guarded here as Flask's are there; a resource is asked by nobody who may not.
+    Access to native resources is checked here, as Flask checks its own routes.
     """
 
     def __init__(
@@ -151,11 +151,11 @@ class Root(Resource):
         self._hosts = hosts
 
     def getChild(self, path: bytes, request: SiteRequest) -> IResource:
-        """The resource for ``path``."""
+        """Return the resource for ``path``."""
         assert request.prepath is not None and request.postpath is not None
         asked = (path, *request.postpath)
         for pattern, resource, role in self._native:
-            if _begins(asked, pattern):
+            if _matches(asked, pattern):
                 for _ in pattern[1:]:
                     request.prepath.append(request.postpath.pop(0))
                 return self._guarded(resource, role, request)
@@ -169,7 +169,7 @@ class Root(Resource):
         for name, value in headers(host, origin, lets_in).items():
             request.setHeader(name, value)
         method = (request.method or b"").decode("ascii", "replace")
-        # A page that is being closed can still send a last word, but no header with it.
+        # navigator.sendBeacon, which a phone uses when its page is closed, cannot set headers.
         is_marked = role == "phone" or request.getHeader("x-swarm") == "1" or method == "GET"
         problem = refusal(method, host, origin, is_marked, self._hosts, lets_in)
         if problem is not None:
@@ -187,7 +187,7 @@ class Root(Resource):
 
 
 class _Preflight(Resource):
-    """What a browser asks before it lets a page of another node ask."""
+    """The answer to a CORS preflight request."""
 
     isLeaf = True
 
@@ -196,7 +196,7 @@ class _Preflight(Resource):
         return b""
 
 
-def _begins(asked: Sequence[bytes], pattern: Sequence[bytes]) -> bool:
+def _matches(asked: Sequence[bytes], pattern: Sequence[bytes]) -> bool:
     return len(asked) >= len(pattern) and all(
         segment == wanted or (wanted.startswith(b"{") and segment != b"")
         for segment, wanted in zip(asked, pattern, strict=False)
@@ -204,28 +204,28 @@ def _begins(asked: Sequence[bytes], pattern: Sequence[bytes]) -> bool:
 
 
 def _role_of(path: str) -> Role:
-    """The role that the native route at ``path``, or below it, wants; one that no route names is for operators."""
+    """Return the role for the native route at ``path`` or below it; "operator" for a path without a route."""
     roles = [route.role for route in TABLE if route.answer is None and f"{route.path}/".startswith(f"{path}/")]
     return roles[0] if roles else "operator"
 
 
 def listening(reactor: Any, host: str, port: int, factory: Any, setting: str) -> IListeningPort:
-    """A TCP port that is open for ``factory``; raises ``PortTaken``, which says what to do about ``setting``."""
+    """Open a TCP port for ``factory``; raises ``PortTaken``, with a remedy for ``setting``."""
     try:
         opened: IListeningPort = reactor.listenTCP(port, factory, interface=host)
     except CannotListenError as error:
         why = getattr(error.socketError, "strerror", None) or str(error.socketError)
         is_foreign = getattr(error.socketError, "errno", None) == errno.EADDRNOTAVAIL
-        remedy = "give host an address of this machine" if is_foreign else f"choose another {setting}, or 0"
-        raise PortTaken(f"the page cannot be served on {host or '*'}:{port} ({why}); {remedy}") from error
+        remedy = "set host to an address of this machine" if is_foreign else f"choose another {setting}, or 0"
+        raise PortTaken(f"cannot serve the page on {host or '*'}:{port} ({why}); {remedy}") from error
     return opened
 
 
 class QuietSite(Site):
-    """A site that keeps no access log (three cameras alone would write forty lines a second) and names no version."""
+    """A site without an access log (three cameras would write forty lines a second) and without a Server header."""
 
     def getResourceFor(self, request: Any) -> IResource:  # noqa: N802
-        """The resource that answers; which Twisted serves it is nobody's business."""
+        """Return the resource for the request, and remove the Server header."""
         request.responseHeaders.removeHeader(b"server")
         found: IResource = super().getResourceFor(request)
         return found
@@ -237,10 +237,10 @@ class QuietSite(Site):
 class WebService(Service):
     """The page as a service of the node's process.
 
-    ``startService`` raises ``PortTaken`` (one line for a person) where the port cannot be had; ``port`` 0 takes
-    any, see ``port``.  ``read`` returns the newest state on any thread, ``live`` on the reactor's (as ``read`` where it
-    is None), where ``version`` may spare reading it again (see ``Events``); ``wall`` is the unix time in seconds.
-    ``doors`` open further ports for the same page.
+    ``startService`` raises ``PortTaken`` (one line for the operator) if the port is not available; with port 0 the
+    property ``port`` has the chosen one.  ``read`` returns the newest state on any thread, ``live`` on the reactor's
+    thread (default: ``read``); ``version`` can avoid reading it again (see ``Events``).  ``wall`` returns unix time in
+    seconds.  ``doors`` open further ports for the same page.
     """
 
     name = "web"
@@ -277,23 +277,23 @@ class WebService(Service):
 
     @property
     def port(self) -> int:
-        """The port on which the page is served; the wanted one until the service runs."""
+        """The port of the page; the configured one before the service starts."""
         return (
             self._wanted if self._listening is None else int(getattr(self._listening.getHost(), "port", self._wanted))
         )
 
     @property
     def secure_port(self) -> int:
-        """The first of the further ports; 0 where there is none, or none yet."""
+        """The first of the further ports; 0 if there is none or the service has not started."""
         return next((int(getattr(door.getHost(), "port", 0)) for door in self._open), 0)
 
     def urls(self, names: Collection[str]) -> list[str]:
-        """Where others find the page; ``names`` are the machine's, for a page that is served at every address."""
+        """Return the URLs of the page; ``names`` are this machine's, for a page at all addresses."""
         doors = urls_at(self._host, self.secure_port, names, is_secure=True) if self.secure_port else []
         return [*urls_at(self._host, self.port, names), *doors]
 
     def startService(self) -> None:
-        """Open the port, then the workers."""
+        """Open the ports, then start the workers."""
         self._listening = listening(self._reactor, self._host, self._wanted, self.site, "port")
         try:
             for door in self._doors:
@@ -308,7 +308,7 @@ class WebService(Service):
         super().startService()
 
     def stopService(self) -> Deferred[None] | None:
-        """Close the port and every stream, and let the workers end."""
+        """Close the ports and all streams, and stop the workers."""
         super().stopService()
         if self._listening is None:
             return None
@@ -316,6 +316,6 @@ class WebService(Service):
         self._listening, self._open = None, []
         self._events.close()
         self._shots.close()
-        # Waits for the workers, which at that moment may wait for the reactor to take their answer: not on its thread.
+        # Runs on another thread, as a worker may be waiting for the reactor.
         closed.append(deferToThreadPool(self._reactor, self._reactor.getThreadPool(), self._pool.stop))
         return gatherResults(closed).addCallback(lambda _: None)

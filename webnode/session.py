@@ -1,4 +1,4 @@
-"""Session: who has signed in to the page, by the code that was printed at start or by a password."""
+"""Sign visitors in to the page, by the code printed at start, a password or an invitation."""
 
 from __future__ import annotations
 
@@ -25,38 +25,38 @@ from webnode.token import MAX_PARENTS, MAX_VOUCHERS, SESSION_BYTES, Claim, Token
 from webnode.visitor import OpenSessions, Role, Sessions, Token, Visitor
 
 SIGNED_S = 12 * 3600.0
-"""How long one is signed in, unless the page has it renewed."""
+"""Validity of a session in seconds, unless the page renews it."""
 MAX_SIGNED_S = 30 * 86400.0
-"""How long a session lasts at most, however often it is renewed."""
+"""Maximum duration of a session in seconds, with renewals."""
 PASS_S = 600.0
-"""How long a token is good that takes a page to another web node; there it is renewed."""
+"""Validity in seconds of a token for another web node, at which the page renews it."""
 FREE_EVERYWHERE, LONGEST_EVERYWHERE_S, FORGOTTEN_EVERYWHERE_S = 100, 60.0, 3600.0
-"""Of all addresses together 100 wrong codes are free; then at last one a minute is looked at, until an hour is quiet.
-The wait is short, as everybody whose address is not known yet waits."""
+"""Failed attempts of all addresses together: 100 are free, then one per minute is allowed, until an hour passes without
+any.  The pause is short, as it delays every address that has not signed in before."""
 EVERYWHERE = "everywhere"
 AT_ONCE, WAITING = 2, 1
-"""Passwords that are checked at the same time, and those that may wait for it: each holds one of the page's four
-workers, and whoever guesses must not hold them all."""
+"""Number of passwords checked at the same time, and of those waiting: each occupies one of the page's four workers, and
+guesses must not occupy all."""
 
 NOBODY = Visitor()
 NO_GATEWAY = Refusal(
     "node",
-    "it may let nobody in: it has not the role gateway in its team",
-    "sign in at another web node, or have the operator say: swarm promote NAME --role gateway",
+    "it has no role gateway in its team, so it cannot sign anyone in",
+    "sign in at another web node, or let the operator run: swarm promote NAME --role gateway",
     403,
 )
 Check = Callable[[str, str], Deferred[bool]]
-"""Whether a hash is that of a password, worked out beside the reactor's thread."""
+"""Verifies a password against a hash on a worker thread."""
 
 
 class SignedSessions:
-    """Sessions that are signed tokens, each good at one web node.
+    """Sessions that are signed tokens, each valid at one web node.
 
-    ``code`` lets in operators; so does the password whose hash is ``password``, where there is one.  A token of a
-    visitor who is let in can be given as a code, too, and is good for the same role until the same moment: that is an
-    invitation.  ``key`` signs in the name of this web node.  ``may_vouch`` says whether the node with a public key is a
-    gateway of the team at this moment: a session counts while all are that vouch for it, this node included.
-    ``revoked`` are the sessions that were ended; one holds for ``signed_s``, and as long again when it is renewed.
+    ``code`` signs in operators, and so does the password with the hash ``password`` if that is not empty.  The token of
+    a valid session also works as a code, for the same role and until the same time: this is an invitation.  ``key``
+    signs for this web node.  ``may_vouch`` returns whether the node with a public key is a gateway of the team now; a
+    session is valid while all its vouchers are, this node included.  ``revoked`` are the sessions that were ended; a
+    session lasts ``signed_s``, and as long again when it is renewed.
     """
 
     def __init__(
@@ -85,30 +85,30 @@ class SignedSessions:
         """Sign in with a code, a password or an invitation; fails with ``Refusal`` 401, 403, 429 or 503."""
         if not self._may_vouch(self.key.public):
             return fail(NO_GATEWAY)
-        # Nobody guesses a signature: an invitation lets in however many guess codes.
+        # A signature cannot be guessed, so invitations need no rate limit.
         invited = self.visitor(proof.strip(), now)
         if invited.role != "anyone" and not invited.is_ticket:
             return succeed(self._begin(invited.name, invited.role, now, invited.until, invited))
         wait = self._attempts.wait(source, now)
         if wait > 0.0:
-            return fail(Refusal("code", "there were too many wrong ones", f"wait {math.ceil(wait)} s", 429))
+            return fail(Refusal("code", "too many wrong attempts", f"wait {math.ceil(wait)} s", 429))
         self._attempts.tried(source, now)
-        if hmac.compare_digest(_plain(proof), _plain(self.code)):
+        if hmac.compare_digest(_normalized(proof), _normalized(self.code)):
             return succeed(self._operator(source, now))
         if not self._password:
-            return fail(_wrong())
+            return fail(_wrong_code())
         if len(self._gate.waiting) >= WAITING:
-            return fail(Refusal("code", "too many sign in at once", "try again in a few seconds", 503))
+            return fail(Refusal("code", "too many sign-ins at once", "try again in a few seconds", 503))
 
-        def judged(is_right: bool) -> Token:
+        def finish(is_right: bool) -> Token:
             if not is_right:
-                raise _wrong()
+                raise _wrong_code()
             return self._operator(source, now)
 
-        return self._gate.run(self._check, self._password, proof).addCallback(judged)
+        return self._gate.run(self._check, self._password, proof).addCallback(finish)
 
     def visitor(self, token: str, now: float) -> Visitor:
-        """Who shows this token or ticket."""
+        """Return the visitor of a token or ticket."""
         claim = self.key.claim(token)
         if claim is None or now >= claim.until or any(self._revoked.has(each) for each in (claim.id, *claim.parents)):
             return NOBODY
@@ -119,29 +119,29 @@ class SignedSessions:
         return replace(who, parents=claim.parents, vouchers=claim.vouchers)
 
     def token(self, who: Visitor, name: str, role: Role, now: float, seconds: float) -> Token:
-        """A token for somebody whom ``who`` brings in, until ``who`` could stay at most."""
+        """Return a token for a guest of ``who``, valid no longer than ``who`` can stay."""
         end = min(now + seconds, who.limit)
-        claim = Claim(self._fresh_id(), name, role, int(end), limit=int(end), vouchers=self._through(who))
+        claim = Claim(self._fresh_id(), name, role, int(end), limit=int(end), vouchers=self._vouchers_of(who))
         return self._signed(claim)
 
     def derived(self, who: Visitor, name: str, role: Role, now: float, seconds: float) -> Token:
-        """A token for ``who`` under another name, which ends with the session."""
-        token = Claim(self._fresh_id(), name, role, int(min(now + seconds, who.limit)), vouchers=self._through(who))
+        """Return a token for ``who`` under another name, which ends with the session."""
+        token = Claim(self._fresh_id(), name, role, int(min(now + seconds, who.limit)), vouchers=self._vouchers_of(who))
         return self._signed(replace(token, limit=token.until, parents=_lineage(who)))
 
     def renewed(self, who: Visitor, now: float) -> Token:
-        """Another token for the same session; one that is revoked ends both."""
-        _checked_session(who)
+        """Return another token for the same session; revoking one ends both."""
+        _require_session(who)
         return self._session(who, now + self.signed_s, who.limit)
 
     def passes(self, who: Visitor, nodes: Iterable[str], now: float) -> dict[str, Token]:
-        """Tokens for the same session at other web nodes, by uuid; each is good at its node alone, for ``PASS_S``."""
-        _checked_session(who)
+        """Return tokens for the same session at other web nodes, by uuid, each valid only there and for ``PASS_S``."""
+        _require_session(who)
         until = min(now + PASS_S, who.limit)
         return {node: self._session(who, until, who.limit, bytes.fromhex(node)) for node in dict.fromkeys(nodes)}
 
     def revoke(self, token_id: str, until: float = math.inf) -> None:
-        """Let in nobody with this token any more, at any web node of the team."""
+        """Revoke a session at all web nodes of the team."""
         self._revoked.add(token_id, until)
 
     def _operator(self, source: str, now: float) -> Token:
@@ -149,23 +149,23 @@ class SignedSessions:
         return self._begin("operator", "operator", now, now + MAX_SIGNED_S)
 
     def _begin(self, name: str, role: Role, now: float, limit: float, invited: Visitor = NOBODY) -> Token:
-        """A new session, which ends with the invitation by which it came."""
+        """Start a session, which ends with the invitation that it was made from."""
         who = Visitor(name, role, self._fresh_id(), parents=_lineage(invited), vouchers=invited.vouchers)
         return self._session(who, now + self.signed_s, limit)
 
     def _session(self, who: Visitor, until: float, limit: float, audience: bytes = b"") -> Token:
         claim = Claim(who.token_id, who.name, who.role, int(min(until, limit)), limit=int(limit))
-        return self._signed(replace(claim, parents=who.parents, vouchers=self._through(who)), audience)
+        return self._signed(replace(claim, parents=who.parents, vouchers=self._vouchers_of(who)), audience)
 
     def _signed(self, claim: Claim, audience: bytes = b"") -> Token:
         text, ticket = (self.key.token(each, audience) for each in (claim, claim.ticket))
         return Token(text, ticket, claim.role, float(claim.until))
 
-    def _through(self, who: Visitor) -> tuple[bytes, ...]:
-        """The web nodes beside this one that vouch for ``who``; raises ``Refusal`` where they are too many."""
+    def _vouchers_of(self, who: Visitor) -> tuple[bytes, ...]:
+        """Return the other web nodes that vouch for ``who``; raises ``Refusal`` if there are too many."""
         others = tuple(each for each in who.vouchers if each != self.key.public)
         if len(others) > MAX_VOUCHERS:
-            raise Refusal("Authorization", "the session came by too many web nodes", "sign in here", 401)
+            raise Refusal("Authorization", "the session used too many web nodes", "sign in here", 401)
         return others
 
     def _fresh_id(self) -> str:
@@ -173,9 +173,9 @@ class SignedSessions:
 
 
 class Attempts:
-    """Attempts to sign in with a code or password: each address has its own, and all together have some.
+    """Limits attempts to sign in with a code or password, per address and for all addresses together.
 
-    Those of all together do not hold up this machine, nor a network from which somebody signed in before.
+    The common limit does not apply to this machine and to networks from which a visitor has signed in before.
     """
 
     def __init__(self) -> None:
@@ -184,7 +184,7 @@ class Attempts:
         self._known: OrderedDict[str, None] = OrderedDict()
 
     def wait(self, source: str, now: float) -> float:
-        """Seconds until ``source`` may try again; 0 where it may now."""
+        """Return the seconds until ``source`` may try again; 0 if it may now."""
         wait = self._here.wait(source, now)
         return wait if self._is_known(source) else max(wait, self._everywhere.wait(EVERYWHERE, now))
 
@@ -195,7 +195,7 @@ class Attempts:
             self._everywhere.tried(EVERYWHERE, now)
 
     def held(self, source: str, now: float) -> None:
-        """Take note that the last attempt of ``source`` was right."""
+        """Record that the last attempt of ``source`` succeeded."""
         self._here.held(source)
         if not self._is_known(source):
             self._everywhere.undo(EVERYWHERE)
@@ -209,7 +209,7 @@ class Attempts:
 
 
 def sessions(settings: Settings, node: SwarmNode, reactor: Any, rng: random.Random, team: TeamFallbacks) -> Sessions:
-    """Who may come in; raises ``BadSetting`` where the settings would let in everybody of the network."""
+    """Return the sessions for these settings; raises ``BadSetting`` if they would admit every client of the network."""
     web, origin = settings.web, settings.origin
     key = TokenKey(node.entangled.identity)
     if not web.sign_in:
@@ -222,7 +222,7 @@ def sessions(settings: Settings, node: SwarmNode, reactor: Any, rng: random.Rand
             read(web.password)
         except ValueError as error:
             raise BadSetting(
-                origin, "[web] password", f"is no hash of a password ({error})", "make one by: swarm password"
+                origin, "[web] password", f"is not a valid hash ({error})", "create one with: swarm password"
             ) from error
 
     def check(text: str, password: str) -> Deferred[Any]:
@@ -232,21 +232,21 @@ def sessions(settings: Settings, node: SwarmNode, reactor: Any, rng: random.Rand
     return SignedSessions(key, team.may_vouch, code, web.password, rng, check, TeamRevocations(node))
 
 
-def _wrong() -> Refusal:
-    return Refusal("code", "it is not the code of this page", "look where the node was started, or ask: swarm web", 401)
+def _wrong_code() -> Refusal:
+    return Refusal("code", "wrong code", "see the node's output at its start, or run: swarm web", 401)
 
 
-def _plain(code: str) -> bytes:
-    """A code as it is compared: people write it in capitals, and with spaces."""
+def _normalized(code: str) -> bytes:
+    """Normalize a code: capitals, spaces and hyphens do not matter."""
     return "".join(c for c in code.lower() if not c.isspace() and c != "-").encode()
 
 
 def _lineage(who: Visitor) -> tuple[str, ...]:
-    """The ids with which whatever ``who`` begins ends, too."""
+    """Return the ids of the sessions with which everything started by ``who`` ends."""
     return tuple(each for each in (who.token_id, *who.parents) if each)[:MAX_PARENTS]
 
 
-def _checked_session(who: Visitor) -> None:
+def _require_session(who: Visitor) -> None:
     if who.role == "anyone" or who.is_ticket:
-        problem = "a ticket is not enough" if who.is_ticket else "nobody is signed in"
+        problem = "a ticket is not enough" if who.is_ticket else "not signed in"
         raise Refusal("Authorization", problem, "send the token, as 'Bearer TOKEN', or sign in", 401)

@@ -1,8 +1,8 @@
-"""The state that the page shows: one pure function from records to a JSON-able view.
+"""Convert the records of the team to the view that the page shows.  Pure.
 
-The four views of the thesis (section 4.2.4): the devices, what each stores, the objective of each, and the consensus
-point that each group found.  Two web nodes that hold the same records make the same view, whatever order the records
-came in.
+The view has the four parts of the thesis (section 4.2.4): the devices, the data that each stores, its objective, and
+the consensus point of each group.  Two web nodes with the same records make the same view, whatever the order of the
+records.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ GONE = "GONE"
 REMEMBERED_S = 60.0
 MESSAGES = 5
 FARTHEST = 1e6
-"""No device is farther from the origin of its frame, in metres."""
+"""Maximum distance of a device from the origin of its frame, in metres."""
 
 
 def state_of(
@@ -34,10 +34,9 @@ def state_of(
     departed: Iterable[State] = (),
     node: str = "",
 ) -> State:
-    """The whole view: devices in the order of joining, tasks newest first, groups in the order of the tasks.
+    """Return the whole view: devices in the order of joining, tasks newest first, groups in the order of the tasks.
 
-    ``departed`` are the devices that left a short while ago (``Departed.of``); ``node`` is the name of the node that
-    serves.
+    ``departed`` are the devices that left recently (``Departed.of``); ``node`` is the name of the serving node.
     """
     present = [view for view in map(device_view, devices) if view["uuid"]]
     known = {view["uuid"] for view in present}
@@ -48,7 +47,7 @@ def state_of(
     titles = {view["id"]: view["title"] for view in listed}
     for view in shown:
         view["objective"] = titles.get(view["task"], view["task"])
-    # A winner that has just died reports no more, and is still named by those that stand by.
+    # A winner that has just failed no longer reports, but the standbys still name it.
     names = {view["uuid"]: view["name"] for view in shown}
     order = {view["id"]: place for place, view in enumerate(listed)}
     keys = sorted((key for key in groups if groups[key]), key=lambda key: (order.get(key, len(order)), key))
@@ -61,7 +60,7 @@ def state_of(
 
 
 def device_view(fields: Fields) -> State:
-    """One device as the page shows it; fields that are missing or no lawful values become empty ones."""
+    """Return one device as the page shows it; missing and invalid fields become empty."""
     network, deployed = fields.get("network"), fields.get("deployed")
     deployed = deployed if isinstance(deployed, Mapping) else {}
     return {
@@ -89,7 +88,7 @@ def device_view(fields: Fields) -> State:
 
 
 def task_view(fields: Fields) -> State:
-    """One task as the page shows it."""
+    """Return one task as the page shows it."""
     note, result, why = fields.get("note"), fields.get("result"), fields.get("why")
     return {
         "id": text(fields.get("id"), limit=64),
@@ -112,11 +111,11 @@ def task_view(fields: Fields) -> State:
 
 
 def group_view(task: str, title: str, members: Sequence[Fields], known: Mapping[str, str] | None = None) -> State:
-    """The consensus point of one group: whom each agent computed as the winner, and whether they agree.
+    """Return the consensus point of one group: the winner that each agent computed, and whether they agree.
 
-    The point is the agent named by most (the lowest uuid where two are named as often).  ``differ`` lists who named
-    another, ``undecided`` who named nobody yet.  ``known`` names devices that report nothing here (uuid to name).
-    ``share`` puts the costs (metres) on one scale: the farthest is 1.
+    The point is the agent named most often (of equals, the lowest uuid).  ``differ`` lists the members that named
+    another agent, ``undecided`` the members without a choice yet.  ``known`` names devices without a report (uuid to
+    name).  ``share`` is the cost (metres) relative to the largest.
     """
     views = [_member_view(member) for member in members]
     views.sort(key=lambda view: (view["name"], view["uuid"]))
@@ -145,7 +144,7 @@ def group_view(task: str, title: str, members: Sequence[Fields], known: Mapping[
 
 
 class Departed:
-    """A small memory of the devices that left: a device that went away must not look alive, nor vanish at once."""
+    """Keeps devices that left for some time, so that the page shows them as gone."""
 
     def __init__(self, remembered_s: float = REMEMBERED_S) -> None:
         self._remembered_s = remembered_s
@@ -153,9 +152,9 @@ class Departed:
         self._gone: dict[str, State] = {}
 
     def of(self, devices: Iterable[Fields], now: float) -> list[State]:
-        """Those not among ``devices`` that were there a short while ago, ``gone`` being when that was seen (unix s).
+        """Return the devices that left recently; ``gone`` is the unix time at which this was seen.
 
-        Safe to call from several threads: each call replaces what is remembered and changes nothing in place.
+        Safe to call from several threads: each call replaces the stored tables and modifies nothing in place.
         """
         present = {view["uuid"]: view for view in map(device_view, devices) if view["uuid"]}
         left = {uuid: {**view, "status": GONE, "gone": now} for uuid, view in self._last.items() if uuid not in present}
@@ -187,7 +186,7 @@ def _result(fields: Fields) -> State:
 
 
 def _ruling_view(fields: Fields) -> State:
-    """One epoch of an ``Explanation``: a row for each who reported, and for each who differs."""
+    """Return one epoch of an ``Explanation``, with a row per device that reported or differs."""
     standby, winner = list(fields["standby"]), fields["winner"]
     differ = {each["name"]: each["what"] for each in fields["differ"]}
     rows: dict[str, State] = {}
@@ -217,10 +216,10 @@ def _ruling_view(fields: Fields) -> State:
 
 
 def _position(value: object) -> State | None:
-    """Where a device says that it is: metres in its yard, or on the globe; None where it says neither."""
-    said = value if isinstance(value, Mapping) else {}
+    """Return the position of a device in metres on its map, or in degrees on the globe; None if it reports neither."""
+    reported = value if isinstance(value, Mapping) else {}
     x, y, heading, lat, lon, accuracy = (
-        number(said.get(key), math.nan) for key in ("x", "y", "heading", "lat", "lon", "accuracy")
+        number(reported.get(key), math.nan) for key in ("x", "y", "heading", "lat", "lon", "accuracy")
     )
     if abs(x) <= FARTHEST and abs(y) <= FARTHEST:
         return {"x": x, "y": y, "heading": None if math.isnan(heading) else heading}
@@ -229,8 +228,8 @@ def _position(value: object) -> State | None:
     return None
 
 
-def _status(value: object, lawful: Sequence[str]) -> str:
-    return value if isinstance(value, str) and value in lawful else UNKNOWN
+def _status(value: object, allowed: Sequence[str]) -> str:
+    return value if isinstance(value, str) and value in allowed else UNKNOWN
 
 
 def _messages(value: object) -> list[list[float | str]]:

@@ -1,6 +1,6 @@
-"""Survey: what devices answer when they are asked over the network.
+"""Query devices over the network for diagnostics.
 
-However many look at the network, each device is asked once a second; what it says is not believed to be lawful.
+Each device is queried at most once a second, however many pages ask; replies are not trusted and therefore sanitized.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from webnode.errors import Refusal
 from webnode.field import MAX_ENTRIES, Json, count, distance, number, text
 
 PATIENCE_S = 1.2
-"""How long a device has to answer; below what the caller of a route waits."""
+"""Timeout of a device's reply in seconds; less than the time limit of a route."""
 FRESH_S = 1.0
 MAX_ASKED = 64
-"""Devices that are asked for the view of the network, in the order of joining."""
+"""Maximum number of devices queried, in the order of joining."""
 OWN: dict[str, Callable[[SwarmNode], dict[str, Any]]] = {INVENTORY: inventory, NETWORK: network, LINKS: links}
 
 
 class TeamSurvey:
-    """Asks the devices that ``client`` knows; the one of ``node`` answers here."""
+    """Queries the devices that ``client`` knows; the device of ``node`` is read locally."""
 
     def __init__(self, node: SwarmNode, client: TeamClient) -> None:
         self._node = node
@@ -38,35 +38,35 @@ class TeamSurvey:
         self._rounds = {NETWORK: _Round(_network_view), LINKS: _Round(_links_view)}
 
     def network(self) -> Deferred[Json]:
-        """Who knows whom, and how far they are; ``silent`` are the uuids of those that did not answer."""
-        return self._told(NETWORK)
+        """Fire with each device's contacts and round-trip times; ``silent`` lists devices without a reply."""
+        return self._query(NETWORK)
 
     def links(self) -> Deferred[Json]:
-        """How each device reaches the others, and how well; ``here`` is the uuid of this node."""
-        return self._told(LINKS)
+        """Fire with the path and its quality from each device to the others; ``here`` is the uuid of this node."""
+        return self._query(LINKS)
 
     def team(self) -> Json:
-        """What team this is."""
+        """Return the kind of team, and its members if it is closed."""
         return team(self._node)
 
     def inventory(self, uuid: str) -> Deferred[Json]:
-        """What a device stores; fails with ``Refusal`` 409 or 504."""
+        """Fire with the records that a device stores; fails with ``Refusal`` 409 or 504."""
         device = self._client.view.device(uuid)
         if device is None:
             raise Refusal("device", "it has left the network", "wait until it is back", 409)
-        return self._ask(uuid, INVENTORY).addCallbacks(_inventory_view, _refused, errbackArgs=(device.name,))
+        return self._ask(uuid, INVENTORY).addCallbacks(_inventory_view, _raise_refusal, errbackArgs=(device.name,))
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
-    def _told(self, method: str) -> Deferred[Json]:
-        """What all answered, asked at most once a ``FRESH_S``."""
+    def _query(self, method: str) -> Deferred[Json]:
+        """Fire with the replies of all devices, queried at most once in ``FRESH_S``."""
         asked = self._rounds[method]
         if asked.waiting is None:
             if self._node.clock.seconds() - asked.ended_at < FRESH_S:
-                return succeed(asked.told)
+                return succeed(asked.reply)
             self._ask_all(method, asked)
-        if asked.waiting is None:  # everybody has answered at once
-            return succeed(asked.told)
+        if asked.waiting is None:  # all devices have replied synchronously
+            return succeed(asked.reply)
         waiter: Deferred[Json] = Deferred(asked.waiting.remove)
         asked.waiting.append(waiter)
         return waiter
@@ -78,15 +78,15 @@ class TeamSurvey:
         asked.waiting = []
 
         def ended(outcomes: list[tuple[bool, Any]]) -> None:
-            # In the order of joining, whoever was quicker.
-            told = [(device.uuid, outcome) for device, (_, outcome) in zip(devices, outcomes, strict=True)]
-            views = {uuid: asked.view(outcome, names) for uuid, outcome in told if isinstance(outcome, dict)}
-            silent: list[Json] = [uuid for uuid, _ in told if uuid not in views]
-            asked.told = {"here": self._node.uuid, "devices": views, "silent": silent}
+            # In the order of joining, whatever the order of the replies.
+            replies = [(device.uuid, outcome) for device, (_, outcome) in zip(devices, outcomes, strict=True)]
+            views = {uuid: asked.view(outcome, names) for uuid, outcome in replies if isinstance(outcome, dict)}
+            silent: list[Json] = [uuid for uuid, _ in replies if uuid not in views]
+            asked.reply = {"here": self._node.uuid, "devices": views, "silent": silent}
             asked.ended_at = self._node.clock.seconds()
             waiting, asked.waiting = asked.waiting or [], None
             for waiter in waiting:
-                waiter.callback(asked.told)
+                waiter.callback(asked.reply)
 
         answers = [maybeDeferred(self._ask, device.uuid, method) for device in devices]
         DeferredList(answers, consumeErrors=True).addCallback(ended)
@@ -99,18 +99,18 @@ class TeamSurvey:
 
 @dataclass
 class _Round:
-    """What is asked of all: how an answer is made lawful, the newest answers, and who waits for others."""
+    """One kind of query to all devices: its sanitizing function, the newest replies, and the callers that wait."""
 
     view: Callable[[dict[Any, Any], dict[str, str]], Json]
-    told: Json = None
+    reply: Json = None
     ended_at: float = float("-inf")
     waiting: list[Deferred[Json]] | None = None
 
 
-def _refused(failure: Any, name: str) -> None:
+def _raise_refusal(failure: Any, name: str) -> None:
     failure.trap(EntangledError)
     if failure.check(Refused):
-        raise Refusal("device", f"{name} says no: {failure.getErrorMessage()}", "bring it to this version", 409)
+        raise Refusal("device", f"{name} refused: {failure.getErrorMessage()}", "update it to this version", 409)
     raise Refusal("device", f"{name} did not answer", "wait until it is back, then try again", 504)
 
 
@@ -118,9 +118,9 @@ def _entries(value: object) -> list[Any]:
     return value[:MAX_ENTRIES] if isinstance(value, list) else []
 
 
-def _network_view(told: dict[Any, Any], names: dict[str, str]) -> Json:
-    contacts = [each for each in _entries(told.get("contacts")) if isinstance(each, dict) and text(each.get("uuid"))]
-    lookups = [each for each in _entries(told.get("lookups")) if isinstance(each, dict)]
+def _network_view(reply: dict[Any, Any], names: dict[str, str]) -> Json:
+    contacts = [each for each in _entries(reply.get("contacts")) if isinstance(each, dict) and text(each.get("uuid"))]
+    lookups = [each for each in _entries(reply.get("lookups")) if isinstance(each, dict)]
     return {
         "contacts": [
             {
@@ -131,10 +131,10 @@ def _network_view(told: dict[Any, Any], names: dict[str, str]) -> Json:
             }
             for each in contacts
         ],
-        "known": count(told.get("known")),
-        "sent": count(told.get("sent")),
-        "received": count(told.get("received")),
-        "lost": count(told.get("lost")),
+        "known": count(reply.get("known")),
+        "sent": count(reply.get("sent")),
+        "received": count(reply.get("received")),
+        "lost": count(reply.get("lost")),
         "lookups": [
             {
                 "key": text(each.get("key"), limit=40),
@@ -146,24 +146,24 @@ def _network_view(told: dict[Any, Any], names: dict[str, str]) -> Json:
     }
 
 
-def _links_view(told: dict[Any, Any], names: dict[str, str]) -> Json:
-    ways = [each for each in _entries(told.get("links")) if isinstance(each, dict) and text(each.get("id"))]
-    refusals = [each for each in _entries(told.get("refusals")) if isinstance(each, dict)]
+def _links_view(reply: dict[Any, Any], names: dict[str, str]) -> Json:
+    ways = [each for each in _entries(reply.get("links")) if isinstance(each, dict) and text(each.get("id"))]
+    refusals = [each for each in _entries(reply.get("refusals")) if isinstance(each, dict)]
     return {"links": [_link_view(each, names) for each in ways], "refusals": [_refusal_view(each) for each in refusals]}
 
 
-def _link_view(told: dict[Any, Any], names: dict[str, str]) -> Json:
-    """One way, and its score, which is None as long as nothing is measured."""
-    way, by = told.get("way"), text(told.get("by"), limit=64)
-    loss, round_trip, jitter = (distance(told.get(name)) for name in ("loss", "round_trip", "jitter"))
+def _link_view(reply: dict[Any, Any], names: dict[str, str]) -> Json:
+    """Return one path and its score, which is None if nothing is measured."""
+    way, by = reply.get("way"), text(reply.get("by"), limit=64)
+    loss, round_trip, jitter = (distance(reply.get(name)) for name in ("loss", "round_trip", "jitter"))
     loss = None if loss is None else min(loss, 1.0)
     return {
-        "uuid": text(told["id"], limit=64),
-        "name": names.get(told["id"], text(told["id"], limit=8)),
+        "uuid": text(reply["id"], limit=64),
+        "name": names.get(reply["id"], text(reply["id"], limit=8)),
         "way": way if way in KINDS else "none",
         "by": names.get(by, by[:8]),
-        "address": text(told.get("address"), limit=64),
-        "for_s": distance(told.get("for")),
+        "address": text(reply.get("address"), limit=64),
+        "for_s": distance(reply.get("for")),
         "score": None if loss is None else Link(loss, round_trip, jitter, way == "carried").score,
         "loss": loss,
         "rtt_ms": None if round_trip is None else round(1000 * round_trip, 2),
@@ -171,27 +171,27 @@ def _link_view(told: dict[Any, Any], names: dict[str, str]) -> Json:
     }
 
 
-def _refusal_view(told: dict[Any, Any]) -> Json:
-    reason, _, remedy = text(told.get("reason")).partition("; ")
-    side = told.get("side")
+def _refusal_view(reply: dict[Any, Any]) -> Json:
+    reason, _, remedy = text(reply.get("reason")).partition("; ")
+    side = reply.get("side")
     return {
-        "who": text(told.get("who"), limit=64),
-        "at": text(told.get("at"), limit=64),
+        "who": text(reply.get("who"), limit=64),
+        "at": text(reply.get("at"), limit=64),
         "side": side if side in SIDES else "we",
-        "code": text(told.get("code"), limit=32),
+        "code": text(reply.get("code"), limit=32),
         "why": reason,
         "remedy": remedy,
-        "ago_s": number(told.get("ago")),
-        "count": count(told.get("count"), 1),
+        "ago_s": number(reply.get("ago")),
+        "count": count(reply.get("count"), 1),
     }
 
 
-def _inventory_view(told: Any) -> Json:
-    told = told if isinstance(told, dict) else {}
-    kinds = told.get("kinds")
-    newest = [each for each in _entries(told.get("newest")) if isinstance(each, list) and len(each) == 4]
+def _inventory_view(reply: Any) -> Json:
+    reply = reply if isinstance(reply, dict) else {}
+    kinds = reply.get("kinds")
+    newest = [each for each in _entries(reply.get("newest")) if isinstance(each, list) and len(each) == 4]
     return {
-        **{name: count(told.get(name)) for name in ("records", "deleted", "bytes", "most_bytes")},
+        **{name: count(reply.get(name)) for name in ("records", "deleted", "bytes", "most_bytes")},
         "kinds": {text(k): count(v) for k, v in list(kinds.items())[:MAX_ENTRIES]} if isinstance(kinds, dict) else {},
         "newest": [[text(kind), text(name, limit=64), count(size), text(life)] for kind, name, size, life in newest],
     }

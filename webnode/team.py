@@ -1,4 +1,4 @@
-"""TeamDesk: an operator's wishes, carried out over the node (thesis, Algorithm 4.4 and the Run Demo button)."""
+"""Carry out an operator's requests on the team (thesis, Algorithm 4.4 and the Run Demo button)."""
 
 from __future__ import annotations
 
@@ -20,39 +20,39 @@ from webnode.camera import OnFrame
 from webnode.errors import Refusal
 
 PLACING = 5.0
-"""Seconds between Run Demo and the target's appearance: it is placed while the robots search (thesis, section 5)."""
+"""Seconds between Run Demo and the target's placement: it appears while the robots search (thesis, section 5)."""
 NEAREST = Task.strategy
 DIVIDED = "group_optimal"
-"""The strategy of a task of a group whose catalogue entry says the nearest, which is for one task."""
+"""The strategy of a task in a group, if its catalogue entry names the nearest agent, which applies to one task."""
 PATIENCE = 1.5
-"""Seconds that a device has to answer an order: less than the page's own patience, so that its visitor is told why."""
+"""Timeout of a device's reply to an order in seconds; less than the time limit of a route."""
 
 
 class YardHand(Protocol):
-    """What the desk needs of a yard, where there is one."""
+    """The operations of a robot simulator that the desk uses."""
 
     @property
     def snapshot(self) -> Mapping[str, Any] | None:
-        """The newest view from above."""
+        """The newest map."""
 
     def place_target(self, x: float, y: float) -> Deferred[bool]:
-        """Put the target at a place."""
+        """Put the target at a position."""
 
     def place_target_later(self, seconds: float) -> Deferred[bool]:
-        """Put the target anywhere after a while, whoever is still there then."""
+        """Let the simulator put the target at a random position after ``seconds``."""
 
     def clear_target(self) -> Deferred[bool]:
-        """Take the target away."""
+        """Remove the target."""
 
     def move_dog(self, name: str, x: float, y: float, heading: float) -> Deferred[bool]:
-        """Lift a robot and set it down."""
+        """Move a robot."""
 
 
 class TeamDesk:
-    """The desk of a running team; ``predefined`` and ``demo`` come from the catalogue of tasks.
+    """An operator's access to a running team; ``predefined`` and ``demo`` come from the catalogue of tasks.
 
-    Every method is called on the reactor's thread and returns at once, or returns a Deferred that fires soon.  A wish
-    that cannot be granted raises ``Refusal``; its outcome is seen in the state, not in the answer.
+    Every method is called on the reactor's thread and returns at once, or returns a Deferred that fires soon.  It
+    raises ``Refusal`` for an impossible request; the effect of a request shows in the state, not in the answer.
     """
 
     _log = Logger()
@@ -66,21 +66,21 @@ class TeamDesk:
         self._demo = demo
         self._yard = yard
 
-    # -- what is known ----------------------------------------------------------------------------------------------
+    # -- queries ----------------------------------------------------------------------------------------------------
 
     def read(self, key: bytes) -> list[Record]:
-        """The records under ``key``, of the keys that the page shows, as they are watched now."""
+        """Return the watched records under ``key``, one of the keys that the page shows."""
         return self._client.read(key)
 
     def watch(self, uuid: str, on_frame: OnFrame) -> Callable[[], None]:
-        """Look through the camera of the device ``uuid`` until what is returned is called."""
+        """Stream the camera of the device ``uuid`` until the returned function is called."""
         contact = self._client.contact(uuid)
         if contact is None:
-            raise Refusal("device", "there is no such device", "choose one of /api/v1/devices", 404)
+            raise Refusal("device", "unknown device", "choose one of /api/v1/devices", 404)
         return self._client.stream_camera(contact, on_frame)
 
     def yard(self) -> Mapping[str, Any] | None:
-        """The newest view from above, or None where there is no yard.
+        """Return the newest map of the robot simulator, or None without one.
 
         ``{"walls": [w, h], "dogs": [{"name", "x", "y", "heading", "stripes"}], "target": {"x", "y", "radius"} |
         None}``; metres and radians, origin in the lower left corner.
@@ -88,43 +88,43 @@ class TeamDesk:
         return None if self._yard is None else self._yard.snapshot
 
     def catalogue(self) -> Sequence[Mapping[str, Any]]:
-        """The predefined tasks: ``{"name", "title", "requirements"}`` each."""
+        """Return the predefined tasks, each as ``{"name", "title", "requirements"}``."""
         return [
             {"name": name, "title": task.title, "requirements": task.requirements}
             for name, task in self._predefined.items()
         ]
 
-    # -- what is wished ---------------------------------------------------------------------------------------------
+    # -- orders -----------------------------------------------------------------------------------------------------
 
     def run_demo(self, task_id: str = "") -> Any:
-        """Assign the demonstration's task; where there is a yard, the target is placed while the robots search.
+        """Assign the demonstration's task; with a simulator, the target is placed while the robots search.
 
-        Returns its id; fires with it, where ``task_id`` says what it is to be, and does nothing if it is there.
+        Returns the task's id.  With ``task_id`` it returns a Deferred of it, and does nothing if that task exists.
         """
         if task_id:
             found = self._client.find_task(task_id)
-            return found.addCallback(lambda task: task_id if task else self._demonstrated(task_id))
-        return self._demonstrated(self._client.new_task_id())
+            return found.addCallback(lambda task: task_id if task else self._start_demo(task_id))
+        return self._start_demo(self._client.new_task_id())
 
     def assign(self, name: str, tolerates: int = 1, group: str = "", task_id: str = "") -> Any:
-        """Publish a predefined task; ``tolerates`` members of its council may be lost at once.
+        """Publish a predefined task; ``tolerates`` members of its council may fail at once.
 
-        Those of one ``group`` are divided together.  Returns ``{"id", "able": [names], "refused": {name: [reasons]}}``.
-        Where ``task_id`` says what its id is to be, the answer is a Deferred, and a task that is there already, made by
-        another web node for the same wish, is not made again.
+        Tasks of one ``group`` are divided together.  Returns ``{"id", "able": [names], "refused": {name: [reasons]}}``.
+        With ``task_id`` it returns a Deferred, and does not publish a task that exists, as another web node may have
+        published it for the same request.
         """
         template = replace(self._template(name, group), tolerates=tolerates)
         if task_id:
             found = self._client.find_task(task_id)
-            return found.addCallback(lambda task: self._told(task) if task else self._published(template, task_id))
-        return self._published(template, self._client.new_task_id())
+            return found.addCallback(lambda task: self._describe(task) if task else self._publish(template, task_id))
+        return self._publish(template, self._client.new_task_id())
 
     def preview(self, name: str, group: str = "") -> dict[str, Any]:
-        """Who could take a predefined task and who not, and why; nothing is asked of anybody.
+        """Return which devices can take a predefined task and why others cannot; sends nothing.
 
         ``{"able": [{"uuid", "name", "busy"}], "refused": {name: [reasons]}, "likely": name | None, "together": [{"id",
-        "title"}]}``; ``busy`` is the task that a device has now, ``likely`` who would take it by what is known already,
-        ``together`` the open tasks that it would be divided together with, as one of ``group``.
+        "title"}]}``; ``busy`` is the current task of a device, ``likely`` the device that would probably take it by
+        present reports, ``together`` the open tasks of ``group`` that it would be divided with.
         """
         task = self._template(name, group)
         refused = self._view.unable(task)
@@ -134,7 +134,7 @@ class TeamDesk:
             {"uuid": d.uuid, "name": d.name, "busy": titles.get(d.task, "another task" * bool(d.task))} for d in able
         ]
         likely = self._likely(task, [device.uuid for device in able])
-        # As the agents divide them: those of one group that want the same of a device, by the same strategy.
+        # The same rule as the agents': tasks of one group with equal requirements and strategy are divided together.
         together = [
             {"id": other.task_id, "title": other.title}
             for other in self._view.open_tasks
@@ -143,41 +143,41 @@ class TeamDesk:
         return {"able": rows, "refused": refused, "likely": likely, "together": together}
 
     def cancel(self, task_id: str) -> None:
-        """Record that the task is cancelled; whoever is at it stops."""
-        self._quietly(self._client.cancel(task_id))
+        """Record that the task is cancelled; its devices stop."""
+        self._log_failure(self._client.cancel(task_id))
 
     def pause(self, task_id: str) -> None:
-        """Record that the task is to rest; whoever is at it stops, and is free for others."""
-        self._quietly(self._client.order(task_id, PAUSE))
+        """Record that the task is paused; its devices stop and are free for other tasks."""
+        self._log_failure(self._client.order(task_id, PAUSE))
 
     def resume(self, task_id: str) -> None:
-        """Record that the task is to go on."""
-        self._quietly(self._client.order(task_id, RESUME))
+        """Record that the task is resumed."""
+        self._log_failure(self._client.order(task_id, RESUME))
 
     def message(self, uuid: str, text: str) -> Deferred[dict[str, Any]]:
-        """Send a text to one device, or to all where ``uuid`` is empty.
+        """Send a text to one device, or to all if ``uuid`` is empty.
 
-        Fires with ``{"delivered": [names], "failed": {name: why}}``; for one device a failure is a ``Refusal``.
+        Fires with ``{"delivered": [names], "failed": {name: reason}}``; for one device a failure is a ``Refusal``.
         """
         delivered: list[str] = []
         failed: dict[str, str] = {}
 
-        def told(device: Device) -> Deferred[Any]:
+        def send(device: Device) -> Deferred[Any]:
             asked = self.call(device.uuid, "device.message", text)
             return asked.addCallback(lambda _: delivered.append(device.name))
 
-        def untold(failure: Any, name: str) -> None:
+        def note_failure(failure: Any, name: str) -> None:
             failure.trap(Refusal)
             failed[name] = failure.value.problem
 
         if uuid:
             one = self.call(uuid, "device.message", text)
             return one.addCallback(lambda _: {"delivered": [self._view.name_of(uuid)], "failed": failed})
-        all_told = DeferredList([told(device).addErrback(untold, device.name) for device in self._view.devices])
-        return all_told.addCallback(lambda _: {"delivered": sorted(delivered), "failed": failed})
+        all_sent = DeferredList([send(device).addErrback(note_failure, device.name) for device in self._view.devices])
+        return all_sent.addCallback(lambda _: {"delivered": sorted(delivered), "failed": failed})
 
     def disconnect(self, uuid: str, seconds: float) -> Deferred[Any]:
-        """Ask a device to leave the network for a while, as if it had failed; fires when it says that it does."""
+        """Ask a device to leave the network for ``seconds``, as if it had failed; fires when it confirms."""
         return self.call(uuid, "device.disconnect", seconds)
 
     def call(
@@ -187,49 +187,49 @@ class TeamDesk:
         *arguments: object,
         refused: Callable[[Refused], Refusal | None] = lambda refused: None,
     ) -> Deferred[Any]:
-        """Ask a device something; fires with its answer, fails with ``Refusal``.
+        """Call a method of a device; fires with its answer, fails with ``Refusal``.
 
-        409: it is not here, leaves while it is asked, or says no; 504: it is here and does not answer.  ``refused``
-        may know better what a no means.
+        409: the device has left, leaves during the call, or refuses; 504: it does not answer.  ``refused`` may
+        translate a refusal.
         """
         name = self._view.name_of(uuid)
         if self._client.contact(uuid) is None:
-            return fail(Refusal("device", f"{name} is not here", "choose one of /api/v1/devices", 409))
+            return fail(Refusal("device", f"{name} has left the network", "choose one of /api/v1/devices", 409))
         until = self._client.clock.seconds() + PATIENCE
         asked = self._client.call(uuid, method, *arguments, timeout=PATIENCE, changes=True)
-        return asked.addErrback(self._unanswered, uuid, name, until, refused)
+        return asked.addErrback(self._explain_failure, uuid, name, until, refused)
 
     def move_target(self, x: float, y: float) -> Deferred[Any]:
-        """Put the target at (x, y), metres in the yard's frame."""
-        return self._with_yard().place_target(x, y).addErrback(_refused)
+        """Put the target at (x, y), metres on the simulator's map."""
+        return self._with_yard().place_target(x, y).addErrback(_raise_refusal)
 
     def clear_target(self) -> Deferred[Any]:
-        """Take the target away."""
-        return self._with_yard().clear_target().addErrback(_refused)
+        """Remove the target."""
+        return self._with_yard().clear_target().addErrback(_raise_refusal)
 
     def move_robot(self, name: str, x: float, y: float, heading: float) -> Deferred[Any]:
-        """Lift a robot of the yard and set it down at (x, y), looking along ``heading`` (radians)."""
-        return self._with_yard().move_dog(name, x, y, heading).addErrback(_refused, name)
+        """Move a simulated robot to (x, y), facing ``heading`` (radians)."""
+        return self._with_yard().move_dog(name, x, y, heading).addErrback(_raise_refusal, name)
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
-    def _demonstrated(self, task_id: str) -> str:
+    def _start_demo(self, task_id: str) -> str:
         for task in self._view.open_tasks:
             self.cancel(task.task_id)
         if self._yard is not None:
-            self._quietly(self._yard.clear_target())
-            # By the yard itself: this node may be gone by then.
-            self._quietly(self._yard.place_target_later(PLACING))
-        # Who acts may be lost together with the node that serves the page.
+            self._log_failure(self._yard.clear_target())
+            # The simulator places it, as this node may fail before.
+            self._log_failure(self._yard.place_target_later(PLACING))
+        # The acting device may fail together with the node that serves the page.
         template = replace(self._template(self._demo), tolerates=2)
-        return str(self._published(template, task_id)["id"])
+        return str(self._publish(template, task_id)["id"])
 
-    def _published(self, template: Task, task_id: str) -> dict[str, Any]:
+    def _publish(self, template: Task, task_id: str) -> dict[str, Any]:
         task, stored = self._client.submit(template, task_id)
-        self._quietly(stored)
-        return self._told(task)
+        self._log_failure(stored)
+        return self._describe(task)
 
-    def _told(self, task: Task) -> dict[str, Any]:
+    def _describe(self, task: Task) -> dict[str, Any]:
         refused = self._view.unable(task)
         able = [device.name for device in self._view.devices if device.name not in refused]
         return {"id": task.task_id, "able": able, "refused": refused}
@@ -238,13 +238,13 @@ class TeamDesk:
         template = self._predefined.get(name)
         if template is None:
             known = ", ".join(sorted(self._predefined))
-            raise Refusal("name", f"there is no predefined task {name!r}", f"choose one of {known}", 404)
+            raise Refusal("name", f"unknown predefined task {name!r}", f"choose one of {known}", 404)
         if not group:
             return template
         return replace(template, group=group, strategy=DIVIDED if template.strategy == NEAREST else template.strategy)
 
     def _likely(self, task: Task, able: Sequence[str]) -> str | None:
-        """Who of ``able`` would be the nearest by what is reported to open tasks of that kind; None: nobody knows."""
+        """Return the nearest of ``able`` by the reports to open tasks of the same kind; None without reports."""
         costs: dict[str, float] = {}
         for other in self._view.open_tasks:
             if (other.kind, other.parameters) == (task.kind, task.parameters):
@@ -254,40 +254,40 @@ class TeamDesk:
         nearest = min(costs, key=lambda uuid: (costs[uuid], uuid), default=None)
         return None if nearest is None else self._view.name_of(nearest)
 
-    def _unanswered(
+    def _explain_failure(
         self, failure: Any, uuid: str, name: str, until: float, refused: Callable[[Refused], Refusal | None]
     ) -> Deferred[Any]:
-        """Say in what way a device failed to do what it was asked."""
+        """Convert a failed call of a device to a ``Refusal``."""
         failure.trap(EntangledError)
         if failure.check(Refused):
             raise refused(failure.value) or Refusal(
-                "device", f"{name} says no: {failure.getErrorMessage()}", "ask for something else", 409
+                "device", f"{name} refused: {failure.getErrorMessage()}", "check the request", 409
             )
         silent: Deferred[Any] = Deferred()
 
-        def judge() -> None:
-            remedy = "look whether it was done all the same, then try again"
+        def decide() -> None:
+            remedy = "check whether the order took effect, then try again"
             refusal = Refusal("device", f"{name} did not answer", remedy, 504)
             if self._view.device(uuid) is None:
-                refusal = Refusal("device", f"{name} left while it was asked", "wait until it is back", 409)
+                refusal = Refusal("device", f"{name} left during the request", "wait until it is back", 409)
             silent.errback(refusal)
 
-        # Its presence outlives it for a moment: whether it is gone or only silent shows then.
-        self._client.clock.callLater(max(0.0, until - self._client.clock.seconds()), judge)
+        # The device's presence record outlives it for a moment; its expiry tells a departure from silence.
+        self._client.clock.callLater(max(0.0, until - self._client.clock.seconds()), decide)
         return silent
 
     def _with_yard(self) -> YardHand:
         if self._yard is None:
-            raise Refusal("target", "this node has no yard", "start one, or name it in the settings", 409)
+            raise Refusal("target", "this node has no robot simulator", "start one, or name it in the settings", 409)
         return self._yard
 
-    def _quietly(self, work: Deferred[Any]) -> None:
+    def _log_failure(self, work: Deferred[Any]) -> None:
         def ended(failure: Any) -> None:
             if failure.check(EntangledError) is None:
-                self._log.warn("a wish was not granted: {error}", error=failure.getErrorMessage())
+                self._log.warn("a request failed: {error}", error=failure.getErrorMessage())
 
         work.addErrback(ended)
 
 
-def _refused(failure: Any, what: str = "target") -> None:
-    raise Refusal(what, failure.getErrorMessage(), "choose another place, or look whether the yard runs", 409)
+def _raise_refusal(failure: Any, what: str = "target") -> None:
+    raise Refusal(what, failure.getErrorMessage(), "choose another position, or check that the simulator runs", 409)

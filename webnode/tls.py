@@ -1,7 +1,7 @@
-"""TLS: a second port for the page, under a certificate that the node makes, keeps and renews by itself.
+"""Serve the page over TLS on a second port, with a certificate that the node creates, stores and renews.
 
-The same site answers at both ports, with the same deadlines: they run from the connection on, so that whoever dribbles
-its handshake is let go as well.  Imported only where it is wanted, as it loads pyOpenSSL.
+Both ports serve the same site with the same deadlines.  These start with the connection, so a client that is slow with
+its handshake is disconnected as well.  This module loads pyOpenSSL and is imported only if TLS is used.
 """
 
 from __future__ import annotations
@@ -27,25 +27,25 @@ from webnode.keyfile import Unsafe, keep, kept
 from webnode.server import listening
 
 LEAF = ".tls"
-"""Beside the node's store: its certificate with the key."""
+"""Suffix of the file with the certificate and its key, next to the node's store."""
 AUTHORITY = "page/authority"
-"""The note in the node's store with the seed of its authority."""
+"""Key of the note in the node's store with the seed of its authority."""
 SEED_BYTES = 32
 LOOK_S = 60.0
-"""So often, at most, is it asked whether the certificate will still do, when somebody connects."""
+"""Minimum interval in seconds between two checks of the certificate, made when a client connects."""
 MOST_REACHED = 8
 
 Names = Callable[[], Collection[str]]
-"""What others in the network call this machine now: addresses and names."""
+"""Returns the current addresses and names of this machine in the network."""
 
 _log = Logger()
 
 
 @implementer(IOpenSSLServerConnectionCreator)
 class Certified:
-    """The certificate under which connections are made: from the file, or a new one.
+    """The certificate for connections: from the file, or a new one.
 
-    ``path`` None: it is forgotten when the node ends.  ``wall`` is unix time, ``names`` the machine's.
+    With ``path`` None it is not stored.  ``wall`` returns unix time, ``names`` the names of this machine.
     """
 
     def __init__(
@@ -64,31 +64,31 @@ class Certified:
         self._wall = wall
         self._rng = rng
         self._reached: list[str] = []
-        self._looked = 0.0
-        self._leaf = self._found() or self._made("there is none yet")
+        self._checked_at = 0.0
+        self._leaf = self._load() or self._create("there is none yet")
         self._options: Any = None
 
     @property
     def names(self) -> list[str]:
-        """The addresses and names for which it stands."""
+        """The addresses and names in the certificate."""
         return self._leaf.names
 
     def reached(self, host: str) -> None:
-        """Somebody came by this address of the machine, which is to be in the certificate."""
+        """Add an address of this machine, to which a client has connected, to the certificate."""
         for name in nameable([host]):
             if name not in self._leaf.names:
                 self._reached = [*self._reached, name][-MOST_REACHED:]
-                self._looked = 0.0
+                self._checked_at = 0.0
 
     def serverConnectionForTLS(self, protocol: object) -> Connection:  # noqa: N802
-        """The next connection."""
+        """Return the TLS state of the next connection."""
         now = self._wall()
-        # A clock that was set, backwards too, is a reason to look again.
-        if not 0.0 <= now - self._looked < LOOK_S:
-            self._looked = now
-            flaw = self._leaf.flaw(self._signer, self._wanted(), now)
+        # Check again also if the clock was set back.
+        if not 0.0 <= now - self._checked_at < LOOK_S:
+            self._checked_at = now
+            flaw = self._leaf.flaw(self._signer, self._required_names(), now)
             if flaw:
-                self._leaf, self._options = self._made(flaw), None
+                self._leaf, self._options = self._create(flaw), None
         if self._options is None:
             self._options = CertificateOptions(
                 privateKey=PKey.from_cryptography_key(self._leaf.key),
@@ -97,51 +97,51 @@ class Certified:
             )
         return Connection(self._options.getContext(), None)
 
-    def _wanted(self) -> list[str]:
+    def _required_names(self) -> list[str]:
         return [*self._reached, *self._names()]
 
-    def _found(self) -> Leaf | None:
-        """The certificate of the file, where it still serves."""
+    def _load(self) -> Leaf | None:
+        """Return the certificate of the file, if it is still usable."""
         if self._path is None:
             return None
         try:
             pem = kept(self._path)
             if pem is None:
                 return None
-            found = read(pem)
-            flaw = found.flaw(self._signer, self._wanted(), self._wall())
+            stored = read(pem)
+            flaw = stored.flaw(self._signer, self._required_names(), self._wall())
         except (Unsafe, ValueError) as error:
             flaw = str(error)
         if not flaw:
-            return found
-        _log.warn("the certificate in {path} is made anew: {flaw}", path=str(self._path), flaw=flaw)
+            return stored
+        _log.warn("the certificate in {path} is replaced: {flaw}", path=str(self._path), flaw=flaw)
         return None
 
-    def _made(self, why: str) -> Leaf:
-        """A new one, in the file as well."""
-        made = leaf(self._signer, self._title, self._wanted(), self._wall(), self._rng)
-        _log.info("a certificate for {names} is made: {why}", names=", ".join(made.names), why=why)
-        foreign = [name for name in self._wanted() if name and not plain(name)]
-        if foreign:
-            words = "{names}: not of a local network, so not in the certificate; open the page by another name"
-            _log.warn(words, names=", ".join(foreign))
+    def _create(self, why: str) -> Leaf:
+        """Create a certificate and store it in the file."""
+        created = leaf(self._signer, self._title, self._required_names(), self._wall(), self._rng)
+        _log.info("new certificate for {names}: {why}", names=", ".join(created.names), why=why)
+        excluded = [name for name in self._required_names() if name and not plain(name)]
+        if excluded:
+            warning = "{names}: not local names, so not in the certificate; open the page by another name"
+            _log.warn(warning, names=", ".join(excluded))
         if self._path is not None:
             try:
-                keep(self._path, made.pem_with_key)
+                keep(self._path, created.pem_with_key)
             except OSError as error:
                 _log.warn(
-                    "the certificate cannot be kept in {path} ({error}): the next start makes another",
+                    "cannot store the certificate in {path} ({error}): the next start creates another",
                     path=str(self._path),
                     error=error,
                 )
-        return made
+        return created
 
 
 class _Connection(BufferingTLSTransport):
     factory: Any
 
     def makeConnection(self, transport: Any) -> None:  # noqa: N802
-        # Whatever address the visitor has dialled: the certificate should name it.
+        # The address that the client dialled has to be in the certificate.
         self.factory.certified.reached(str(getattr(transport.getHost(), "host", "")))
         super().makeConnection(transport)
 
@@ -156,7 +156,7 @@ class _Connections(TLSMemoryBIOFactory):
 
 
 class TlsDoor:
-    """The port; ``signer`` is the authority that a visitor's browser should trust."""
+    """The TLS port; ``signer`` is the authority that a visitor's browser should trust."""
 
     def __init__(self, reactor: Any, host: str, port: int, signer: Authority, certified: Certified) -> None:
         self.signer = signer
@@ -166,7 +166,7 @@ class TlsDoor:
         self._certified = certified
 
     def open(self, site: Site) -> IListeningPort:
-        """Open it for ``site``; raises ``PortTaken``."""
+        """Open the port for ``site``; raises ``PortTaken``."""
         connections = _Connections(self._certified, site, self._reactor)
         return listening(self._reactor, self._host, self._port, connections, "tls_port")
 
@@ -174,7 +174,7 @@ class TlsDoor:
 def door(
     settings: Settings, store: Store, reactor: Any, wall: Callable[[], float], rng: random.Random, names: Names
 ) -> TlsDoor:
-    """The page's port over TLS, for the node with this ``store``."""
+    """Return the TLS port of the page for the node with this ``store``."""
     web, node = settings.web, settings.node
     signer = authority(_seed(store, rng), node.name)
     path = None if node.store == IN_MEMORY else Path(f"{node.store}{LEAF}")
@@ -184,7 +184,7 @@ def door(
 
 
 def _seed(store: Store, rng: random.Random) -> bytes:
-    """The seed of this node's authority: its own, drawn at the first start."""
+    """Return the seed of this node's authority, drawn at the first start."""
     seed = store.noted(AUTHORITY)
     if seed is None or len(seed) != SEED_BYTES:
         seed = rng.randbytes(SEED_BYTES)

@@ -1,8 +1,8 @@
-"""Token: what a visitor of the page shows, signed by the web node that gave it, for one web node.  Pure.
+"""Sign and verify session tokens, each issued by a web node for one web node.  Pure.
 
-A web node signs with the identity of its node: an Ed25519 key of its own, to which the operator of a closed team gives
-the role ``gateway``.  So no member without that role can make a token that counts, and whoever knows a secret that all
-members share knows nothing of it.  Signing and encoding are those of ``itsdangerous``.
+A web node signs with the identity of its node: an Ed25519 key, which has the role ``gateway`` from the operator of a
+closed team.  So members without that role cannot issue valid tokens, and a secret that all members share is of no use
+for it.  Signing and encoding use ``itsdangerous``.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ VERSION = 3
 SESSION_BYTES = 8
 MAX_NAME = 64
 MAX_VOUCHERS = 3
-"""Web nodes, beside the one that signs, through which a session may have come."""
+"""Maximum number of other web nodes through which a session may have come."""
 MAX_PARENTS = 3
 MAX_TEXT = 700
 REMEMBERED = 512
-"""Tokens that are known to be genuine; to verify one takes 80 us, and streams are checked every second."""
+"""Number of verified tokens cached; a verification takes 80 us, and streams are checked every second."""
 MAX_MOMENT = 2**40
 DOMAIN = b"swarm-page-1 "
 
@@ -36,9 +36,9 @@ DOMAIN = b"swarm-page-1 "
 class Claim:
     """The content of a token.
 
-    ``id`` names the session, ``parents`` the session or invitation of which it was made and with which it ends.
-    ``until`` is in whole unix seconds, and so is ``limit``, beyond which no token follows this one.  ``is_ticket``: the
-    token was made for the query of a GET.  ``vouchers`` are the public keys of the web nodes that vouch for it.
+    ``id`` names the session, ``parents`` the sessions or invitations from which it is derived and with which it ends.
+    ``until`` is the expiry, ``limit`` the latest expiry of a renewed token, both in whole unix seconds.  ``is_ticket``:
+    the token is for the query of a GET.  ``vouchers`` are the public keys of the web nodes that vouch for it.
     """
 
     id: str
@@ -52,28 +52,28 @@ class Claim:
 
     @property
     def ticket(self) -> Claim:
-        """The same session with fewer rights, as a URL is seen by more: an operator's ticket may only look."""
+        """The same session with fewer rights, as URLs leak more easily: an operator's ticket only reads."""
         return replace(self, role="phone" if self.role == "phone" else "viewer", is_ticket=True)
 
 
 class Ed25519(SigningAlgorithm):
-    """Signatures by ``identity``, or by nobody: then they are only verified."""
+    """Ed25519 signatures by ``identity``; without one, signatures can only be verified."""
 
     def __init__(self, identity: Identity | None = None) -> None:
         self._identity = identity
 
     def get_signature(self, key: bytes, value: bytes) -> bytes:
-        """The signature of ``value``; ``key`` is the public key of the identity."""
+        """Return the signature of ``value``; ``key`` is the public key of the identity."""
         assert self._identity is not None and key == self._identity.public
         return self._identity.sign(DOMAIN + value)
 
     def verify_signature(self, key: bytes, value: bytes, sig: bytes) -> bool:
-        """Whether the holder of the public key ``key`` signed ``value``."""
+        """Return whether the owner of the public key ``key`` signed ``value``."""
         return verified(key, DOMAIN + value, sig)
 
 
 class TokenKey:
-    """The key with which one web node signs tokens, and reads those that are for it."""
+    """The key with which one web node signs its tokens and verifies tokens for it."""
 
     def __init__(self, identity: Identity) -> None:
         self.public = identity.public
@@ -82,18 +82,18 @@ class TokenKey:
         self._read = lru_cache(REMEMBERED)(self._verify)
 
     def token(self, claim: Claim, audience: bytes = b"") -> str:
-        """The token of ``claim`` for the node with the id ``audience``, else for this one.
+        """Return the token of ``claim`` for the node with the id ``audience``, by default for this one.
 
-        It has letters, digits, ``-``, ``_`` and ``.``.  One for this node need not name it.
+        It consists of letters, digits, ``-``, ``_`` and ``.``.  A token for this node does not name it.
         """
         is_own = audience in (b"", self.node_id)
         value = base64_encode(packed(claim, b"" if is_own else audience))
         return self._signer.sign(value if is_own else base64_encode(self.public) + b"." + value).decode()
 
     def claim(self, text: str) -> Claim | None:
-        """The content of a token for this node, with who signed it among its vouchers; None for anything else.
+        """Return the content of a token for this node, with its signer among the vouchers; None if it is invalid.
 
-        Whether it is expired, and whether its vouchers may vouch, is for the caller to check.
+        The caller checks the expiry and whether the vouchers may vouch.
         """
         return self._read(text) if 0 < len(text) <= MAX_TEXT and text.isascii() else None
 
@@ -111,12 +111,12 @@ class TokenKey:
 
 
 def _signer(public: bytes, algorithm: Ed25519) -> Signer:
-    # The key stands as it is, and names who signs: the algorithm is an asymmetric one.
+    # No key derivation: the algorithm is asymmetric, and the key names the signer.
     return Signer(public, key_derivation="none", algorithm=algorithm)
 
 
 def packed(claim: Claim, audience: bytes = b"") -> bytes:
-    """The bytes of a claim."""
+    """Encode a claim."""
     flags = ROLES.index(claim.role) << 1 | claim.is_ticket
     vouchers = list(claim.vouchers)
     parents = [bytes.fromhex(each) for each in claim.parents]
@@ -125,7 +125,7 @@ def packed(claim: Claim, audience: bytes = b"") -> bytes:
 
 
 def unpacked(data: bytes, issuer: bytes, audience: bytes) -> Claim:
-    """The claim in ``data``, which ``issuer`` signed; raises ``ValueError`` where it is none for ``audience``."""
+    """Decode the claim in ``data``, signed by ``issuer``; raises ``ValueError`` if it is not valid for ``audience``."""
     fields = msgpack.unpackb(data)
     version, flags, until, limit, session, name, parents, vouchers, meant = fields
     is_lawful = (
@@ -143,7 +143,7 @@ def unpacked(data: bytes, issuer: bytes, audience: bytes) -> Claim:
         and len(vouchers) <= MAX_VOUCHERS
     )
     if not is_lawful:
-        raise ValueError("no claim of a token for this node")
+        raise ValueError("invalid token for this node")
     lineage = tuple(each.hex() for each in parents)
     through = tuple(dict.fromkeys((*vouchers, issuer)))
     return Claim(session.hex(), name, ROLES[flags >> 1], until, bool(flags & 1), limit, lineage, through)

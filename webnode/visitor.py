@@ -1,4 +1,4 @@
-"""Visitor: who asks the page, and who may: sessions, their tokens and their roles."""
+"""Define the visitors of the page: sessions, their tokens and their roles."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ Role = Literal["anyone", "viewer", "operator", "phone"]
 
 @dataclass(frozen=True)
 class Visitor:
-    """Who asks; ``token_id`` names what it signed in with, and is no secret.
+    """The sender of a request; ``token_id`` names its session and is not secret.
 
-    It is let in ``until`` then (unix seconds), which it may have put off, no further than to ``limit``, unless it shows
-    a ticket.  It ends with the sessions ``parents``, too; ``vouchers`` are the keys of the web nodes that vouch for it.
+    The session is valid ``until`` (unix seconds) and can be renewed up to ``limit``, but not with a ticket.  It ends
+    with the sessions ``parents``; ``vouchers`` are the keys of the web nodes that vouch for it.
     """
 
     name: str = ""
@@ -32,10 +32,10 @@ class Visitor:
 
 @dataclass(frozen=True)
 class Token:
-    """What a visitor who signed in shows: ``text`` in a header, ``ticket`` in the query of a GET.
+    """The credentials of a session: ``text`` for a header, ``ticket`` for the query of a GET.
 
-    The ticket stands for the same session and lets look only, as a URL is seen by more than a header.  ``until`` is
-    unix seconds.
+    The ticket belongs to the same session and only reads, as URLs leak more easily than headers.  ``until`` is unix
+    seconds.
     """
 
     text: str
@@ -45,38 +45,38 @@ class Token:
 
 
 class Sessions(Protocol):
-    """Who has signed in; ``now`` is unix seconds."""
+    """The signed-in visitors; ``now`` is unix seconds."""
 
     code: str
-    """What operators sign in with; empty where nobody needs to."""
+    """The sign-in code of operators; empty if none is needed."""
 
     def sign_in(self, proof: str, source: str, now: float) -> Deferred[Token]:
         """Sign in with a code or password, from the address ``source``; fails with ``Refusal`` 401 or 429."""
 
     def visitor(self, token: str, now: float) -> Visitor:
-        """Who shows this token or ticket; never raises, and changes nothing.  Without one: anyone."""
+        """Return the visitor of a token or ticket, without one a visitor ``anyone``; never raises."""
 
     def token(self, who: Visitor, name: str, role: Role, now: float, seconds: float) -> Token:
-        """A token for somebody whom ``who`` brings in, for no longer than ``who`` can stay."""
+        """Return a token for a guest of ``who``, valid no longer than ``who`` can stay."""
 
     def derived(self, who: Visitor, name: str, role: Role, now: float, seconds: float) -> Token:
-        """A token for ``who`` under another name, which ends with the session."""
+        """Return a token for ``who`` under another name, which ends with the session."""
 
     def renewed(self, who: Visitor, now: float) -> Token:
-        """Another token for the same session, good for longer; raises ``Refusal`` 401 for anyone and for a ticket."""
+        """Return a later token for the same session; raises ``Refusal`` 401 for anyone and for a ticket."""
 
     def passes(self, who: Visitor, nodes: Iterable[str], now: float) -> dict[str, Token]:
-        """Tokens for the same session at the web nodes with the uuids ``nodes``, each good there alone, for minutes.
+        """Return tokens for the same session at the web nodes ``nodes`` (uuids), each valid there for some minutes.
 
         Raises ``Refusal`` 401 for anyone and for a ticket.
         """
 
     def revoke(self, token_id: str, until: float = math.inf) -> None:
-        """Let in nobody with this token any more, nor with one that was made of it; it runs out ``until`` then."""
+        """Revoke a session and all tokens derived from it; the last of them expires at ``until``."""
 
 
 class OpenSessions:
-    """Everybody is an operator while ``may_serve``: for a page of this machine alone, and for tests."""
+    """Treat every visitor as an operator while ``may_serve``: for a page of this machine only, and for tests."""
 
     code = ""
 
@@ -84,7 +84,7 @@ class OpenSessions:
         self._may_serve = may_serve
 
     def sign_in(self, proof: str, source: str, now: float) -> Deferred[Token]:
-        """Let in whoever asks, for a day."""
+        """Sign in every visitor, for a day."""
         return succeed(self.token(Visitor(), "visitor", "operator", now, 86400.0))
 
     def visitor(self, token: str, now: float) -> Visitor:
@@ -92,17 +92,17 @@ class OpenSessions:
         return Visitor("visitor", "operator") if self._may_serve() else Visitor()
 
     def token(self, who: Visitor, name: str, role: Role, now: float, seconds: float) -> Token:
-        """Return one that says nothing."""
+        """Return a constant token."""
         return Token("open", "open", role, now + seconds)
 
     derived = token
 
     def renewed(self, who: Visitor, now: float) -> Token:
-        """Return one that says nothing."""
+        """Return a constant token."""
         return self.token(who, who.name, who.role, now, 86400.0)
 
     def passes(self, who: Visitor, nodes: Iterable[str], now: float) -> dict[str, Token]:
-        """Return one that says nothing for each."""
+        """Return a constant token for each node."""
         return {node: self.renewed(who, now) for node in nodes}
 
     def revoke(self, token_id: str, until: float = math.inf) -> None:

@@ -1,1 +1,1 @@
-"""The demonstration: a team of processes in the yard, the judge of both experiments, and the trials of them."""
+"""The demonstration of the thesis: a team of processes, a judge of both experiments, and repeated trials."""

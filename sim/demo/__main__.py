@@ -1,9 +1,9 @@
-"""Starts the demonstration: ``python -m sim.demo``."""
+"""Start the demonstration: ``python -m sim.demo``."""
 
 import sys
 
 if __name__ == "__main__":
-    # Twisted would load pyOpenSSL where it is installed (13 MiB), and nothing in this process speaks TLS.
+    # Twisted would load pyOpenSSL if it is installed (13 MiB), but nothing in this process uses TLS.
     sys.modules.setdefault("OpenSSL", None)  # type: ignore[arg-type]
     from sim.demo.demonstration import main
 

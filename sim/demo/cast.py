@@ -1,4 +1,4 @@
-"""Cast: which robot each dog of the demonstration is, and what its driver is told of it."""
+"""Choose the robots of the demonstration and the settings of their drivers."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ CASTS = {
     "rosbridge": ("rosbridge", "rosbridge", "rosbridge"),
     "sim": ("sim", "sim", "sim"),
 }
-"""The kinds of the three robots, by what a person asks for."""
+"""The kinds of the three robots, by the value of ``--robot``."""
 MOST_PORTS = 8
-"""So many TCP ports a robot and its parts need at most."""
+"""Maximum number of TCP ports of a robot and its parts."""
 SERVICES = ("main", "estop", "state", "walk", "head", "camera")
 
 
 @dataclass(frozen=True)
 class Robot:
-    """One robot: the table that its node's driver gets, and what else the yard has to know to play it."""
+    """One robot: the driver table of its node, and further options for the simulator that emulates it."""
 
     kind: str
     model: str
@@ -41,18 +41,18 @@ class Robot:
 
     @property
     def played(self) -> dict[str, Any]:
-        """What the yard is told of it."""
+        """The robot's table for the simulator."""
         return {**self.driver, **self.more}
 
 
 def chosen(wish: str, names: tuple[str, ...], folder: Path, ports: Iterator[int], yard_port: int) -> dict[str, Robot]:
-    """The robots of the cast ``wish``, by name; each takes of ``ports`` what it needs, and cables end in ``folder``."""
+    """Return the robots of the cast ``wish`` by name; they take ports from ``ports`` and put cables into ``folder``."""
     makers: dict[str, Callable[[str], Robot]] = {
         "aibo": lambda name: _aibo(name, ports),
         "bittle": lambda name: _bittle(name, folder, ports),
         "create2": lambda name: _create2(name, folder, ports),
         "rosbridge": lambda name: _rosbridge(ports),
-        "sim": lambda name: _sim(name, yard_port),
+        "sim": lambda name: _simulated(name, yard_port),
     }
     return {name: makers[kind](name) for name, kind in zip(names, CASTS[wish], strict=True)}
 
@@ -60,7 +60,7 @@ def chosen(wish: str, names: tuple[str, ...], folder: Path, ports: Iterator[int]
 def _aibo(name: str, ports: Iterator[int]) -> Robot:
     served = {service: next(ports) for service in SERVICES}
     options = {"host": LOOPBACK, "camera_fps": FPS, "camera_width": 208, "ports": served}
-    # One of them runs the older Tekkotsu: a driver finds out by itself which one its dog has.
+    # dog3 runs the older Tekkotsu; a driver detects the version.
     more = {"dialect": "T2"} if name.endswith("3") else {}
     stripes = _stripes(name)
     return Robot("aibo", "AIBO ERS-7", f"With {stripes}", options, (_compass(ports),), more)
@@ -82,7 +82,7 @@ def _rosbridge(ports: Iterator[int]) -> Robot:
     return Robot("rosbridge", "ROS 2 robot", "Behind rosbridge", options, (_compass(ports),))
 
 
-def _sim(name: str, yard_port: int) -> Robot:
+def _simulated(name: str, yard_port: int) -> Robot:
     options = {"host": LOOPBACK, "port": yard_port, "robot": name, "camera_fps": FPS}
     stripes = _stripes(name)
     return Robot("sim", "simulated ERS-7", f"With {stripes}", options)

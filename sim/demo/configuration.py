@@ -1,6 +1,6 @@
-"""Configuration: the files of the demonstration's nodes, as text.
+"""Write the configuration files of the demonstration's nodes.
 
-Knows what ``twistd swarm-node --config FILE`` reads, and nothing of what it does with that.
+This module knows the format of the files that ``twistd swarm-node --config FILE`` reads, and nothing of their effect.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ RESERVE = "pi"
 DOGS = ("dog1", "dog2", "dog3")
 
 JUDGE, YARD = "judge", "yard"
-"""The two processes of a demonstration that are no nodes: this one, and the world."""
+"""The two processes of a demonstration that are not nodes: this one, and the robot simulator."""
 
 Table = Mapping[str, object]
 FAULTS: Table = {"allow": True}
-"""A demonstration is there to see robots fail."""
+"""All nodes of a demonstration allow fault injection."""
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where one process of a demonstration runs, as its network sees it; without more said all are on one machine.
+    """The network location of one process of a demonstration; by default all are on one machine.
 
-    ``host`` is where it listens, ``entry`` where it finds the bootstrap and web node, ``yard`` where it finds the yard,
-    and ``enter`` what stands before its command, so that it runs there.
+    ``host`` is the address on which it listens, ``entry`` the address of the bootstrap and web node and ``yard`` the
+    address of the robot simulator as this process sees them, and ``enter`` the command prefix that runs it there.
     """
 
     host: str = LOOPBACK
@@ -40,7 +40,7 @@ class Place:
 
 @dataclass(frozen=True)
 class Plan:
-    """Where everything of one demonstration listens and lies; ``nodes`` maps a node's name to its UDP port."""
+    """Addresses, ports and folders of one demonstration; ``nodes`` maps a node's name to its UDP port."""
 
     run_dir: Path
     web_host: str
@@ -48,26 +48,26 @@ class Plan:
     yard_port: int
     nodes: Mapping[str, int]
     code: str
-    """What operators sign in to the page with."""
+    """The operators' sign-in code of the page."""
     reserve_port: int
-    """Where the second web node serves the page, for when the first is lost."""
+    """The port of the second web node's page."""
     tls_ports: tuple[int, int] = (0, 0)
-    """Where each of the two serves it over TLS; 0: nowhere."""
+    """The TLS ports of the two pages; 0 for none."""
     robots: Mapping[str, Robot] = field(default_factory=dict)
-    """What each dog is."""
+    """The robots by the names of the dogs."""
     places: Mapping[str, Place] = field(default_factory=dict)
-    """Where each process runs, by its name; those that are not named run on this machine."""
+    """The location of each process by name; other processes run on this machine."""
 
     def place(self, name: str) -> Place:
-        """Where the process ``name`` runs."""
+        """Return the location of the process ``name``."""
         return self.places.get(name, Place())
 
     def file(self, name: str) -> Path:
-        """The configuration file of the node ``name``."""
+        """Return the path of the configuration file of the node ``name``."""
         return self.run_dir / f"{name}.toml"
 
     def texts(self) -> dict[str, str]:
-        """The configuration of every node: the laptop that lets others in, the other web node, then the dogs."""
+        """Return the configuration of every node: the bootstrap node, the second web node, then the dogs."""
         laptop = self._node(BOOTSTRAP, "laptop", "Bootstrap node and web node", ["bootstrap", "edge", "web"])
         reserve = self._node(RESERVE, "computer", "Web node for when the other is lost", ["edge", "web"])
         ports = zip((self.web_port, self.reserve_port), self.tls_ports, strict=True)
@@ -78,7 +78,7 @@ class Plan:
         return {**webs, **{name: self._dog(name) for name in DOGS}}
 
     def founding(self) -> list[str]:
-        """What makes the demonstration's own closed team, as ``swarm init`` takes it: each node has its membership."""
+        """Return the arguments of ``swarm init`` that create the demonstration's closed team with all memberships."""
         team, folder = f"demo-{self.nodes[BOOTSTRAP]}", str(self.run_dir)
         words = [team, "--first", BOOTSTRAP, "--folder", folder, "--operator", str(self.run_dir / "operator.key")]
         members = [f"{RESERVE}=device,operator,gateway", *DOGS]
@@ -86,7 +86,7 @@ class Plan:
 
     @property
     def played(self) -> str:
-        """What the yard has to play beside its own simulated dogs; empty where it has nothing to."""
+        """The robots that the simulator emulates in addition to its own dogs, as TOML; empty if there are none."""
         return toml({name: robot.played for name, robot in self.robots.items() if robot.kind != "sim"})
 
     def _node(self, name: str, kind: str, description: str, roles: list[str]) -> Table:
@@ -121,7 +121,7 @@ class Plan:
 
 
 def toml(tables: Mapping[str, Table]) -> str:
-    """The TOML text of ``tables``, whose values are texts, numbers, lists of them, or one more level of table."""
+    """Encode ``tables`` as TOML; values are texts, numbers, lists of them, or one more level of tables."""
     lines: list[str] = []
     for title, table in tables.items():
         lines.append(f"[{title}]")
@@ -135,5 +135,5 @@ def _value(value: object) -> str:
         return "{ " + ", ".join(f"{key} = {_value(item)}" for key, item in value.items()) + " }"
     if isinstance(value, list | tuple):
         return "[" + ", ".join(_value(item) for item in value) + "]"
-    # JSON's texts, numbers, booleans and lists are lawful TOML, but for DEL, which JSON leaves as it is.
+    # JSON texts, numbers, booleans and lists are valid TOML, except DEL, which JSON does not escape.
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -1,8 +1,8 @@
-"""The demonstration: three dogs, two web nodes and a yard as six processes of this machine, told in words.
+"""The demonstration: three dogs, two web nodes and a robot simulator as six processes of this machine.
 
-``python -m sim.demo`` keeps the team running until Ctrl-C; with ``--headless`` it runs both experiments of the thesis,
-judges them by where the dogs really are, and exits with 0 or 1.  The nodes decide everything; this module only starts,
-watches, places the target, and once pulls a plug.
+``python -m sim.demo`` runs the team until Ctrl-C.  With ``--headless`` it runs both experiments of the thesis, checks
+them against the true positions of the dogs, and exits with 0 or 1.  The nodes decide everything; this module starts
+them, observes, places the target, and kills a node in experiment 2.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ from sim.demo.visitor import PageError, Visitor
 
 START_S = 40.0
 SEARCH_S = 3.0
-"""How long the dogs have searched when the target is placed."""
+"""Seconds that the dogs search before the target is placed."""
 TICK_S = 0.05
 
 
 class Demonstration:
-    """Six processes, an eye on the page, and an eye over the yard."""
+    """The processes, a client of the page, and a connection to the simulator for the true positions."""
 
     def __init__(
         self, reactor: Any, plan: Plan, seed: int, say: Callable[[str], None], loses_link: bool = False
@@ -59,11 +59,11 @@ class Demonstration:
         self.address = f"http://{host}:{plan.web_port}/#code={plan.code}"
         tls = plan.tls_ports[0]
         self.secure = f"https://{host}:{tls}/#code={plan.code}" if tls else ""
-        """The same over TLS, empty where there is none."""
+        """The address over TLS; empty without TLS."""
 
     async def start(self) -> None:
         """Start everything and wait until the page lists the three dogs."""
-        # The team is made while the yard starts.
+        # Create the team while the simulator starts.
         founding = [sys.executable, "-m", "swarmnode.team.init", *self._plan.founding()]
         founder = subprocess.Popen(founding, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
         yard = ["--host", self._plan.place(YARD).host, "--port", str(self._plan.yard_port), "--seed", str(self._seed)]
@@ -75,7 +75,7 @@ class Demonstration:
         self._team.start()
         _, trouble = founder.communicate()
         if founder.returncode != 0:
-            raise Trouble(f"no team can be made: {trouble.strip()}")
+            raise Trouble(f"cannot create the team: {trouble.strip()}")
         for name, text in self._plan.texts().items():
             path = self._plan.file(name)
             path.touch(mode=0o600)
@@ -89,7 +89,7 @@ class Demonstration:
         await self._until(self._is_complete, START_S, "the page does not list all three dogs")
 
     def stop(self) -> Deferred[None]:
-        """End everything; fires when no process is left."""
+        """End all processes; fires when they have ended."""
         self._visitor.leave()
         self._operator.disconnect()
         return self._team.stop()
@@ -110,7 +110,7 @@ class Demonstration:
             snapshot = self._operator.snapshot
             if target_at <= now and snapshot is not None:
                 target_at = float("inf")
-                # A page that puts the target there itself has done so by now.
+                # The page may place the target itself; it has done so by now.
                 if snapshot["target"] is None:
                     await self._operator.place_target_at_random()
                     self._tell("the red target is placed")
@@ -120,14 +120,14 @@ class Demonstration:
                 loss = "loss of the link" if self._loses_link else "kill"
                 self._tell(f"{run.takeover_s:.2f} s from the {loss} to the next dog moving")
             if victim:
-                await self._lose(victim)
+                await self._inject_failure(victim)
             self._check_processes()
         if run.killed and self._loses_link:
             await self._operator.plug(run.killed)
         return run
 
-    async def _lose(self, victim: str) -> None:
-        """Take the dog on its way away: its node, or what leads from its node to the robot."""
+    async def _inject_failure(self, victim: str) -> None:
+        """Let the approaching dog fail: its node, or the link between its node and the robot."""
         if self._loses_link:
             self._tell(f"{victim} has come nearer; the link between its node and the robot is lost")
             await self._operator.unplug(victim)
@@ -137,7 +137,7 @@ class Demonstration:
             self._team.kill(victim)
 
     def watch(self) -> None:
-        """Say when a process ends; the team starts it again."""
+        """Report a process that ends; the team restarts it."""
         missing = set(self._team.missing())
         for name in sorted(missing - self._lost):
             log = self._plan.run_dir / f"{name}.log"
@@ -176,9 +176,9 @@ class Demonstration:
 async def judged(
     demonstration: Demonstration, begun: Callable[[], Awaitable[None]], path: Path | None, say: Callable[[str], None]
 ) -> None:
-    """Run both experiments, once the page lists all dogs and ``begun`` has come back, and end everything.
+    """Run both experiments after ``start`` and ``begun``, then end everything.
 
-    The verdict is said, and written to ``path`` as JSON; raises ``SystemExit`` with 1 where one was not held.
+    The verdict is printed, and written to ``path`` as JSON; raises ``SystemExit`` with 1 if an experiment failed.
     """
     try:
         await demonstration.start()
@@ -194,72 +194,72 @@ async def judged(
 
 
 def options(prog: str, description: str) -> argparse.ArgumentParser:
-    """A command line with the options that demonstrations on one machine and across several have in common."""
+    """Return a parser with the common options of demonstrations on one machine and across several."""
     parser = argparse.ArgumentParser(prog=prog, description=description)
     parser.add_argument(
         "--robot",
         choices=sorted(CASTS),
         default="aibo",
-        help="what the three are; mixed: an AIBO, a Create 2 and a Bittle (default %(default)s)",
+        help="kind of the three robots; mixed: an AIBO, a Create 2 and a Bittle (default %(default)s)",
     )
     parser.add_argument(
         "--lose",
         choices=("node", "link"),
         default="node",
-        help="what experiment 2 takes from the dog on its way: node, or link to the robot (default %(default)s)",
+        help="what fails in experiment 2: the approaching dog's node, or its link to the robot (default %(default)s)",
     )
-    parser.add_argument("--seed", type=int, default=1, help="seed of the yard (default 1)")
-    parser.add_argument("--run-dir", type=Path, default=Path("run"), help="logs, stores and configurations go there")
-    parser.add_argument("--report", type=Path, help="write the verdict of both experiments there as JSON")
+    parser.add_argument("--seed", type=int, default=1, help="seed of the simulator (default 1)")
+    parser.add_argument("--run-dir", type=Path, default=Path("run"), help="folder for logs, stores and configurations")
+    parser.add_argument("--report", type=Path, help="write the verdict of both experiments to this file as JSON")
     return parser
 
 
 def _arguments(arguments: Sequence[str]) -> argparse.Namespace:
     parser = options("swarm demo", "Three robots, a red target and the page.")
-    parser.add_argument("--headless", action="store_true", help="run both experiments, judge them, exit with 0 or 1")
+    parser.add_argument("--headless", action="store_true", help="run and check both experiments, exit with 0 or 1")
     parser.add_argument("--web-host", default=LOOPBACK, help="address of the page; 0.0.0.0 opens it to the network")
     parser.add_argument(
         "--web-port",
         type=_port,
         default=None,
-        help=f"port of the page (default {WEB_PORT}, or a free one; 0: all ports are free ones, for several at once)",
+        help=f"port of the page (default {WEB_PORT}, or a free one; 0: only free ports, for several demonstrations)",
     )
-    parser.add_argument("--tls", action="store_true", help="serve the page over TLS on this machine alone, too")
-    wishes = parser.parse_args(arguments)
-    if wishes.lose == "link" and wishes.robot == "sim":
-        parser.error("--lose link: a simulated dog has no link of its own; choose another --robot")
-    if wishes.report is not None and not wishes.report.absolute().parent.is_dir():
-        parser.error(f"--report {wishes.report}: there is no such folder; make it, or name another file")
-    return wishes
+    parser.add_argument("--tls", action="store_true", help="also serve the page over TLS, on this machine only")
+    given = parser.parse_args(arguments)
+    if given.lose == "link" and given.robot == "sim":
+        parser.error("--lose link: a simulated dog has no link; choose another --robot")
+    if given.report is not None and not given.report.absolute().parent.is_dir():
+        parser.error(f"--report {given.report}: no such folder; create it, or choose another file")
+    return given
 
 
 def _port(word: str) -> int:
-    """The number of a port, from the command line; 0 is any."""
+    """Parse a port number of the command line; 0 is any port."""
     if not (word.isdecimal() and len(word) <= 5 and int(word) <= 65535):
         raise argparse.ArgumentTypeError(f"must be 0 to 65535, is {word!r}")
     return int(word)
 
 
-async def _run(reactor: Any, wishes: argparse.Namespace) -> None:
+async def _run(reactor: Any, given: argparse.Namespace) -> None:
     try:
-        with fresh(wishes.run_dir.absolute()):
-            folder = wishes.run_dir.absolute()
-            # On this machine alone a browser trusts http; TLS would only weigh.
-            with_tls = wishes.tls or (has_tls() and not wishes.headless and wishes.web_host != LOOPBACK)
-            if wishes.tls and not has_tls():
-                raise Trouble("--tls wants libraries that are missing; install them by: pip install 'swarm-node[tls]'")
-            is_usual = not wishes.headless and wishes.web_port != 0
-            plan = arranged(folder, wishes.web_host, wishes.web_port, is_usual, say, with_tls, wishes.robot)
-            demonstration = Demonstration(reactor, plan, wishes.seed, say, wishes.lose == "link")
+        with fresh(given.run_dir.absolute()):
+            folder = given.run_dir.absolute()
+            # For this machine alone browsers trust http, so TLS is not needed.
+            with_tls = given.tls or (has_tls() and not given.headless and given.web_host != LOOPBACK)
+            if given.tls and not has_tls():
+                raise Trouble("--tls needs libraries that are not installed; run: pip install 'swarm-node[tls]'")
+            is_usual = not given.headless and given.web_port != 0
+            plan = arranged(folder, given.web_host, given.web_port, is_usual, say, with_tls, given.robot)
+            demonstration = Demonstration(reactor, plan, given.seed, say, given.lose == "link")
             reactor.addSystemEventTrigger("before", "shutdown", demonstration.stop)
 
             async def begun() -> None:
                 _invite(demonstration, plan)
-                if not wishes.headless:
+                if not given.headless:
                     demonstration.watch()
                     await Deferred()
 
-            await judged(demonstration, begun, wishes.report, say)
+            await judged(demonstration, begun, given.report, say)
     except (Trouble, PageError, PortBusy, OSError) as problem:
         sys.stderr.write(f"swarm demo: {problem}\n")
         raise SystemExit(2 if isinstance(problem, PortBusy) else 1) from None
@@ -269,21 +269,21 @@ def _invite(demonstration: Demonstration, plan: Plan) -> None:
     say(f"The page: {demonstration.address}   (logs: {plan.run_dir}; end with Ctrl-C)")
     if demonstration.secure:
         say(f"Over TLS: {demonstration.secure}   (a browser warns until it trusts the team: docs/how-to/https.md)")
-    say("If the node that serves it is lost, the page goes on at another: end the process of vaio, and see.")
+    say("If its node fails, the page switches to another: end the process of vaio to see it.")
     if plan.web_host == LOOPBACK:
-        say("For a phone or tablet in the same network, then over TLS as well: make demo WEB_HOST=0.0.0.0")
+        say("To open it on phones and tablets in the same network, then also over TLS: make demo WEB_HOST=0.0.0.0")
     else:
         here, tls = os.uname().nodename, plan.tls_ports[0]
-        also = f", https://{here}.local:{tls} (which the camera of a phone wants)" if tls else ""
+        also = f", https://{here}.local:{tls} (required for the camera of a phone)" if tls else ""
         say(f"In the same network: http://{here}.local:{plan.web_port}{also}, or this machine's address;")
-        say(f"the code to sign in with: {plan.code}.  For a phone there is a code to scan: Invite, on the page")
+        say(f"sign-in code: {plan.code}.  For phones the page shows a QR code: Invite")
         if not tls:
-            say("The camera of a phone wants https, which is missing here: pip install 'swarm-node[tls]'")
+            say("The camera of a phone requires https, which is not installed: pip install 'swarm-node[tls]'")
 
 
 def main(arguments: Sequence[str] = tuple(sys.argv[1:])) -> None:
-    """Run the demonstration that the command line asks for."""
-    wishes = _arguments(arguments)
-    # Twisted's timers run on the wall clock; a step of that clock would freeze or fire all of them.
+    """Run the demonstration according to the command line."""
+    given = _arguments(arguments)
+    # Twisted's timers use the wall clock; a step of that clock would delay or fire all of them.
     ReactorBase.seconds = staticmethod(time.monotonic)
-    react(lambda reactor: Deferred.fromCoroutine(_run(reactor, wishes)))
+    react(lambda reactor: Deferred.fromCoroutine(_run(reactor, given)))

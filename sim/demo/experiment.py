@@ -1,7 +1,7 @@
-"""Experiment: one run of the thesis' demonstration, judged from what the page says and where the robots really are.
+"""Judge one run of the thesis' demonstration by the state of the page and the true positions of the robots.
 
-Experiment 1: three dogs search, the nearest approaches the target.  Experiment 2: the same, but the dog that
-approaches is lost on its way, and another one finishes (thesis, section 5).  No clock: ``now`` is an argument.
+Experiment 1: three dogs search, and the nearest approaches the target.  Experiment 2: the same, but the approaching dog
+fails on its way, and another one finishes (thesis, section 5).  Time is an argument.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from sim.demo.story import present
 from sim.robots.scene import FOOTPRINT
 
 MOVED_M = 0.10
-"""The dog is killed when it has come this much nearer to the target, or half its way where that is less."""
+"""The dog is killed when it has come this much nearer to the target, or half of its way if that is less."""
 TOUCH_M = 0.15
 """The gap between the dog's footprint and the target that still counts as having reached it."""
 SAME_M = 0.05
@@ -27,7 +27,7 @@ State = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Check:
-    """One thing that had to be so."""
+    """One condition of an experiment."""
 
     what: str
     held: bool
@@ -36,8 +36,8 @@ class Check:
 class Experiment:
     """One task from its assignment to its end.
 
-    :param kills: whether the dog that approaches shall be lost on its way
-    :param started: the moment of assignment, in seconds of the clock that ``look`` is given
+    :param kills: whether the approaching dog fails on its way
+    :param started: the time of assignment, in seconds of the clock of ``look``
     """
 
     def __init__(self, title: str, task: str, kills: bool, started: float) -> None:
@@ -57,11 +57,11 @@ class Experiment:
 
     @property
     def is_over(self) -> bool:
-        """Whether nothing more will happen: completed, failed, or out of time."""
+        """Whether the experiment has ended: completed, failed, or out of time."""
         return bool(self._end)
 
     def look(self, now: float, state: State, snapshot: State | None) -> str:
-        """Take notice of the newest state and snapshot; returns the name of the dog to kill now, or an empty text."""
+        """Evaluate a state and snapshot; returns the name of the dog to kill now, or an empty text."""
         if self._end:
             return ""
         distances = to_target(snapshot)
@@ -105,7 +105,7 @@ class Experiment:
         return bool(self._end)
 
     def checks(self) -> list[Check]:
-        """What had to be so, and whether it was."""
+        """Return the conditions of the experiment and whether they hold."""
         checks = [Check(f"task completed ({self._end or 'not over'})", self._end == "COMPLETED")]
         gap = "unknown" if self.gap_m is None else f"{self.gap_m:.2f} m"
         checks.append(Check(f"{self.by or 'nobody'} stands at the target (gap {gap})", _within(self.gap_m, TOUCH_M)))
@@ -124,12 +124,12 @@ class Experiment:
 
     @property
     def held(self) -> bool:
-        """Whether everything was as it had to be."""
+        """Whether all conditions hold."""
         return all(check.held for check in self.checks())
 
 
 def table(runs: Sequence[Experiment]) -> str:
-    """The verdict over all experiments, one line for each thing that had to be so."""
+    """Return the verdict of all experiments as text, one line per condition."""
     lines = []
     for run in runs:
         took = "" if run.took_s is None else f", {run.took_s:.1f} s"
@@ -140,7 +140,7 @@ def table(runs: Sequence[Experiment]) -> str:
 
 
 def report(runs: Sequence[Experiment]) -> list[dict[str, Any]]:
-    """The same for programs."""
+    """Return the verdict as data for JSON."""
     return [
         {
             "title": run.title,
@@ -157,7 +157,7 @@ def report(runs: Sequence[Experiment]) -> list[dict[str, Any]]:
 
 
 def to_target(snapshot: State | None) -> dict[str, float]:
-    """The distance of each dog to the target, centre to centre, in metres; empty where there is no target."""
+    """Return the distance of each dog to the target in metres, between centres; empty without a target."""
     target = (snapshot or {}).get("target")
     if not snapshot or not target:
         return {}

@@ -1,8 +1,8 @@
-"""Leash: runs a program that ends when whoever started it ends, a killed parent included.
+"""Run a program that ends when its parent ends, also if the parent is killed.
 
-``python -m sim.demo.leash FILE|-m MODULE [ARGUMENTS]`` runs the program in this very process, so its process id is the
-one that was started.  The parent holds the other end of standard input and never writes; end of file there means that
-the parent is gone.  A kernel closes that pipe however the parent died, which no signal handler could promise.
+``python -m sim.demo.leash FILE|-m MODULE [ARGUMENTS]`` runs the program in this process, so the process id stays the
+same.  The parent holds the other end of standard input and never writes; end of file means that the parent has ended.
+The kernel closes the pipe however the parent ends, which a signal handler cannot guarantee.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import threading
 import time
 
 GRACE_S = 3.0
-"""Seconds between the request to end (SIGTERM) and the end that cannot be refused."""
+"""Seconds between SIGTERM and the forced end."""
 
 
 def _watch(descriptor: int) -> None:
@@ -27,7 +27,7 @@ def _watch(descriptor: int) -> None:
 
 
 def main() -> None:
-    """Run the program that the command line names, on a leash."""
+    """Run the program of the command line and watch standard input."""
     if len(sys.argv) < 2 or sys.argv[1:] == ["-m"]:
         raise SystemExit("usage: python -m sim.demo.leash FILE|-m MODULE [ARGUMENTS]")
     leash = os.dup(0)

@@ -1,4 +1,4 @@
-"""Port: finds out which ports of this machine are free."""
+"""Find free ports of this machine."""
 
 from __future__ import annotations
 
@@ -13,31 +13,31 @@ Kind = Literal["tcp", "udp"]
 BOTH: tuple[Kind, ...] = ("tcp", "udp")
 
 QUIET = range(20_000, 32_000)
-"""Systems hand out none of these by themselves (Linux begins at 32,768, others at 49,152): a port that is free here
-is still free when the process starts that it was looked up for, however many connections others open meanwhile."""
+"""Systems assign none of these automatically (Linux starts at 32,768, others at 49,152): a port that is free now is
+still free when its process starts, however many connections are opened in between."""
 
 
 class PortBusy(Exception):
-    """A port that was asked for is held by another program; the message names it and says what to do."""
+    """A requested port is used by another program; the message names the port and the remedy."""
 
 
 def chosen(kind: Kind, host: str, wanted: int, what: str) -> int:
-    """``wanted`` where it is free, else ``PortBusy``."""
+    """Return ``wanted`` if it is free; raises ``PortBusy`` otherwise."""
     if not _is_free(kind, host, wanted):
-        raise PortBusy(f"port {wanted} ({what}) is busy; end the program that holds it, or choose another one")
+        raise PortBusy(f"port {wanted} ({what}) is busy; end the program that uses it, or choose another port")
     return wanted
 
 
 def preferred(kind: Kind, host: str, wanted: int, spare: Iterator[int]) -> int:
-    """``wanted`` where it is free, else the next of the ``spare`` ones; 0 wants any."""
+    """Return ``wanted`` if it is free, else the next of ``spare``; 0 always takes the next of ``spare``."""
     return wanted if wanted and _is_free(kind, host, wanted) else next(spare)
 
 
 def free(kind: Kind | tuple[Kind, ...], host: str, count: int) -> list[int]:
-    """``count`` different ``QUIET`` ports, free at this moment; held all at once, so none is given twice.
+    """Return ``count`` different ``QUIET`` ports that are free now for every ``kind``.
 
-    Each is free for every ``kind``.  Drawn by chance, so that who asks at the same moment is given others.  Raises
-    ``OSError`` where ``host`` is no address of this machine, or too few are free.
+    All are bound at the same time, so none is returned twice, and drawn at random, so that concurrent callers get
+    different ones.  Raises ``OSError`` if ``host`` is not an address of this machine, or too few ports are free.
     """
     kinds = (kind,) if isinstance(kind, str) else kind
     check(kinds[0], host)
@@ -59,7 +59,7 @@ def free(kind: Kind | tuple[Kind, ...], host: str, count: int) -> list[int]:
 
 
 def check(kind: Kind, host: str) -> None:
-    """Raises ``OSError`` where ``host`` is no address of this machine."""
+    """Raise ``OSError`` if ``host`` is not an address of this machine."""
     _bound(kind, host, 0).close()
 
 
@@ -75,7 +75,7 @@ def _bound(kind: Kind, host: str, port: int) -> socket.socket:
     opened = socket.socket(socket.AF_INET, socket.SOCK_STREAM if kind == "tcp" else socket.SOCK_DGRAM)
     try:
         if kind == "tcp":
-            # As Twisted's own listening ports do: a port in TIME_WAIT is free.
+            # Twisted sets it on its listening ports too: a port in TIME_WAIT is free.
             opened.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         opened.bind((host, port))
         if kind == "tcp":

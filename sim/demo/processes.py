@@ -1,7 +1,7 @@
-"""Team: the operating-system processes of a demonstration, watched by Twisted's ``ProcessMonitor``.
+"""Run the processes of a demonstration under Twisted's ``ProcessMonitor``.
 
-What a process writes goes line by line to ``RUN_DIR/NAME.log`` and to whoever listens.  A process that ends is
-started again after ``RESTART_S``, so that a killed node stays away long enough to be missed.
+The output of a process is written line by line to ``RUN_DIR/NAME.log`` and passed to a callback.  A process that ends
+is restarted after ``RESTART_S``, so that the team notices the failure of a node.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from twisted.runner.procmon import ProcessMonitor
 
 TAIL_LINES = 12
 RESTART_S = 30.0
-"""Seconds after which a dead process starts again: longer than another robot needs to finish on a busy machine."""
+"""Delay before a process is restarted: longer than another robot needs to finish on a busy machine."""
 
 
 class Team:
     """Processes by name, started and ended together.
 
-    :param reactor: starts the processes and says what time it is
-    :param run_dir: an existing folder; logs go there
-    :param said: told the name of a process and each line that it writes
+    :param reactor: starts the processes and provides the time
+    :param run_dir: an existing folder for the logs
+    :param said: called with the name of a process and each line of its output
     """
 
     log = Logger()
@@ -38,12 +38,12 @@ class Team:
     def __init__(self, reactor: Any, run_dir: Path, said: Callable[[str, str], None] = lambda name, line: None) -> None:
         self._clock = IReactorTime(reactor)
         self._run_dir = run_dir
-        self._said = said
+        self._on_line = said
         self._logs: dict[str, TextIO] = {}
         self._tails: dict[str, deque[str]] = {}
         self._stopped: Deferred[None] | None = None
         monitor = ProcessMonitor(reactor)
-        # Every end counts as "died too fast" for the monitor, and both its delays are ours: so it always waits.
+        # With an infinite threshold the monitor regards every end as too early, and waits for the delay set here.
         monitor.threshold = inf  # type: ignore[assignment]
         monitor.minRestartDelay = monitor.maxRestartDelay = RESTART_S  # type: ignore[assignment]
         monitor.killTime = 4
@@ -51,9 +51,9 @@ class Team:
         self._monitor = monitor
 
     def add(self, name: str, arguments: Sequence[str], enter: Sequence[str] = ()) -> None:
-        """Add a process; it starts at once where the team runs.  Raises ``KeyError`` where the name is taken.
+        """Add a process; it starts at once if the team runs.  Raises ``KeyError`` if the name is taken.
 
-        ``enter`` stands before its command, and must become it (as ``nsenter`` does), or a signal would miss it.
+        ``enter`` is a command prefix that has to exec the command (as ``nsenter`` does), so that signals reach it.
         """
         if name not in self._logs:
             self._logs[name] = (self._run_dir / f"{name}.log").open("a", encoding="utf-8", buffering=1)
@@ -66,20 +66,20 @@ class Team:
         self._monitor.startService()
 
     def stop(self) -> Deferred[None]:
-        """End every process, by force after four seconds; fires when all have ended.  May be called twice."""
+        """End every process, by force after four seconds; fires when all have ended.  May be called repeatedly."""
         done: Deferred[None] = Deferred()
         if self._stopped is None:
             self._stopped = done
             if self._monitor.running:
                 self._monitor.stopService()
-            self._await_end()
+            self._check_ended()
         else:
             self._stopped.addCallback(lambda _: done.callback(None))
         return done
 
-    def _await_end(self) -> None:
+    def _check_ended(self) -> None:
         if self._monitor.protocols:
-            self._clock.callLater(0.05, self._await_end)
+            self._clock.callLater(0.05, self._check_ended)
             return
         for log in self._logs.values():
             log.close()
@@ -87,22 +87,22 @@ class Team:
         self._stopped.callback(None)
 
     def pid(self, name: str) -> int | None:
-        """The process id; None while the process does not run."""
+        """Return the process id; None while the process does not run."""
         protocol = self._monitor.protocols.get(name)
         return None if protocol is None or protocol.transport is None else protocol.transport.pid
 
     def missing(self) -> list[str]:
-        """The names of the processes that do not run."""
+        """Return the names of the processes that do not run."""
         return [name for name in self._logs if self.pid(name) is None]
 
     def tail(self, name: str) -> list[str]:
-        """The last lines that the process wrote."""
+        """Return the last lines of the process's output."""
         return list(self._tails[name])
 
     def kill(self, name: str) -> None:
-        """End a process as a power cut would (SIGKILL); it is started again after the delay.
+        """Kill a process (SIGKILL); it is restarted after the delay.
 
-        Raises ``KeyError`` where no such process runs.
+        Raises ``KeyError`` if no such process runs.
         """
         protocol = self._monitor.protocols.get(name)
         if protocol is None or protocol.transport is None:
@@ -117,17 +117,17 @@ class Team:
         if not isinstance(name, str) or not isinstance(line, str):
             failure = event.get("log_failure")
             if failure is not None:
-                self.log.failure("A process cannot be watched", failure=failure)
+                self.log.failure("cannot watch a process", failure=failure)
             return
         if not line:
-            return  # the monitor ends every output with one line too many
+            return  # the monitor adds an empty line at the end of the output
         self._tails[name].append(line)
         log = self._logs[name]
         if not log.closed:
             log.write(line + "\n")
-        self._said(name, line)
+        self._on_line(name, line)
 
 
 def on_leash(arguments: Sequence[str]) -> list[str]:
-    """The command line that runs Python ``arguments`` so that they end with us (see ``sim.demo.leash``)."""
+    """Return the command line that runs Python ``arguments`` and ends with this process (see ``sim.demo.leash``)."""
     return [sys.executable, "-m", "sim.demo.leash", *arguments]

@@ -1,4 +1,4 @@
-"""Stage: the folder and the ports of a demonstration, taken before anything starts."""
+"""Prepare the folder and the ports of a demonstration before anything starts."""
 
 from __future__ import annotations
 
@@ -17,30 +17,30 @@ from sim.demo.configuration import BOOTSTRAP, DOGS, RESERVE, Plan
 
 WEB_PORT, TLS_PORT, NODE_PORT, YARD_PORT = 8080, 8443, 7000, 7400
 PAGES = 5
-"""Ports of the page, of its reserve, of both over TLS, and of the yard."""
+"""Number of ports for the two pages, both over TLS, and the simulator."""
 EVERYWHERE = "0.0.0.0"
 MARK = ".swarm-demo"
 LETTERS = "abcdefghjkmnpqrstuvwxyz"
-"""Of these is the code to sign in with: none looks like another, or like a digit."""
+"""Letters of a sign-in code; none resembles another or a digit."""
 
 
 class Trouble(Exception):
-    """The demonstration cannot go on; the message is for the person who started it."""
+    """The demonstration cannot continue; the message is for the person who started it."""
 
 
 def fresh(run_dir: Path) -> TextIO:
-    """Make ``run_dir`` empty and ours; returns the open lock, which is held for as long as that stays open.
+    """Create or empty ``run_dir`` and lock it; returns the lock, which is held until it is closed.
 
-    Refuses a folder that holds anything but an earlier demonstration.
+    Refuses a folder with anything but an earlier demonstration.
     """
     mark = run_dir / MARK
     try:
         run_dir.mkdir(parents=True, exist_ok=True)
         if not mark.exists() and any(run_dir.iterdir()):
-            raise Trouble(f"{run_dir} is not empty and no earlier demonstration; choose another --run-dir")
+            raise Trouble(f"{run_dir} is not empty and not from an earlier demonstration; choose another --run-dir")
         lock = mark.open("a", encoding="utf-8")
     except OSError as error:
-        raise Trouble(f"{run_dir} cannot be used ({error.strerror}); choose another --run-dir") from error
+        raise Trouble(f"cannot use {run_dir} ({error.strerror}); choose another --run-dir") from error
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
@@ -57,13 +57,13 @@ def fresh(run_dir: Path) -> TextIO:
 
 
 def say(line: str) -> None:
-    """Print a line at once."""
+    """Print a line and flush."""
     sys.stdout.write(line + "\n")
     sys.stdout.flush()
 
 
 def has_tls() -> bool:
-    """Whether nodes of this installation can serve the page over TLS; looks past what this process leaves out."""
+    """Return whether nodes of this installation can serve TLS, even if this process blocks the import of OpenSSL."""
     return all(PathFinder.find_spec(name) is not None for name in ("OpenSSL", "cryptography"))
 
 
@@ -76,18 +76,18 @@ def arranged(
     with_tls: bool = False,
     robot: str = "sim",
 ) -> Plan:
-    """A plan on ports that are free; a usual port that had to give way is said.
+    """Return a plan with free ports; reports each usual port that is busy.
 
-    ``usual``: try the usual ports first, for people who look at them; without it all ports are any free ones, so that
-    several demonstrations can start at the same moment.  ``with_tls``: the page is served over TLS as well.
-    ``robot``: the cast, of ``sim.demo.cast.CASTS``.
+    ``usual``: try the usual ports first, for interactive use; otherwise all ports are arbitrary, so that several
+    demonstrations can start at the same time.  ``with_tls``: also serve the pages over TLS.  ``robot``: a key of
+    ``sim.demo.cast.CASTS``.
     """
     try:
         port.check("tcp", web_host)
     except OSError as error:
-        remedy = "give --web-host an address of this machine, or 0.0.0.0 for all of them"
-        raise Trouble(f"the page cannot be at {web_host} ({error.strerror}); {remedy}") from error
-    # Free at every address: the page may be at another one than the robots.  What was asked for is nobody else's.
+        remedy = "set --web-host to an address of this machine, or 0.0.0.0 for all of them"
+        raise Trouble(f"cannot serve the page on {web_host} ({error.strerror}); {remedy}") from error
+    # Free on every address, as page and robots may use different ones; without the requested port.
     found = port.free("tcp", EVERYWHERE, 1 + PAGES + MOST_PORTS * len(DOGS))
     spare = iter([one for one in found if one != web_port])
     if web_port:
@@ -97,10 +97,10 @@ def arranged(
     reserve = port.preferred("tcp", web_host, web + 1 if usual and web < 65535 else 0, spare)
     tls = (0, 0)
     if with_tls:
-        # Nobody holds the ports of the page yet, so that they look free.
-        wish = TLS_PORT if usual and not {TLS_PORT, TLS_PORT + 1} & {web, reserve} else 0
-        first = port.preferred("tcp", web_host, wish, spare)
-        tls = (first, port.preferred("tcp", web_host, first + 1 if first == wish else 0, spare))
+        # The ports of the page are not bound yet, so they would look free.
+        preferred_port = TLS_PORT if usual and not {TLS_PORT, TLS_PORT + 1} & {web, reserve} else 0
+        first = port.preferred("tcp", web_host, preferred_port, spare)
+        tls = (first, port.preferred("tcp", web_host, first + 1 if first == preferred_port else 0, spare))
     yard = port.preferred("tcp", LOOPBACK, YARD_PORT if usual else 0, spare)
     quiet = iter(port.free("udp", LOOPBACK, 2 + len(DOGS)))
     node = port.preferred("udp", LOOPBACK, NODE_PORT if usual else 0, quiet)
@@ -108,9 +108,9 @@ def arranged(
     if usual:
         wanted = [("the page", web_port or WEB_PORT, web), ("the yard", YARD_PORT, yard), ("vaio", NODE_PORT, node)]
         wanted += [("the page over TLS", TLS_PORT, tls[0])] if with_tls else []
-        for what, wish, got in wanted:
-            if wish != got:
-                say(f"port {wish} is busy; {what} uses {got}")
+        for what, preferred_port, got in wanted:
+            if preferred_port != got:
+                say(f"port {preferred_port} is busy; {what} uses {got}")
     nodes = {BOOTSTRAP: node, **dict(zip((RESERVE, *DOGS), others, strict=True))}
     code = "".join(secrets.choice(LETTERS) for _ in range(8))
     robots = chosen(robot, DOGS, run_dir, spare, yard)

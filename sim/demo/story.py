@@ -1,4 +1,4 @@
-"""Story: what changed between two states of the page, in words for a terminal."""
+"""Describe the changes between two states of the page as text."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ State = Mapping[str, Any]
 
 
 def told(before: State, after: State) -> list[str]:
-    """One line for each thing that changed: devices, then tasks, then what the groups agree on."""
+    """Return one line per change: devices, then tasks, then groups."""
     return [*_devices(before, after), *_tasks(before, after), *_groups(before, after)]
 
 
 def present(state: State) -> dict[str, State]:
-    """The devices that are there, by name."""
+    """Return the devices in the network, by name."""
     return {str(device["name"]): device for device in _rows(state, "devices") if not _is_gone(device)}
 
 

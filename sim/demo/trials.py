@@ -1,7 +1,7 @@
-"""Trials: both experiments of the thesis, many times, each from a seed; a table, and pictures of each phase.
+"""Repeat both experiments of the thesis with many seeds; write a table, and pictures of each phase.
 
-``swarm trials --count 20 --seed 1`` runs in virtual time, where the real nodes, agents, drivers and yard run on a
-turned clock; ``--real 3`` adds runs with real processes (``sim.demo``).  The team is handed in by the front door.
+``swarm trials --count 20 --seed 1`` runs real nodes, agents and drivers and the robot simulator in virtual time;
+``--real 3`` adds runs with real processes (``sim.demo``).  The caller provides the team.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from typing import Any, Protocol
 from sim.demo.experiment import Experiment
 
 LOOK_S = 0.032
-"""Virtual seconds between two looks at the team: one sensor frame."""
+"""Virtual seconds between two evaluations of the team: one sensor frame."""
 LIMIT_S = 120.0
 SETTLED_S = 1.0
 
 
 class Team(Protocol):
-    """A team that can be made to live a while (the front door's ``VirtualTeam``)."""
+    """A team in virtual time (``VirtualTeam`` of package ``swarmnode``)."""
 
     clock: Any
     board: Any
@@ -41,16 +41,16 @@ class Team(Protocol):
         """Assign the demonstration's task."""
 
     def state(self) -> dict[str, Any]:
-        """What the page shows."""
+        """Return the state that the page shows."""
 
     def truth(self) -> dict[str, Any]:
-        """Where everything really is."""
+        """Return the true positions of the robots and the target."""
 
     def scatter(self, seed: int) -> None:
-        """Set the dogs down at random places."""
+        """Move the dogs to random positions."""
 
     def kill(self, name: str) -> None:
-        """End a node without a word."""
+        """Kill a node."""
 
     def stop(self) -> None:
         """End everything."""
@@ -61,10 +61,10 @@ MakeTeam = Callable[[int], Team]
 
 @dataclass
 class Outcome:
-    """What came of one trial; times in seconds since the task was assigned, ``takeover`` since the kill.
+    """The result of one trial; times in seconds since the task was assigned, ``takeover`` since the kill.
 
     ``found`` says whether every dog reported before the task ended, ``agreed`` whether all agents named the same one,
-    ``right`` whether the one that went was the nearest, ``held`` whether everything was as it had to be.
+    ``right`` whether the nearest dog went, ``held`` whether all conditions of the experiment hold.
     """
 
     seed: int
@@ -84,7 +84,7 @@ class Outcome:
 
 
 def trial(make_team: MakeTeam, experiment: int, seed: int, pictures: Path | None = None) -> Outcome:
-    """Run one experiment from ``seed``; where ``pictures`` is given, draw each phase into that folder."""
+    """Run one experiment from ``seed``; draw each phase into the folder ``pictures`` if it is given."""
     team = make_team(seed)
     team.scatter(seed)
     draw = _painter(team, pictures, experiment, seed)
@@ -95,7 +95,7 @@ def trial(make_team: MakeTeam, experiment: int, seed: int, pictures: Path | None
     while not run.is_over and team.clock.seconds() - began < LIMIT_S:
         team.clock.advance(LOOK_S)
         state, truth = team.state(), team.truth()
-        _notice(outcome, state, truth, team.clock.seconds() - began, draw)
+        _record_times(outcome, state, truth, team.clock.seconds() - began, draw)
         killed = run.look(team.clock.seconds(), state, truth)
         if killed:
             draw("5-lost", f"{killed} is lost on its way")
@@ -115,8 +115,8 @@ def trial(make_team: MakeTeam, experiment: int, seed: int, pictures: Path | None
 Draw = Callable[[str, str], None]
 
 
-def _notice(outcome: Outcome, state: dict[str, Any], truth: dict[str, Any], now: float, draw: Draw) -> None:
-    """The moments at which all have found the target, and at which all name the same agent."""
+def _record_times(outcome: Outcome, state: dict[str, Any], truth: dict[str, Any], now: float, draw: Draw) -> None:
+    """Record the times at which all dogs have found the target and all agents name the same dog."""
     group = state["groups"][0] if state["groups"] else None
     if truth["target"] is not None:
         draw("2-with-target", "The target is placed while they search")
@@ -148,13 +148,13 @@ def _painter(team: Team, folder: Path | None, experiment: int, seed: int) -> Dra
 
 
 def percentile(values: Sequence[float], share: float) -> float:
-    """The smallest of ``values`` that at least ``share`` of them do not exceed."""
+    """Return the smallest of ``values`` that at least the share ``share`` of them does not exceed."""
     ordered = sorted(values)
     return ordered[max(0, math.ceil(share * len(ordered)) - 1)]
 
 
 def table(outcomes: Iterable[Outcome]) -> str:
-    """One line an experiment: how many held, found, agreed, chose right; times as median (95th percentile)."""
+    """Return one line per experiment: counts held, found, agreed, right; times as median (95th percentile)."""
     rows = [f"{'':12}{'trials':>7}{'held':>7}{'found':>7}{'agreed':>8}{'right':>7}"]
     rows[0] += "".join(f"{name:>16}" for name in ("find s", "agree s", "reach s", "take over s"))
     every = list(outcomes)
@@ -171,13 +171,13 @@ def table(outcomes: Iterable[Outcome]) -> str:
     return "\n".join(rows)
 
 
-def _one(job: tuple[MakeTeam, int, int, Path | None]) -> Outcome:
+def _run_job(job: tuple[MakeTeam, int, int, Path | None]) -> Outcome:
     make_team, experiment, seed, pictures = job
     return trial(make_team, experiment, seed, pictures)
 
 
 def real(count: int, seed: int, run_dir: Path) -> list[bool]:
-    """Both experiments with real processes, ``count`` times; whether each run held."""
+    """Run both experiments with real processes ``count`` times; returns whether each run passed."""
     held = []
     for number in range(count):
         command = [sys.executable, "-m", "sim.demo", "--headless", "--seed", str(seed + number), "--run-dir"]
@@ -185,27 +185,27 @@ def real(count: int, seed: int, run_dir: Path) -> list[bool]:
     return held
 
 
-def whole(word: str) -> int:
-    """A number that is not negative, from the command line."""
-    if not (word.isdecimal() and len(word) <= 9):
-        raise argparse.ArgumentTypeError(f"must be a whole number from 0 on, is {word!r}")
-    return int(word)
+def whole(text: str) -> int:
+    """Parse a non-negative integer of the command line."""
+    if not (text.isdecimal() and len(text) <= 9):
+        raise argparse.ArgumentTypeError(f"must be a whole number from 0 on, is {text!r}")
+    return int(text)
 
 
 def main(arguments: Sequence[str], make_team: MakeTeam) -> int:
-    """The command line; returns 0 where every trial held."""
+    """Run the command line; returns 0 if every trial passed."""
     parser = argparse.ArgumentParser(prog="swarm trials", description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--count", type=whole, default=20, help="trials of each experiment in virtual time")
     parser.add_argument("--seed", type=int, default=1, help="the first seed")
     parser.add_argument("--real", type=whole, default=0, help="runs of both experiments with real processes")
     parser.add_argument("--out", type=Path, default=Path("run/trials"), help="folder for the report and the pictures")
-    parser.add_argument("--pictures", type=whole, default=1, help="of how many seeds pictures are drawn")
-    parser.add_argument("--jobs", type=whole, default=os.cpu_count() or 1, help="trials at the same time")
+    parser.add_argument("--pictures", type=whole, default=1, help="number of seeds for which pictures are drawn")
+    parser.add_argument("--jobs", type=whole, default=os.cpu_count() or 1, help="parallel trials")
     given = parser.parse_args(list(arguments))
     try:
         given.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        parser.error(f"--out {given.out} cannot be made ({error.strerror}); name another folder")
+        parser.error(f"--out: cannot create {given.out} ({error.strerror}); choose another folder")
     jobs = [
         (make_team, experiment, given.seed + n, given.out if n < given.pictures else None)
         for n in range(given.count)
@@ -216,14 +216,14 @@ def main(arguments: Sequence[str], make_team: MakeTeam) -> int:
     with ExitStack() as stack:
         spread: Callable[..., Iterable[Outcome]] = map
         if given.jobs > 1:
-            # A fork of a process that has threads may stand still for ever.
+            # Forking a process with threads may deadlock.
             spawn = multiprocessing.get_context("spawn")
             spread = stack.enter_context(ProcessPoolExecutor(given.jobs, spawn)).map
-        for outcome in spread(_one, jobs):
+        for outcome in spread(_run_job, jobs):
             outcomes.append(outcome)
-            word = "ok  " if outcome.held else "FAIL"
+            text = "ok  " if outcome.held else "FAIL"
             broken = f"  ({'; '.join(outcome.broken)})" if outcome.broken else ""
-            line = f"{len(outcomes):4}/{len(jobs)} {word} experiment {outcome.experiment} seed {outcome.seed}"
+            line = f"{len(outcomes):4}/{len(jobs)} {text} experiment {outcome.experiment} seed {outcome.seed}"
             sys.stdout.write(f"{line}: {outcome.by or 'nobody'} reached it{broken}\n")
             sys.stdout.flush()
     (given.out / "trials.json").write_text(json.dumps([asdict(o) for o in outcomes], indent=1), encoding="utf-8")

@@ -1,6 +1,6 @@
-"""Visitor: a client of a web node's page, as a browser is one, for programs.
+"""A programmatic client of a web node's page.
 
-Follows the live stream of states, and orders through the page's JSON.
+It follows the live stream of states, and sends orders through the HTTP API.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ MAX_EVENT = 1 << 20
 
 
 class PageError(Exception):
-    """The page refused, or answered what is no answer; the message is the page's own."""
+    """The page refused a request or sent an invalid answer; the message contains the page's text."""
 
 
 class EventStream:
-    """Server-sent events out of bytes, however these are cut; an event above one MiB is dropped."""
+    """A parser of server-sent events for any chunks of bytes; an event above one MiB is dropped."""
 
     def __init__(self) -> None:
         self._buffer = b""
@@ -36,7 +36,7 @@ class EventStream:
         self._data: list[bytes] = []
 
     def feed(self, data: bytes) -> list[tuple[str, bytes]]:
-        """Take the next bytes; returns the events that are complete now, each with its name and data."""
+        """Parse more bytes; returns the completed events, each with its name and data."""
         events = []
         *lines, self._buffer = (self._buffer + data).split(b"\n")
         if len(self._buffer) > MAX_EVENT:
@@ -57,10 +57,10 @@ class EventStream:
 
 
 class Visitor:
-    """One visitor of the page at ``http://HOST:PORT``.
+    """A client of the page at ``http://HOST:PORT``.
 
-    ``on_state(before, after)`` is called at each new state; ``state`` is the newest, empty before the first one.
-    ``code`` is what it signs in with; it signs in again when the page no longer knows it.
+    ``on_state(before, after)`` is called for each new state; ``state`` is the newest, empty before the first one.
+    ``code`` is the sign-in code; the client signs in again when its session has ended.
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class Visitor:
         self._following = False
 
     def follow(self) -> None:
-        """Follow the live states until ``leave``; a lost stream is opened again."""
+        """Follow the live states until ``leave``; a lost stream is reopened."""
         self._following = True
         self._open()
 
@@ -96,11 +96,11 @@ class Visitor:
             self._stream.transport.loseConnection()
 
     async def post(self, path: str) -> dict[str, Any]:
-        """Give an order to the page; raises ``PageError`` where it is refused."""
+        """Send an order to the page; raises ``PageError`` if it is refused."""
         await self._sign_in()
-        return await self._posted(path, None)
+        return await self._post(path, None)
 
-    async def _posted(self, path: str, body: IBodyProducer | None) -> dict[str, Any]:
+    async def _post(self, path: str, body: IBodyProducer | None) -> dict[str, Any]:
         asked = self._agent.request(b"POST", (self._address + path).encode(), self._headers(), body)
         response = await asked.addTimeout(LIMIT_S, self._clock)
         content = await readBody(response).addTimeout(LIMIT_S, self._clock)
@@ -117,7 +117,7 @@ class Visitor:
     async def _sign_in(self) -> None:
         if self._code and not self._token:
             body = FileBodyProducer(BytesIO(json.dumps({"code": self._code}).encode()))
-            answer = await self._posted("/api/v1/session", body)
+            answer = await self._post("/api/v1/session", body)
             self._token = str(answer.get("token", ""))
 
     def _headers(self) -> Headers:
@@ -125,28 +125,28 @@ class Visitor:
         return Headers({"X-Swarm": ["1"], **signed})
 
     def _open(self) -> None:
-        Deferred.fromCoroutine(self._asked_stream()).addCallbacks(self._opened, self._lost)
+        Deferred.fromCoroutine(self._request_stream()).addCallbacks(self._on_open, self._on_lost)
 
-    async def _asked_stream(self) -> IResponse:
+    async def _request_stream(self) -> IResponse:
         await self._sign_in()
         response = await self._agent.request(b"GET", f"{self._address}/events?whole=1".encode(), self._headers())
         if response.code == 401:
             self._token = ""
         return response
 
-    def _opened(self, response: IResponse) -> None:
-        self._stream = _Stream(self._heard)
-        self._stream.over.addBoth(self._lost)
+    def _on_open(self, response: IResponse) -> None:
+        self._stream = _Stream(self._on_event)
+        self._stream.over.addBoth(self._on_lost)
         response.deliverBody(self._stream)
         if not self._following:
             self.leave()
 
-    def _lost(self, _: object) -> None:
+    def _on_lost(self, _: object) -> None:
         self._stream = None
         if self._following:
             self._retry = self._clock.callLater(RETRY_S, self._open)
 
-    def _heard(self, name: str, data: bytes) -> None:
+    def _on_event(self, name: str, data: bytes) -> None:
         if name != "state":
             return
         try:
@@ -159,14 +159,14 @@ class Visitor:
 
 
 class _Stream(Protocol):
-    def __init__(self, heard: Callable[[str, bytes], None]) -> None:
+    def __init__(self, on_event: Callable[[str, bytes], None]) -> None:
         self.over: Deferred[None] = Deferred()
         self._events = EventStream()
-        self._heard = heard
+        self._on_event = on_event
 
     def dataReceived(self, data: bytes) -> None:
         for name, event in self._events.feed(data):
-            self._heard(name, event)
+            self._on_event(name, event)
 
     def connectionLost(self, reason: Failure = connectionDone) -> None:
         self.over.callback(None)

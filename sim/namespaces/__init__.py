@@ -1,1 +1,1 @@
-"""An internet made of network namespaces: sites behind routers that translate addresses, bad lines, and real nodes."""
+"""An emulated internet of network namespaces: sites behind NAT routers, impaired links, and real nodes."""

@@ -1,10 +1,10 @@
-"""Capture: what passes an interface, kept for whoever searches it, and counted by the peer it went to or came from.
+"""Capture the frames of an interface into a file, and count datagrams by peer.
 
     with Capture(net, "pub", folder / "pub.pcap") as seen:
         ...
     seen.found([b"red target"]), seen.traffic["198.18.1.2:7000"].amplification
 
-``python -m sim.namespaces.capture INTERFACE FILE`` is the part of it that runs on the host; it needs no ``tcpdump``.
+``python -m sim.namespaces.capture INTERFACE FILE`` is the process on the host; it does not need ``tcpdump``.
 """
 
 from __future__ import annotations
@@ -42,14 +42,14 @@ class Traffic:
 
     @property
     def amplification(self) -> float:
-        """Bytes sent for each byte received; infinite for a peer that sent none."""
+        """Bytes sent per byte received; infinite for a peer that sent nothing."""
         if not self.sent_bytes:
             return 0.0
         return self.sent_bytes / self.received_bytes if self.received_bytes else float("inf")
 
 
 class Capture:
-    """What passes the interface of ``host`` between ``with`` and its end; ``traffic`` is there afterwards."""
+    """A capture of the interface of ``host`` within a ``with`` block; ``traffic`` is available afterwards."""
 
     def __init__(self, net: Internet, host: str, file: Path) -> None:
         self.traffic: dict[str, Traffic] = {}
@@ -66,11 +66,11 @@ class Capture:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        said = self._process.communicate(timeout=20)[0]
-        self.traffic = {peer: Traffic(**counts) for peer, counts in json.loads(said).items()}
+        output = self._process.communicate(timeout=20)[0]
+        self.traffic = {peer: Traffic(**counts) for peer, counts in json.loads(output).items()}
 
     def from_host(self, address: str) -> Traffic:
-        """The traffic with all ports of one address."""
+        """Return the traffic with all ports of one address."""
         whole = Traffic()
         for peer, each in self.traffic.items():
             if peer.rpartition(":")[0] == address:
@@ -81,18 +81,18 @@ class Capture:
         return whole
 
     def found(self, words: Iterable[bytes]) -> list[bytes]:
-        """Those of ``words`` that can be read in what passed."""
+        """Return those of ``words`` that occur in the captured frames in plain text."""
         return readable(self.file.read_bytes(), words)
 
 
 def readable(passed: bytes, words: Iterable[bytes]) -> list[bytes]:
-    """Those of ``words`` that stand in ``passed`` as they are, whatever their letters' case, or as UTF-16."""
+    """Return those of ``words`` that occur in ``passed`` in any case, or as UTF-16."""
     text = passed.lower()
     return [w for w in words if w.lower() in text or w.decode().lower().encode("utf-16-le") in text]
 
 
 def datagrams(file: Path) -> Iterator[tuple[str, str, bytes]]:
-    """The UDP datagrams of a capture: from where, to where, and what they hold."""
+    """Yield source, target and payload of the UDP datagrams of a capture file."""
     data, place = file.read_bytes(), len(FILE_HEADER)
     while place + 16 <= len(data):
         length = struct.unpack_from("=I", data, place + 8)[0]
@@ -103,7 +103,7 @@ def datagrams(file: Path) -> Iterator[tuple[str, str, bytes]]:
 
 
 def payload(frame: bytes) -> tuple[str, str, bytes] | None:
-    """Where a frame's datagram comes from, where it goes, and what it holds; None for what is no UDP over IPv4."""
+    """Return source, target and payload of a frame's datagram; None unless it is UDP over IPv4."""
     if len(frame) < 42 or int.from_bytes(frame[12:14]) != IPV4 or frame[23] != UDP:
         return None
     udp = 14 + 4 * (frame[14] & 15)
@@ -115,7 +115,7 @@ def payload(frame: bytes) -> tuple[str, str, bytes] | None:
 
 
 def capture(interface: str, out: BinaryIO, orders: int, ready: Any) -> dict[str, Traffic]:
-    """Write frames to ``out`` until the file ``orders`` ends; returns what was counted."""
+    """Write frames to ``out`` until the file ``orders`` ends; returns the traffic by peer."""
     raw = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(EVERYTHING))
     raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 8 << 20)
     raw.bind((interface, 0))
@@ -145,7 +145,7 @@ def capture(interface: str, out: BinaryIO, orders: int, ready: Any) -> dict[str,
 
 
 def main(interface: str, file: str) -> None:
-    """Capture until the input ends, then say what was counted."""
+    """Capture until standard input ends, then print the traffic as JSON."""
 
     def ready() -> None:
         sys.stdout.write("ready\n")

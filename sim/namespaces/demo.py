@@ -1,9 +1,8 @@
-"""The demonstration across an internet: ``make demo NAT=1``, or ``python -m sim.namespaces.demo``.
+"""The demonstration across an emulated internet: ``make demo NAT=1``, or ``python -m sim.namespaces.demo``.
 
-Two dogs' computers are behind routers of their own, one of them a symmetric one; the third is on the LAN of the
-bootstrap and web node, whose router hands two ports on to it; and whoever looks at the page sits behind a fourth.  Each
-robot hangs on its computer by a cable, at the other end of which is the yard.  Both experiments of the thesis are run
-and judged as on one machine.
+The computers of two dogs are each behind a NAT router, one of them symmetric.  The third is on the LAN of the bootstrap
+and web node, whose router forwards two ports.  The browser is behind a fourth router.  Each robot is connected to its
+computer by a separate link to the robot simulator.  Both experiments of the thesis run as on one machine.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ from sim.namespaces.room import refusal
 NODE_PORT, WEB_PORT, YARD_PORT, ROBOT_PORT = 7000, 8080, 7400, 7500
 HOME, KINDS = "home", (Kind.PORT, Kind.SYM)
 HOSTS = {BOOTSTRAP: "home1", RESERVE: "home2", DOGS[2]: "home3", DOGS[0]: "far1", DOGS[1]: "farther1", JUDGE: "cafe1"}
-"""On which host each one runs."""
+"""The host of each process."""
 SITES = (
     Site(HOME, Kind.PORT, 3),
     Site("far", KINDS[0]),
@@ -41,7 +40,7 @@ SITES = (
 
 
 def laid_out(net: Internet) -> dict[str, Place]:
-    """Join the robots to their computers and open the ports of the home; says where everything is."""
+    """Connect the robots to their computers and forward the ports of the home; returns the location of each process."""
     net.island(YARD)
     cables = {name: net.cable(host, YARD)[1] for name, host in HOSTS.items()}
     inside = net.address(HOSTS[BOOTSTRAP])
@@ -54,7 +53,7 @@ def laid_out(net: Internet) -> dict[str, Place]:
 
 
 def planned(run_dir: Path, robot: str, places: dict[str, Place], code: str) -> Plan:
-    """The plan of the demonstration at ``places``."""
+    """Return the plan of the demonstration at ``places``."""
     ports = iter(range(ROBOT_PORT, ROBOT_PORT + MOST_PORTS * len(DOGS)))
     robots = {
         name: _cabled(each, places[name].yard) for name, each in chosen(robot, DOGS, run_dir, ports, YARD_PORT).items()
@@ -64,13 +63,13 @@ def planned(run_dir: Path, robot: str, places: dict[str, Place], code: str) -> P
 
 
 def _cabled(robot: Robot, yard: str) -> Robot:
-    """``robot``, found at the yard's end of its cable."""
+    """Return ``robot`` with the address of the simulator's end of its cable."""
     there = json.loads(json.dumps({"options": robot.options, "parts": robot.parts}).replace(LOOPBACK, yard))
     return replace(robot, options=there["options"], parts=tuple(there["parts"]))
 
 
 def inside(given: argparse.Namespace) -> None:
-    """Run and judge both experiments; called on the host of whoever looks at the page."""
+    """Run and judge both experiments; called on the host of the browser."""
     from twisted.internet.base import ReactorBase
     from twisted.internet.defer import Deferred
     from twisted.internet.task import react
@@ -81,8 +80,8 @@ def inside(given: argparse.Namespace) -> None:
     async def run(reactor: Any) -> None:
         try:
             with fresh(folder):
-                said = json.loads(sys.stdin.readline())
-                places = {name: Place(**{**each, "enter": tuple(each["enter"])}) for name, each in said.items()}
+                given_places = json.loads(sys.stdin.readline())
+                places = {name: Place(**{**each, "enter": tuple(each["enter"])}) for name, each in given_places.items()}
                 plan = planned(folder, given.robot, places, "over-there")
                 demonstration = Demonstration(reactor, plan, given.seed, say, given.lose == "link")
                 reactor.addSystemEventTrigger("before", "shutdown", demonstration.stop)
@@ -100,10 +99,10 @@ def inside(given: argparse.Namespace) -> None:
 
 
 def main(arguments: Sequence[str] = tuple(sys.argv[1:])) -> int:
-    """The command line; returns 0 where both experiments held, 2 where namespaces are refused."""
-    parser = options("python -m sim.namespaces.demo", "Both experiments, behind routers.")
-    parser.add_argument("--loss", type=float, default=0.0, help="percent lost on every line (%(default)s)")
-    parser.add_argument("--record", type=Path, default=None, help="write every frame of the wide area there")
+    """Run the command line; returns 0 if both experiments passed, 2 if namespaces are not available."""
+    parser = options("python -m sim.namespaces.demo", "Run both experiments behind NAT routers.")
+    parser.add_argument("--loss", type=float, default=0.0, help="percent of datagrams lost on every link (%(default)s)")
+    parser.add_argument("--record", type=Path, default=None, help="write every frame of the wide area to this file")
     for ignored in ("--web-host", "--web-port"):
         parser.add_argument(ignored, help=argparse.SUPPRESS)
     for ignored in ("--headless", "--tls"):
@@ -116,7 +115,7 @@ def main(arguments: Sequence[str] = tuple(sys.argv[1:])) -> int:
     if why:
         sys.stderr.write(f"!!!\n!!! NO DEMONSTRATION ACROSS NAMESPACES HERE: {why}\n!!!\n")
         return 2
-    # What is made is unmade on the way out, so a request to end has to lead there.
+    # The namespaces are removed when the block is left, so signals must leave it.
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: sys.exit(130))
     with Internet(SITES, given.seed) as net:

@@ -1,11 +1,11 @@
-"""Internet: sites behind routers, a public host and a wide area between them, all made of namespaces.
+"""Build an emulated internet from namespaces: sites behind routers, a public host, and a wide area network.
 
     with Internet([Site("a", Kind.PORT), Site("b", Kind.SYM, hosts=2)]) as net:
         process = net.start("a1", ["ping", net.address("pub")])
         net.weather("b", loss=30)
 
-Hosts are named after their site: ``a1``, ``b1``, ``b2``; ``pub`` is the public one, ``a-gw`` the router of ``a``.  No
-address leads out of the namespaces (198.18.0.0/15, RFC 2544), and leaving the block ends every process that was
+Hosts are named after their site: ``a1``, ``b1``, ``b2``; ``pub`` is the public host, ``a-gw`` the router of ``a``.  No
+address is routed out of the namespaces (198.18.0.0/15, RFC 2544), and leaving the block ends every process that was
 started in them.
 """
 
@@ -34,7 +34,7 @@ Way = Literal["in", "out", "both"]
 
 @dataclass(frozen=True)
 class Site:
-    """``hosts`` computers behind a router of one kind."""
+    """A site with ``hosts`` computers behind a router of one kind."""
 
     name: str
     kind: Kind
@@ -42,23 +42,23 @@ class Site:
 
 
 class Internet:
-    """The sites, between ``with`` and its end; ``seed`` is that of the losses.  Raises ``Refused``."""
+    """The sites within a ``with`` block; ``seed`` is the seed of losses.  Raises ``Refused``."""
 
     def __init__(self, sites: Sequence[Site], seed: int = 1) -> None:
         if len(sites) > MAX_SITES or len({site.name for site in sites}) < len(sites):
-            raise ValueError(f"at most {MAX_SITES} sites, each with a name of its own")
+            raise ValueError(f"at most {MAX_SITES} sites, with different names")
         self.sites = {site.name: site for site in sites}
         self._numbers = {site.name: number for number, site in enumerate(sites, start=1)}
         self._seed = seed
         self._rooms: dict[str, Room] = {}
         self._ports: dict[str, str] = {}
         self._addresses: dict[str, str] = {}
-        self._outside: dict[str, str] = {}
+        self._external: dict[str, str] = {}
         self._places: dict[str, str] = {}
         self._started: list[subprocess.Popen[Any]] = []
         self._switch: subprocess.Popen[str] | None = None
         self._forwards: dict[str, list[Forward]] = {}
-        self._moves = self._cables = 0
+        self._move_count = self._cables = 0
 
     def __enter__(self) -> Internet:
         try:
@@ -74,7 +74,7 @@ class Internet:
         self.close()
 
     def close(self) -> None:
-        """End all that was started, and every namespace; may be called twice."""
+        """End all started processes and every namespace; may be called repeatedly."""
         for process in self._started:
             if process.poll() is None:
                 process.kill()
@@ -84,7 +84,7 @@ class Internet:
                 if pipe is not None:
                     pipe.close()
         self._started.clear()
-        # The wide area last: the others' user namespace is its own.
+        # The wide area last, as it owns the user namespace of the others.
         for name in sorted(self._rooms, key=lambda name: name == ""):
             self._rooms.pop(name).close()
 
@@ -92,27 +92,27 @@ class Internet:
 
     @property
     def hosts(self) -> list[str]:
-        """All hosts, the public one among them; no routers."""
+        """All hosts, including the public one, without routers."""
         return list(self._addresses)
 
     def address(self, host: str) -> str:
-        """The address of a host, as itself sees it."""
+        """Return the address of a host in its own network."""
         return self._addresses[host]
 
     def outside(self, site: str) -> str:
-        """The address of a site's router, as the others see it."""
-        return self._outside[site]
+        """Return the external address of a site's router."""
+        return self._external[site]
 
     def room(self, name: str) -> Room:
-        """The namespace of a host, of a router (``a-gw``), or of the wide area (the empty name)."""
+        """Return the namespace of a host, of a router (``a-gw``), or of the wide area (the empty name)."""
         return self._rooms[name]
 
     def command(self, host: str, arguments: Sequence[str]) -> list[str]:
-        """``arguments`` as a command that runs on ``host``."""
+        """Return the command that runs ``arguments`` on ``host``."""
         return self._rooms[host].command(arguments)
 
     def start(self, host: str, arguments: Sequence[str], **options: Any) -> subprocess.Popen[Any]:
-        """Start a program on ``host``, with options of ``Popen``; it ends with this internet at the latest."""
+        """Start a program on ``host``, with options of ``Popen``; it is killed by ``close`` at the latest."""
         options = {"stdin": subprocess.DEVNULL, "cwd": ROOT, "env": environment(), **options}
         process = subprocess.Popen(self.command(host, arguments), **options)
         self._started.append(process)
@@ -130,89 +130,89 @@ class Internet:
             timeout=timeout,
         )
 
-    # -- lines ------------------------------------------------------------------------------------------------------
+    # -- links ------------------------------------------------------------------------------------------------------
 
     def weather(self, site: str, way: Way = "both", to: str = "", **figures: float) -> None:
-        """Make the line of a site (or of ``pub``) as bad as ``figures`` say (see ``Weather``), from now on.
+        """Impair the link of a site (or of ``pub``) according to ``figures`` (see ``Weather``).
 
-        ``way`` is seen from the site.  With ``to`` it is only the way from this site to that one.
+        ``way`` is relative to the site.  With ``to`` only the direction from this site to that one is impaired.
         """
-        said = asdict(Weather(**figures))
+        impairments = asdict(Weather(**figures))
         for port in self._ports_of(site):
             if to:
                 for other in self._ports_of(to):
-                    self._order(do="weather", port=port, to=other, weather=said)
+                    self._order(do="weather", port=port, to=other, weather=impairments)
                 continue
             for is_up in (True, False):
                 if way == "both" or is_up == (way == "out"):
-                    self._order(do="weather", port=port, to="", is_up=is_up, weather=said)
+                    self._order(do="weather", port=port, to="", is_up=is_up, weather=impairments)
 
     def cut(self, site: str, way: Way = "both", to: str = "") -> None:
-        """Let nothing pass into a site, out of it, or either; with ``to`` only on the way from it to that one."""
+        """Block traffic into a site, out of it, or both; with ``to`` only from this site to that one."""
         self.weather(site, way, to, loss=100.0)
 
     def heal(self, site: str) -> None:
-        """Make the line of a site good again."""
+        """Remove all impairments of a site's link."""
         self.weather(site)
 
     def counted(self) -> dict[str, Any]:
-        """Frames passed and lost and bytes carried so far, by the name of the line and by ``up`` and ``down``."""
+        """Return frames passed and lost and bytes carried so far, by link name and by ``up`` and ``down``."""
         counts: dict[str, Any] = self._order(do="count")
         return counts
 
     def record(self, file: Path | None) -> None:
-        """Write every frame that enters the wide area to ``file`` (as ``tcpdump -w`` does) until told None."""
+        """Write every frame that enters the wide area to ``file`` (in the format of ``tcpdump -w``); None stops it."""
         self._order(do="record", file="" if file is None else str(file.absolute()))
 
     # -- routers ----------------------------------------------------------------------------------------------------
 
     def forget(self, site: str) -> None:
-        """Let a router forget every mapping, as one does that starts anew."""
+        """Drop all mappings of a router, as its restart does."""
         self._router(site).run(
             f"conntrack -F 2>/dev/null || true\nnft -f - <<'END'\nflush ruleset\n{self._rules(site)}END\n"
         )
 
     def renumber(self, site: str) -> str:
-        """Give a router another outside address, as a provider does at night; returns it."""
+        """Change the external address of a router, as providers do; returns the new one."""
         number = self._numbers[site]
-        self._moves += 1
-        new, old = f"198.18.{1 + self._moves % 9}.{number}", self._outside[site]
+        self._move_count += 1
+        new, old = f"198.18.{1 + self._move_count % 9}.{number}", self._external[site]
         if new == old:
             return self.renumber(site)
         self._router(site).run(
             f"ip address add {new}/16 dev {WAN}\nip address del {old}/16 dev {WAN}\n"
             f"ip address show dev {WAN} | grep -q {new}/16 || ip address add {new}/16 dev {WAN}\n"
         )
-        self._outside[site] = new
+        self._external[site] = new
         self.forget(site)
         return new
 
     def mapping_life(self, site: str, seconds: int) -> None:
-        """Let a router's mappings end after so long without a datagram."""
+        """Set the timeout of a router's idle mappings."""
         folder = "/proc/sys/net/netfilter/nf_conntrack_udp_timeout"
         self._router(site).run(f"echo {seconds} >{folder}\necho {seconds} >{folder}_stream\n")
 
     def move(self, host: str, site: str) -> str:
-        """Carry a host to another site, as a phone leaves Wi-Fi; returns its new address there."""
+        """Move a host to another site, as a phone leaves Wi-Fi; returns its new address there."""
         if Kind.NONE in (self.sites[site].kind, self.sites[self._places[host]].kind):
-            raise ValueError(f"{host} moves between sites that have a router")
+            raise ValueError(f"{host} can only move between sites with a router")
         self._rooms[host].run(f"ip link del {WAN}\n")
-        self._moves += 1
-        self._plug(host, site, 100 + self._moves)
+        self._move_count += 1
+        self._attach_host(host, site, 100 + self._move_count)
         return self._addresses[host]
 
     def forward(self, site: str, host: str, *ports: tuple[Literal["udp", "tcp"], int]) -> None:
-        """Let a host be found at these ports of its router."""
+        """Forward ports of a site's router to a host."""
         opened = self._forwards.setdefault(site, [])
         opened += [Forward(protocol, port, self._addresses[host]) for protocol, port in ports]
         self.forget(site)
 
     def island(self, name: str) -> None:
-        """Make a host that is joined to nothing."""
-        self._make(name)
+        """Create a host without a network connection."""
+        self._make_room(name)
 
     def cable(self, host: str, other: str) -> tuple[str, str]:
-        """Join two hosts by a line of their own, as a robot to its computer; returns their addresses on it."""
+        """Connect two hosts by a separate link, as a robot and its computer; returns their addresses on it."""
         self._cables += 1
         name, first = f"cable{self._cables}", 4 * self._cables
         ends = [(self._rooms[end], f"198.19.255.{first + place}") for place, end in enumerate((host, other), start=1)]
@@ -227,20 +227,20 @@ class Internet:
             raise ValueError(f"the site {site} has no router")
         return self._rooms[f"{site}-gw"]
 
-    # -- how it is made ---------------------------------------------------------------------------------------------
+    # -- construction -----------------------------------------------------------------------------------------------
 
     def _build(self) -> None:
         self._rooms[""] = Room()
-        self._quiet(self._rooms[""])
-        self._make(PUB)
+        self._disable_ipv6(self._rooms[""])
+        self._make_room(PUB)
         self._uplink(PUB, PUBS)
-        self._addresses[PUB] = self._outside[PUB] = PUBS[0]
+        self._addresses[PUB] = self._external[PUB] = PUBS[0]
         for name, site in self.sites.items():
             if site.kind is not Kind.NONE:
                 self._make_router(name)
             for number in range(1, site.hosts + 1):
-                self._make(f"{name}{number}")
-                self._plug(f"{name}{number}", name, number)
+                self._make_room(f"{name}{number}")
+                self._attach_host(f"{name}{number}", name, number)
         ports = [f"{name}={interface}" for name, interface in self._ports.items()]
         pipe = subprocess.PIPE
         arguments = [sys.executable, "-m", "sim.namespaces.switch", str(self._seed), *ports]
@@ -249,31 +249,31 @@ class Internet:
         if not self._switch.stdout.readline():
             raise RuntimeError("the switch of the wide area did not start")
 
-    def _make(self, name: str) -> Room:
+    def _make_room(self, name: str) -> Room:
         room = self._rooms[name] = Room(self._rooms[""])
-        self._quiet(room)
+        self._disable_ipv6(room)
         return room
 
-    def _quiet(self, room: Room) -> None:
-        # Without IPv6 not a datagram is sent that nobody wanted.
+    def _disable_ipv6(self, room: Room) -> None:
+        # IPv6 would send unsolicited datagrams.
         room.run("for f in /proc/sys/net/ipv6/conf/*/disable_ipv6; do echo 1 >$f; done\nip link set lo up\n")
 
     def _uplink(self, name: str, addresses: Sequence[str]) -> None:
-        """Join a router or host to the wide area."""
+        """Connect a router or host to the wide area."""
         interface = f"way{len(self._ports)}"
         self._ports[name] = interface
         wide, room = self._rooms[""], self._rooms[name]
         wide.run(f"ip link add {interface} type veth peer name {WAN} netns {room.pid}\nip link set {interface} up\n")
-        # Frames are carried by hand: they must be whole, checksum and all, and not longer than a frame is.
+        # The switch copies raw frames: they must have their checksums, and must not exceed the frame size.
         given = "".join(f"ip address add {address}/16 dev {WAN}\n" for address in addresses)
         room.run(
             f"ethtool -K {WAN} tx off tso off gso off gro off >/dev/null 2>&1 || true\nip link set {WAN} up\n{given}"
         )
 
     def _make_router(self, site: str) -> None:
-        room, number = self._make(f"{site}-gw"), self._numbers[site]
-        self._outside[site] = f"198.18.1.{number}"
-        self._uplink(f"{site}-gw", (self._outside[site],))
+        room, number = self._make_room(f"{site}-gw"), self._numbers[site]
+        self._external[site] = f"198.18.1.{number}"
+        self._uplink(f"{site}-gw", (self._external[site],))
         room.run(
             f"echo 1 >/proc/sys/net/ipv4/ip_forward\n"
             f"ip link add {LAN} type bridge stp_state 0 forward_delay 0\nip link set {LAN} up\n"
@@ -283,7 +283,7 @@ class Internet:
     def _rules(self, site: str) -> str:
         return self.sites[site].kind.rules(self._forwards.get(site, ()))
 
-    def _plug(self, host: str, site: str, place: int) -> None:
+    def _attach_host(self, host: str, site: str, place: int) -> None:
         number, room = self._numbers[site], self._rooms[host]
         self._places[host] = site
         if self.sites[site].kind is Kind.NONE:

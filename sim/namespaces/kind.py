@@ -1,7 +1,7 @@
-"""Kind: what a site's router does with UDP, as rules for ``nft``.
+"""Define kinds of NAT routers as rules for ``nft``.
 
-The words are those of RFC 4787: a *mapping* is the outside port that an inside socket gets, a *filter* says whose
-datagrams come in through it.
+Terms of RFC 4787: a *mapping* is the external port of an internal socket; *filtering* decides which external datagrams
+may enter through it.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from typing import Literal
 
 WAN, LAN = "eth0", "lan"
 REMEMBERED_S = 300
-"""Seconds for which ``full`` and ``addr`` remember a port that nobody uses."""
+"""Seconds for which ``full`` and ``addr`` keep the mapping of an idle port."""
 
 
 @dataclass(frozen=True)
 class Forward:
-    """A port of a router at which a host behind it is found."""
+    """A port of a router that is forwarded to a host behind it."""
 
     protocol: Literal["udp", "tcp"]
     port: int
@@ -26,38 +26,38 @@ class Forward:
 
 
 class Kind(Enum):
-    """Kinds of routers, from the most open to the most closed."""
+    """Kinds of routers, from the most open to the most restrictive."""
 
     NONE = "none"
-    """No router: the hosts have outside addresses."""
+    """No router: the hosts have external addresses."""
     FULL = "full"
     """One mapping for all peers, no filter ("full cone")."""
     ADDR = "addr"
-    """One mapping; in comes who sends from an address that was written to ("restricted cone")."""
+    """One mapping; accepts datagrams from addresses to which the host has sent ("restricted cone")."""
     PORT = "port"
-    """One mapping; in comes who sends from an address and port that was written to ("port restricted")."""
+    """One mapping; accepts datagrams from addresses and ports to which the host has sent ("port restricted")."""
     LEAKY = "leaky"
-    """As ``port``, but what nobody asked for reaches the router itself and stays in its memory: a peer that knocks
-    before the inside socket does takes the mapping away.  A Linux box that masquerades and has no firewall."""
+    """As ``port``, but unsolicited datagrams reach the router and create connection tracking entries: a peer that sends
+    first prevents the mapping.  This is a Linux router with masquerading and no firewall."""
     SYM = "sym"
-    """Another mapping, at a random port, for each peer ("symmetric")."""
+    """A different, random mapping for each peer ("symmetric")."""
     NOUDP = "noudp"
-    """Lets no UDP through; TCP as ``port``."""
+    """Blocks UDP; TCP as ``port``."""
 
     @property
     def meaning(self) -> str:
-        """What it is, for people."""
+        """A description for people."""
         return _MEANINGS[self]
 
     def rules(self, forwards: Sequence[Forward] = ()) -> str:
-        """The whole rule set of such a router, which hands what ``forwards`` name to hosts behind it."""
+        """Return the rule set of such a router, with the port forwardings ``forwards``."""
         outward = f'oifname "{WAN}" masquerade' + (" fully-random" if self is Kind.SYM else "")
         memory = inward = through = ""
         shield = "" if self is Kind.LEAKY else f'iifname "{WAN}" ct state new drop'
         if self is Kind.NOUDP:
             through = "meta l4proto udp drop"
         elif self in (Kind.FULL, Kind.ADDR):
-            # The kernel's own translation filters by address and port; so the port's owner is noted down beside it.
+            # The kernel's NAT filters by address and port, so a map keeps the owner of each port.
             timed = f"flags dynamic,timeout; timeout {REMEMBERED_S}s; size 65535;"
             memory = f"map owner {{ type inet_service : ipv4_addr; {timed} }}\n"
             memory += f"set written {{ type ipv4_addr . inet_service; {timed} }}"

@@ -1,4 +1,4 @@
-"""Line: what one direction of one link does to a frame; pure: time and dice are handed in."""
+"""Decide what one direction of a link does to a frame.  Pure: time and random numbers are arguments."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from random import Random
 
 @dataclass(frozen=True)
 class Weather:
-    """How bad a line is.
+    """The impairments of a link.
 
-    ``loss``, ``dup``, ``reorder`` and ``corrupt`` are percents; ``burst`` is how many frames are lost in a row on the
-    average (1: each by itself), ``delay`` and ``jitter`` (a standard deviation) are milliseconds, ``rate`` is kbit/s
-    (0: as fast as can be) with a queue of ``queue`` milliseconds, behind which frames are lost.
+    ``loss``, ``dup``, ``reorder`` and ``corrupt`` are percentages; ``burst`` is the mean number of consecutive losses
+    (1: independent losses); ``delay`` and ``jitter`` (a standard deviation) are milliseconds; ``rate`` is kbit/s
+    (0: unlimited), with a queue of ``queue`` milliseconds, beyond which frames are lost.
     """
 
     loss: float = 0.0
@@ -29,21 +29,21 @@ class Weather:
     def __post_init__(self) -> None:
         for name in ("loss", "dup", "reorder", "corrupt"):
             if not 0.0 <= getattr(self, name) <= 100.0:
-                raise ValueError(f"{name} is a percentage from 0 to 100, not {getattr(self, name)!r}")
+                raise ValueError(f"{name} must be a percentage from 0 to 100, not {getattr(self, name)!r}")
         for name in ("delay", "jitter", "rate", "queue"):
             if not 0.0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"{name} is a number from 0 on, not {getattr(self, name)!r}")
+                raise ValueError(f"{name} must be a number from 0 on, not {getattr(self, name)!r}")
         if not 1.0 <= self.burst < math.inf:
-            raise ValueError(f"burst is a number of frames from 1 on, not {self.burst!r}")
+            raise ValueError(f"burst must be a number of frames from 1 on, not {self.burst!r}")
 
     @property
     def is_fair(self) -> bool:
-        """Whether every frame passes at once and whole."""
+        """Whether the link has no impairments."""
         return not (self.loss or self.dup or self.reorder or self.corrupt or self.delay or self.jitter or self.rate)
 
 
 class Line:
-    """One direction; ``passed`` and ``lost`` count frames, ``carried`` the bytes of those that passed."""
+    """One direction of a link; ``passed`` and ``lost`` count frames, ``carried`` counts the bytes of passed frames."""
 
     def __init__(self, rng: Random) -> None:
         self.passed = self.lost = self.carried = 0
@@ -54,7 +54,7 @@ class Line:
 
     @property
     def weather(self) -> Weather:
-        """How bad it is."""
+        """The present impairments."""
         return self._weather
 
     @weather.setter
@@ -63,11 +63,11 @@ class Line:
 
     @property
     def counts(self) -> dict[str, int]:
-        """What it counted."""
+        """The counters."""
         return {"passed": self.passed, "lost": self.lost, "bytes": self.carried}
 
     def fates(self, size: int, now: float) -> list[float]:
-        """The moments at which a frame of ``size`` bytes comes out: none where it is lost, two where it is doubled."""
+        """Return the delivery times of a frame of ``size`` bytes: none if it is lost, two if it is duplicated."""
         weather = self._weather
         if weather.is_fair:
             self.passed += 1
@@ -84,7 +84,7 @@ class Line:
                 return []
             self._free_at = begins + size * 8 / (weather.rate * 1000)
             moment = self._free_at
-        # A frame that is reordered overtakes those that wait.
+        # A reordered frame overtakes delayed ones.
         if not self._happens(weather.reorder):
             spread = self._rng.gauss(0.0, weather.jitter) if weather.jitter else 0.0
             moment += max(0.0, weather.delay + spread) / 1000
@@ -93,14 +93,14 @@ class Line:
         return [moment] * (2 if self._happens(weather.dup) else 1)
 
     def spoiled(self, frame: bytes, header: int) -> bytes:
-        """``frame``, with one bit behind its first ``header`` bytes turned where that happens."""
+        """Return ``frame``; if it is corrupted, with one bit after its first ``header`` bytes flipped."""
         if len(frame) <= header or not self._happens(self._weather.corrupt):
             return frame
         place = self._rng.randrange(header, len(frame))
         return frame[:place] + bytes([frame[place] ^ 1 << self._rng.randrange(8)]) + frame[place + 1 :]
 
     def _is_lost(self) -> bool:
-        """Losses in bursts (Gilbert, Elliott): a bad time loses all, and begins so often that the rate is met."""
+        """Draw a loss (Gilbert-Elliott): the bad state loses all, and begins often enough for the loss rate."""
         loss, burst = self._weather.loss / 100, self._weather.burst
         if burst <= 1.0 or not 0.0 < loss < 1.0:
             return self._happens(100 * loss)

@@ -1,8 +1,8 @@
-"""Room: a network namespace that one process holds open.
+"""Hold a network namespace open by a process.
 
-Nothing gets a name that others on the machine could see: a room is its holder, ends with it, and takes its interfaces
-along.  The holder ends at the end of its input, so however we end, a kill included, nothing is left; and two runs
-cannot meet.  Without privilege the first room gets a user namespace of its own, in which all others lie.
+A namespace has no name that other processes could see: it ends with its holder, and so do its interfaces.
+The holder ends at the end of its input, so nothing remains however this process ends, and two runs cannot conflict.
+Without privileges the first room creates a user namespace that contains all others.
 """
 
 from __future__ import annotations
@@ -21,59 +21,61 @@ TOOLS = {
     "conntrack": "conntrack",
     "ethtool": "ethtool",
 }
-"""What is called, and the Debian package that has it."""
+"""The required tools, with their Debian packages."""
 PATH = os.pathsep.join((os.environ.get("PATH", ""), "/usr/sbin", "/sbin"))
-"""Whoever is not root often has no administrator's tools on the path; in a user namespace they serve all the same."""
+"""Other users than root often lack the sbin folders in PATH; the tools work in a user namespace."""
 OWN_USER = ("--user", "--map-root-user")
 SCRIPT_S = 20.0
 
 
 class Refused(Exception):
-    """This machine lets us make no network namespaces; says why, and what to do."""
+    """This machine does not allow network namespaces; the message has the reason and the remedy."""
 
 
 class Room:
-    """One namespace; ``inside`` is the room in whose user namespace it lies (None: the first).  Raises ``Refused``."""
+    """One namespace; ``inside`` is a room of the same user namespace (None: the first room).  Raises ``Refused``."""
 
     def __init__(self, inside: Room | None = None) -> None:
         self._is_own_user: bool = inside is not None and inside._is_own_user
         before = () if inside is None else inside.entry
-        ways: list[Sequence[str]] = [()] if inside is not None else [(), OWN_USER] if not os.geteuid() else [OWN_USER]
-        said = ""
-        for way in ways:
-            held = _held([*before, "unshare", *way, "--net", "sh", "-c", "echo; exec cat"])
-            if isinstance(held, str):
-                said = held
+        prefixes: list[Sequence[str]] = (
+            [()] if inside is not None else [(), OWN_USER] if not os.geteuid() else [OWN_USER]
+        )
+        error_text = ""
+        for prefix in prefixes:
+            started = _start_holder([*before, "unshare", *prefix, "--net", "sh", "-c", "echo; exec cat"])
+            if isinstance(started, str):
+                error_text = started
                 continue
-            self._holder = held
-            self._is_own_user |= way is OWN_USER
+            self._holder = started
+            self._is_own_user |= prefix is OWN_USER
             return
-        raise Refused(f"no network namespace can be made here: {said}; {_remedy()}")
+        raise Refused(f"cannot create a network namespace: {error_text}; {_remedy()}")
 
     @property
     def pid(self) -> int:
-        """The process that holds it."""
+        """The id of the process that holds the namespace."""
         return self._holder.pid
 
     @property
     def entry(self) -> tuple[str, ...]:
-        """What stands before a command that is to run in the room."""
+        """The command prefix that runs a program in the room."""
         user = ("--user", "--preserve-credentials") if self._is_own_user else ()
         return ("nsenter", f"--target={self.pid}", *user, "--net", "--")
 
     @property
     def inner_entry(self) -> tuple[str, ...]:
-        """The same for a process that is in another room of the same internet already."""
+        """The prefix for a process that is already in another room of the same internet."""
         return ("nsenter", f"--target={self.pid}", "--net", "--")
 
     def command(self, arguments: Sequence[str]) -> list[str]:
-        """``arguments`` as a command that runs in the room; it is to be started by this process, and ends with it."""
-        # We may be gone before the kernel was told what to do then.
+        """Return the command that runs ``arguments`` in the room; started by this process, it ends with it."""
+        # The parent may end before PDEATHSIG is set.
         checked = ("sh", "-c", '[ "$PPID" = "$0" ] && exec "$@"', str(os.getpid()))
         return [*self.entry, "setpriv", "--pdeathsig=KILL", "--", *checked, *arguments]
 
     def run(self, script: str) -> str:
-        """Run a shell script in the room, to its first fault; returns what it said; raises ``RuntimeError``."""
+        """Run a shell script in the room; returns its output; raises ``RuntimeError`` at the first failing command."""
         done = subprocess.run(
             [*self.entry, "sh", "-e"], input=script, capture_output=True, text=True, timeout=SCRIPT_S, env=environment()
         )
@@ -82,7 +84,7 @@ class Room:
         return done.stdout
 
     def close(self) -> None:
-        """End the room; may be called twice."""
+        """Remove the namespace; may be called repeatedly."""
         self._holder.kill()
         self._holder.wait()
         for pipe in (self._holder.stdin, self._holder.stdout, self._holder.stderr):
@@ -91,31 +93,31 @@ class Room:
 
 
 def environment() -> dict[str, str]:
-    """Ours, with the places of administrators' tools on the path."""
+    """Return the environment of this process with the sbin folders in PATH."""
     return {**os.environ, "PATH": PATH}
 
 
 def refusal() -> str:
-    """Why no internet can be made here; empty where it can."""
+    """Return why namespaces are not available on this machine; empty if they are."""
     missing = sorted({package for tool, package in TOOLS.items() if shutil.which(tool, path=PATH) is None})
     if missing:
-        return f"tools are missing; install them: apt install {' '.join(missing)}"
+        return f"missing tools; install them: apt install {' '.join(missing)}"
     try:
         first = Room()
     except Refused as error:
         return str(error)
     try:
-        # What a container may forbid though it allows the namespace itself.
+        # A container may allow namespaces and still forbid these.
         first.run("ip link add probe type veth\nip link del probe\nnft list ruleset >/dev/null\n")
     except RuntimeError as error:
-        return f"namespaces are allowed, what is needed in them is not: {error}"
+        return f"namespaces are allowed, but not the required operations in them: {error}"
     finally:
         first.close()
     return ""
 
 
-def _held(command: list[str]) -> subprocess.Popen[str] | str:
-    """The holder, once it is in its namespace; else what was said instead."""
+def _start_holder(command: list[str]) -> subprocess.Popen[str] | str:
+    """Return the holder once it is in its namespace, else its error output."""
     pipe = subprocess.PIPE
     try:
         holder = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True, env=environment())
@@ -124,15 +126,15 @@ def _held(command: list[str]) -> subprocess.Popen[str] | str:
     assert holder.stdout is not None
     if holder.stdout.readline():
         return holder
-    return holder.communicate()[1].strip() or "it ended without a word"
+    return holder.communicate()[1].strip() or "it ended without an error message"
 
 
 def _remedy() -> str:
     if not os.geteuid():
-        return "in a container they need the capability SYS_ADMIN (docker run --cap-add SYS_ADMIN ..)"
+        return "in a container the capability SYS_ADMIN is required (docker run --cap-add SYS_ADMIN ..)"
     knobs = (
         "user.max_user_namespaces",
         "kernel.unprivileged_userns_clone",
         "kernel.apparmor_restrict_unprivileged_userns",
     )
-    return f"run as root, or let users make namespaces (sysctl {', '.join(knobs)})"
+    return f"run as root, or allow users to create namespaces (sysctl {', '.join(knobs)})"

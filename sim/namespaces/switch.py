@@ -1,8 +1,8 @@
-"""Switch: the wide area as one process: it carries every frame between the sites by hand, and makes the lines bad.
+"""Switch the frames of the wide area between the sites in one process, with link impairments.
 
-``python -m sim.namespaces.switch SEED NAME=INTERFACE ..`` joins those interfaces of its namespace by raw sockets, so it
-needs no traffic control in the kernel.  Orders come as JSON lines, each is repeated when it is in force; it ends with
-its input.  A frame passes three lines: out of its site, along the way between the two sites, and into the other.
+``python -m sim.namespaces.switch SEED NAME=INTERFACE ..`` connects these interfaces of its namespace by raw sockets, so
+the kernel needs no traffic control.  Orders arrive as JSON lines, and each is echoed when it is in force; the process
+ends with its input.  A frame passes three lines: out of its site, between the two sites, and into the other site.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ from sim.namespaces.line import Line, Weather
 EVERYTHING = 3
 PACKET, IGNORE_OUTGOING = 263, 23
 ADDRESSES = 14
-"""Bytes of an Ethernet header: two addresses and a type."""
+"""Length of an Ethernet header in bytes: two addresses and a type."""
 IP_HEADERS = ADDRESSES + 20
 ARP = b"\x08\x06"
 BUFFER = 4 << 20
 AT_ONCE = 64
 SNAP = 65535
 FILE_HEADER = struct.pack("=IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, SNAP, 1)
-"""The old format of tcpdump: magic, version 2.4, no zone, whole frames, Ethernet."""
+"""The classic pcap format: magic, version 2.4, no time zone, whole frames, Ethernet."""
 
 
 class Port:
-    """One interface: where frames of one site come in and go out."""
+    """One interface of a site, with a line for each direction."""
 
     def __init__(self, name: str, interface: str, rng: Random) -> None:
         self.name = name
@@ -48,7 +48,7 @@ class Port:
         self.up, self.down = Line(rng), Line(rng)
 
     def frames(self) -> Iterator[bytes]:
-        """What has come in, a bounded number at a time."""
+        """Yield received frames, a limited number per call."""
         for _ in range(AT_ONCE):
             try:
                 yield self.socket.recv(SNAP)
@@ -57,20 +57,20 @@ class Port:
 
 
 class Switch:
-    """All ports; frames go to where their receiver was last heard, or everywhere."""
+    """All ports; a frame goes to the port of its receiver if that is known, else to all."""
 
     def __init__(self, ports: dict[str, str], rng: Random) -> None:
         self._rng = rng
         self._ports = {name: Port(name, interface, rng) for name, interface in ports.items()}
         self._by_file = {port.socket.fileno(): port for port in self._ports.values()}
-        self._ways: defaultdict[tuple[str, str], Line] = defaultdict(lambda: Line(rng))
-        self._heard_at: dict[bytes, Port] = {}
+        self._pair_lines: defaultdict[tuple[str, str], Line] = defaultdict(lambda: Line(rng))
+        self._port_of: dict[bytes, Port] = {}
         self._waiting: list[tuple[float, int, Port, bytes]] = []
         self._number = 0
         self._record: BinaryIO | None = None
 
     def run(self, orders: int) -> None:
-        """Carry frames until the file ``orders`` ends."""
+        """Switch frames until the file ``orders`` ends."""
         poll = select.epoll()
         for file in (orders, *self._by_file):
             poll.register(file, select.EPOLLIN)
@@ -88,7 +88,7 @@ class Switch:
                     return
                 *lines, rest = (rest + read).split(b"\n")
                 for line in lines:
-                    sys.stdout.write(json.dumps(self._obey(json.loads(line))) + "\n")
+                    sys.stdout.write(json.dumps(self._execute(json.loads(line))) + "\n")
                     sys.stdout.flush()
             now = time.monotonic()
             while self._waiting and self._waiting[0][0] <= now:
@@ -97,20 +97,20 @@ class Switch:
 
     def _enter(self, source: Port, frame: bytes) -> None:
         receiver, sender = frame[:6], frame[6:12]
-        self._heard_at[sender] = source
-        target = None if receiver[0] & 1 else self._heard_at.get(receiver)
+        self._port_of[sender] = source
+        target = None if receiver[0] & 1 else self._port_of.get(receiver)
         targets = [target] if target is not None else [port for port in self._ports.values() if port is not source]
         if self._record is not None:
             self._record.write(recorded(frame))
         now = time.monotonic()
         for port in targets:
             if port is not source:
-                way = self._ways.get((source.name, port.name))
-                self._carry([source.up, *([way] if way is not None else []), port.down], port, frame, now)
+                pair_line = self._pair_lines.get((source.name, port.name))
+                self._carry([source.up, *([pair_line] if pair_line is not None else []), port.down], port, frame, now)
 
     def _carry(self, lines: list[Line], port: Port, frame: bytes, now: float) -> None:
         if frame[12:14] == ARP:
-            # A far line has no ARP on it, and who asks for a lost one again waits a whole second.
+            # ARP is exempt unless the line is cut: real long-distance lines have none, and a retry takes a second.
             if not any(line.weather.loss == 100.0 for line in lines):
                 self._leave(port, frame)
             return
@@ -131,7 +131,7 @@ class Switch:
         except OSError:
             port.down.lost += 1
 
-    def _obey(self, order: dict[str, Any]) -> object:
+    def _execute(self, order: dict[str, Any]) -> object:
         match order["do"]:
             case "weather":
                 self._line(order).weather = Weather(**order["weather"])
@@ -143,7 +143,7 @@ class Switch:
 
     def _line(self, order: dict[str, Any]) -> Line:
         if order["to"]:
-            return self._ways[order["port"], order["to"]]
+            return self._pair_lines[order["port"], order["to"]]
         port = self._ports[order["port"]]
         return port.up if order["is_up"] else port.down
 
@@ -152,18 +152,18 @@ class Switch:
             self._record.close()
         self._record = None
         if path:
-            self._record = open(path, "wb")  # noqa: SIM115 - it stays open until the order to close it
+            self._record = open(path, "wb")  # noqa: SIM115 - open until the order to close it
             self._record.write(FILE_HEADER)
 
 
 def recorded(frame: bytes) -> bytes:
-    """A frame that passes now, as it stands in a file that begins with ``FILE_HEADER``."""
+    """Return a frame as a pcap record with the present time."""
     now = time.time()
     return struct.pack("=IIII", int(now), int(now % 1 * 1_000_000), len(frame), len(frame)) + frame
 
 
 def main(seed: str, *ports: str) -> None:
-    """Be the switch until the input ends."""
+    """Run the switch until standard input ends."""
     pairs = (port.partition("=")[::2] for port in ports)
     switch = Switch(dict(pairs), Random(seed))
     sys.stdout.write('"ready"\n')

@@ -1,1 +1,1 @@
-"""Whole teams in one process, on one turned clock: the nodes that ship, in a world that follows from a seed."""
+"""Simulate whole teams in one process in virtual time: production nodes in an environment that follows from a seed."""

@@ -1,10 +1,10 @@
-"""Checker: what must hold of a history, whoever made it.
+"""Check the invariants of a history of events.
 
-What stands in no history it cannot judge: workloads that compare what they see with the team as it is, such as lookups,
-values, takeovers and tasks, do so themselves (``verdict``), under the same letters where the invariant is the same.
+Some workloads compare their observations with the true state of the team (lookups, values, takeovers, tasks), which no
+history contains.  They check it themselves (``Workload.verdict``), under the same letters if the invariant is the same.
 
-The invariants have letters and numbers, under which the documents promise them: E of execution, D of durability, T of
-tuples, R of the wire.  Each is a function of the events; what was asked and never answered counts as "maybe".
+Invariants have the letters and numbers of the documentation: E for execution, D for durability, T for tuples, R for the
+wire.  Each is a function of the events; a request without an answer counts as "maybe".
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ Kinds = tuple[type[Event], ...]
 
 
 def _named(part: ModuleType) -> tuple[tuple[str, Invariant], ...]:
-    """The invariants of a module, which are its functions of one letter and a number."""
+    """Return the invariants of a module: its functions named by a letter and a digit."""
     return tuple((name.upper(), found) for name, found in vars(part).items() if re.fullmatch(r"[a-z]\d", name))
 
 
 PARTS: tuple[tuple[Kinds, tuple[tuple[str, Invariant], ...]], ...] = tuple(
     (part.KINDS, _named(part)) for part in (execution, agreement, durability, taking, wire)
 )
-"""Of each part of a team the events that it goes by, and the invariants; E5 binds devices, and agents as well."""
+"""For each part of a team the relevant events and its invariants; E5 applies to devices and to agents."""
 
 
 def check(events: Iterable[Event]) -> list[str]:
-    """Every violation, a line each, with its invariant before it; no line twice."""
+    """Return every violation as a line that starts with its invariant, without duplicates."""
     listed = list(events)
     found: dict[str, None] = {}
     for kinds, invariants in PARTS:

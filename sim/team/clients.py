@@ -1,6 +1,6 @@
-"""Clients: those who write, remove and read slots at the nodes of a team, and write down what they were told.
+"""Clients that write, remove and read slots at the nodes of a team, and record requests and answers.
 
-Who runs them judges nothing: the checker does, by what stands in the history (``sim.team.invariant.durability``).
+Clients judge nothing: the checker does, by the history (``sim.team.invariant.durability``).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from sim.team.history import History
 from sim.team.invariant.durability import Slot
 
 WRITE, REMOVE, READ = "write", "remove", "read"
-"""As the checker knows what is asked."""
+"""Operations, by the names that the checker uses."""
 
 
 T = TypeVar("T")
@@ -30,7 +30,7 @@ T = TypeVar("T")
 def follow(
     history: History, number: int, work: Deferred[T], shown: Callable[[T], object] = lambda result: None
 ) -> None:
-    """Write down what comes of ``work``, asked under ``number``: what is ``shown`` of its result, or why it failed."""
+    """Record the outcome of ``work``, the request ``number``: ``shown(result)``, or the reason of its failure."""
 
     def failed(failure: Failure) -> None:
         failure.trap(EntangledError)
@@ -40,7 +40,7 @@ def follow(
 
 
 class Clients:
-    """Those of one run; ``asked`` and ``answered`` count how often they did what."""
+    """The clients of one run; ``asked`` and ``answered`` count operations."""
 
     def __init__(self, history: History) -> None:
         self.asked: Counter[str] = Counter()
@@ -49,13 +49,13 @@ class Clients:
         self._written: Counter[Slot] = Counter()
 
     def slots(self, owner: bytes) -> list[Slot]:
-        """Those that the node with this public key has written or removed, the first one first."""
+        """Return the slots that the node with this public key has written or removed, in order of first use."""
         return [slot for slot in self._written if slot.owner == owner]
 
     def write(
         self, place: int, node: EntangledNode, key: bytes, name: str, concern: Concern = "majority", act: str = WRITE
     ) -> None:
-        """Write the next number in a slot of the ``node`` at ``place``, or by ``REMOVE`` nothing."""
+        """Write the next number into a slot of the ``node`` at ``place``, or remove it if ``act`` is ``REMOVE``."""
         slot = Slot(key, node.identity.public, name)
         self._written[slot] += 1
         count = self._written[slot]
@@ -66,8 +66,8 @@ class Clients:
     def read(
         self, place: int, life: int, node: EntangledNode, key: bytes, concern: ReadConcern = "majority"
     ) -> Deferred[list[Record]]:
-        """Read at the ``node`` at ``place`` in its ``life``; fires with what was found: nothing, where that fails."""
-        # Another life of a node is another client: what it has read itself it may have forgotten.
+        """Read at the ``node`` at ``place`` in its ``life``; fires with the records, or with [] on failure."""
+        # Each life counts as another client, as a node may forget its own reads.
         number = self._asked((place, life), READ, key, concern)
         return node.get(key, concern).addCallbacks(self._shown, self._failed, (number,), {}, (number,))
 

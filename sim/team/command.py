@@ -1,4 +1,4 @@
-"""Command: ``sim run``, a scenario played to its verdict."""
+"""``sim run``: run a scenario and judge it."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ MISSED, ENDED = 1, 130
 
 @dataclass
 class Environment:
-    """What a command needs of the machine; tests have another one.
+    """The environment of a command; tests replace it.
 
-    ``wall`` and ``cpu`` give seconds; ``columns`` is how wide the terminal is, 0 where there is none; ``is_stopped``
-    says whether a person wants an end; ``grown`` is called when most of what a run makes is there.
+    ``wall`` and ``cpu`` return seconds; ``columns`` is the width of the terminal, 0 without one; ``is_stopped`` returns
+    whether the user has asked to stop; ``grown`` is called when most of a run's memory is allocated.
     """
 
     out: TextIO
@@ -43,7 +43,7 @@ class Environment:
 
 
 def run(arguments: Sequence[str], world: Environment, kinds: Kinds = KINDS) -> int:
-    """Run what the arguments say; 1 where a target or an invariant is missed.  Raises ``BadSetting``."""
+    """Run the scenario of the arguments; returns 1 if a target or invariant is missed.  Raises ``BadSetting``."""
     wanted = _parsed(arguments)
     changes = {} if wanted.nodes is None else {"nodes": wanted.nodes}
     scenario = loaded(wanted.scenario, {name: kind.settings for name, kind in kinds.items()}, changes)
@@ -65,7 +65,7 @@ def run(arguments: Sequence[str], world: Environment, kinds: Kinds = KINDS) -> i
     check_targets(scenario, [figure.name for figure in going.figures()], wanted.scenario)
     faults: list[tuple[float, str]] = []
     with ExitStack() as files:
-        # Opened first: who waited for an hour wants no word about a folder that is not there.
+        # Opened before the run, so that a missing folder is reported at once and not after an hour.
         json_out = _opened(wanted.json, "--json", files)
         trace_out = _opened(wanted.trace, "--trace", files)
         picture_out = _opened(wanted.picture, "--picture", files)
@@ -91,25 +91,25 @@ def run(arguments: Sequence[str], world: Environment, kinds: Kinds = KINDS) -> i
 
 
 def check_targets(scenario: Scenario, known: Sequence[str], origin: str) -> None:
-    """Raise ``BadSetting`` for a target that is none of the ``known`` figures."""
+    """Raise ``BadSetting`` for a target that is not one of the ``known`` figures."""
     for name, _ in scenario.targets:
         if name not in known:
             place = place_of(origin, "targets", name)
-            raise BadSetting(place, f"[targets] {name}", "is no figure", remedy_of(name, known))
+            raise BadSetting(place, f"[targets] {name}", "is not a figure", remedy_of(name, known))
 
 
 def _parsed(arguments: Sequence[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="sim run",
-        description="Play a scenario with whole nodes in this process, to its verdict; Ctrl-C gives what there is.",
-        epilog="Exit code: 0 all is well, 1 a target or an invariant is missed, 2 it cannot be run, 130 it was ended.",
+        description="Run a scenario with whole nodes in this process and judge it; Ctrl-C gives the partial result.",
+        epilog="Exit code: 0 success, 1 a target or an invariant is missed, 2 it cannot be run, 130 interrupted.",
     )
     parser.add_argument("--scenario", required=True, metavar="NAME", help=f"{', '.join(names())}, or a .toml file")
-    parser.add_argument("--seed", type=int, default=1, metavar="N", help="everything follows from it (default 1)")
-    parser.add_argument("--nodes", type=int, metavar="N", help="instead of what the scenario says")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="the report for programs")
-    parser.add_argument("--trace", type=Path, metavar="FILE", help="what happened, a line of JSON each")
-    parser.add_argument("--picture", type=Path, metavar="FILE", help="the figures over time, as SVG")
+    parser.add_argument("--seed", type=int, default=1, metavar="N", help="seed of all random numbers (default 1)")
+    parser.add_argument("--nodes", type=int, metavar="N", help="number of nodes, instead of the scenario's")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the report as JSON")
+    parser.add_argument("--trace", type=Path, metavar="FILE", help="write the events, one line of JSON each")
+    parser.add_argument("--picture", type=Path, metavar="FILE", help="write the figures over time as SVG")
     return parser.parse_args(arguments)
 
 
@@ -119,5 +119,5 @@ def _opened(path: Path | None, key: str, files: ExitStack) -> TextIO | None:
     try:
         return files.enter_context(path.open("w", encoding="utf-8"))
     except OSError as error:
-        problem = f"{path} cannot be written: {error.strerror or error}"
-        raise BadSetting("command line", key, problem, "name a file in a folder that is there") from error
+        problem = f"cannot write {path}: {error.strerror or error}"
+        raise BadSetting("command line", key, problem, "name a file in an existing folder") from error

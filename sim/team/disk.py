@@ -1,4 +1,4 @@
-"""Disk: the twin of a store in a file: what is put is safe a moment later, and the last moment goes with the power."""
+"""Simulate a store in a file: writes are durable after a delay, and a loss of power loses pending ones."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ FULL = "database or disk is full"
 
 
 class Memory(MemoryStore):
-    """A store whose next life has all of it."""
+    """A store that keeps everything for its next life."""
 
     def kept(self) -> tuple[list[Record], dict[str, bytes]]:
-        """The records and notes that outlive a loss of power now."""
+        """Return the records and notes that would survive a loss of power now."""
         return self.records(), self._notes
 
 
 class Disk(Memory):
-    """A store that forgets on a loss of power what was not written yet; while ``is_full`` nothing can be written."""
+    """A store that loses pending writes on a loss of power; while ``is_full`` nothing can be written."""
 
     def __init__(self, clock: IReactorTime, rng: random.Random) -> None:
         super().__init__()
@@ -32,90 +32,93 @@ class Disk(Memory):
         self.safe: dict[Slot, Record] = {}
         self.safe_notes: dict[str, bytes] = {}
         self._clock = clock
-        self._dice = rng
+        self._rng = rng
         self._trouble = ""
-        self._owed: dict[Slot, Record | None] = {}
-        self._owed_notes: dict[str, bytes] = {}
+        self._pending: dict[Slot, Record | None] = {}
+        self._pending_notes: dict[str, bytes] = {}
         self._waiting: list[Deferred[None]] = []
-        self._is_turning = False
-        self._is_lost = False
+        self._is_scheduled = False
+        self._is_powered_off = False
 
     @property
     def trouble(self) -> str:
-        """Why the last commit failed; empty if it did not."""
+        """The reason of the last failed commit; empty after a success."""
         return self._trouble
 
     def put(self, record: Record, expires_at: float) -> bool:
-        """Hold ``record`` if it beats what its slot holds; see ``Store.put``."""
+        """Store ``record`` if it beats the one in its slot; see ``Store.put``."""
         if self._trouble and record.beats(self.slot(record.slot)):
             raise _refusal(self._trouble)
         return super().put(record, expires_at)
 
     def written(self) -> Deferred[None]:
-        """Fire once all that was put until now is safe; fail with ``Unwritable`` as soon as a commit fails."""
+        """Fire when all writes until now are durable; fail with ``Unwritable`` as soon as a commit fails."""
         if self._trouble:
             return fail(_refusal(self._trouble))
-        if not self._owed and not self._owed_notes:
+        if not self._pending and not self._pending_notes:
             return succeed(None)
         waiting: Deferred[None] = Deferred()
         self._waiting.append(waiting)
         return waiting
 
     def note(self, name: str, value: bytes) -> None:
-        """Keep a small fact of the node's own under ``name``."""
+        """Store a note of the node under ``name``."""
         if self.noted(name) != value:
             super().note(name, value)
-            self._owed_notes[name] = value
+            self._pending_notes[name] = value
             self._schedule()
 
     def begin(self) -> None:
-        """What is held now is what the disk holds."""
-        self.safe, self.safe_notes = {slot: record for slot, record in self._owed.items() if record}, dict(self._notes)
-        self._owed.clear()
-        self._owed_notes.clear()
+        """Make the present content durable."""
+        self.safe, self.safe_notes = (
+            {slot: record for slot, record in self._pending.items() if record},
+            dict(self._notes),
+        )
+        self._pending.clear()
+        self._pending_notes.clear()
 
     def kept(self) -> tuple[list[Record], dict[str, bytes]]:
-        """The records and notes that outlive a loss of power now."""
+        """Return the records and notes that would survive a loss of power now."""
         return list(self.safe.values()), self.safe_notes
 
     def close(self) -> None:
-        """Write what is to be written, if that can be, and nothing more."""
+        """Write pending changes if possible, and then nothing more."""
         self._commit()
         self.lose_power()
 
     def lose_power(self) -> None:
-        """Write nothing more."""
-        self._is_lost = True
+        """Stop all writing."""
+        self._is_powered_off = True
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
     def _changed(self, slot: Slot, record: Record | None) -> None:
-        self._owed[slot] = record
+        self._pending[slot] = record
         self._schedule()
 
     def _schedule(self) -> None:
-        if not self._is_turning:
-            self._is_turning = True
-            wait = TRY_AGAIN if self._trouble else self._dice.uniform(0.0, COMMIT_AFTER)
+        if not self._is_scheduled:
+            self._is_scheduled = True
+            wait = TRY_AGAIN if self._trouble else self._rng.uniform(0.0, COMMIT_AFTER)
             self._clock.callLater(wait, self._commit)
 
     def _commit(self) -> None:
-        self._is_turning = False
-        if self._is_lost:
+        self._is_scheduled = False
+        if self._is_powered_off:
             return
         self._trouble = FULL if self.is_full else ""
         waiting, self._waiting = self._waiting, []
         if self._trouble:
             self._schedule()
         else:
-            for slot, record in self._owed.items():
+            for slot, record in self._pending.items():
                 if record is None:
                     self.safe.pop(slot, None)
                 else:
                     self.safe[slot] = record
-            self.safe_notes.update(self._owed_notes)
-            self._owed.clear()
-            self._owed_notes.clear()
+            self.safe_notes.update(self._pending_notes)
+            self._pending.clear()
+            self._pending_notes.clear()
         for each in waiting:
             if self._trouble:
                 each.errback(_refusal(self._trouble))
@@ -124,9 +127,9 @@ class Disk(Memory):
 
 
 def next_life(store: Memory, later: Memory, now: float) -> Memory:
-    """``later``, with what outlives the node that had ``store``: team records and notes, but no leases.
+    """Fill ``later`` with the content that survives the node with ``store``: team records and notes, but no leases.
 
-    Team records expire a whole ttl from ``now``, for a file cannot know how long it lay.
+    Team records expire a whole ttl after ``now``, as a file does not know the time since its last use.
     """
     records, notes = store.kept()
     later.origin = "kept"

@@ -1,8 +1,8 @@
-"""Events: what can happen in a run, as plain facts; no event says whether it was right.
+"""Events of a run, as plain facts without judgement.
 
-``at`` is the moment on the clock of the world, in seconds.  A ``place`` is where nodes live one after the other, each
-life with a number of its own; ``task`` is the name of one.  What a client asked and what came of it are two events with
-one ``number``, for between them other things happen.
+``at`` is the time on the simulator's clock, in seconds.  A ``place`` hosts nodes one after the other, and numbers their
+lives; ``task`` is the name of a task.  A request and its answer are two events with the same ``number``, as other
+events happen in between.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Something that happened ``at`` a moment."""
+    """An event at the time ``at``."""
 
     at: float
 
@@ -24,7 +24,7 @@ class Event:
 
 @dataclass(frozen=True, slots=True)
 class Asked(Event):
-    """A client began ``what`` ("write", "read", "take", ...) on a ``subject``."""
+    """A client started the operation ``what`` ("write", "read", "take", ...) on a ``subject``."""
 
     number: int
     client: Hashable
@@ -35,7 +35,7 @@ class Asked(Event):
 
 @dataclass(frozen=True, slots=True)
 class Answered(Event):
-    """What was asked under ``number`` was done, and this is what the client got."""
+    """The operation ``number`` succeeded with a result."""
 
     number: int
     result: object = None
@@ -43,9 +43,9 @@ class Answered(Event):
 
 @dataclass(frozen=True, slots=True)
 class Unanswered(Event):
-    """The client gave up: what it asked for may have been done, or may be yet.
+    """The client gave up: the operation may have been carried out, or may be later.
 
-    ``is_unavailable``: it was told that too few are there.
+    ``is_unavailable``: the client was told that too few replicas are available.
     """
 
     number: int
@@ -53,12 +53,12 @@ class Unanswered(Event):
     is_unavailable: bool = False
 
 
-# -- the world ----------------------------------------------------------------------------------------------------
+# -- nodes --------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
 class Born(Event):
-    """A life began; the node has this public key, id and address (empty where nobody asks)."""
+    """A life began; the node has this public key, id and address (empty if not needed)."""
 
     place: int
     life: int = 0
@@ -69,7 +69,7 @@ class Born(Event):
 
 @dataclass(frozen=True, slots=True)
 class Died(Event):
-    """A life ended; ``forgets``: the next one may lack what this one had stored."""
+    """A life ended; ``forgets``: the next life may lack stored data."""
 
     place: int
     forgets: bool = False
@@ -77,7 +77,7 @@ class Died(Event):
 
 @dataclass(frozen=True, slots=True)
 class Settled(Event):
-    """All faults are over, and the time in which everything mends itself has passed."""
+    """All faults have ended, and the repair interval has passed."""
 
 
 # -- leases and devices -------------------------------------------------------------------------------------------
@@ -85,7 +85,7 @@ class Settled(Event):
 
 @dataclass(frozen=True, slots=True)
 class Terms(Event):
-    """What is assumed from now on: the ttl, how wrong clocks are, how long robots take to stop, the slowest way."""
+    """The assumptions from now on: lease ttl, clock drift, stopping time of robots, maximum network delay."""
 
     ttl: float
     drift: float
@@ -95,7 +95,7 @@ class Terms(Event):
 
 @dataclass(frozen=True, slots=True)
 class Won(Event):
-    """An agent believes to hold a lease with a token that it did not have before."""
+    """An agent believes that it holds a lease, with a token that is new to it."""
 
     task: str
     place: int
@@ -104,7 +104,7 @@ class Won(Event):
 
 @dataclass(frozen=True, slots=True)
 class Held(Event):
-    """``place`` won or renewed its lease; ``others`` believe to hold one as well, each by its own clock."""
+    """``place`` won or renewed its lease; ``others`` also believe that they hold it, each by its own clock."""
 
     task: str
     place: int
@@ -115,7 +115,7 @@ class Held(Event):
 class Issued(Event):
     """An agent sent a command.
 
-    Its lease ends at ``ends`` as its clock goes, at ``truly`` on a clock like it that never stood still.
+    Its lease ends at ``ends`` by its own clock, and at ``truly`` by an equal clock that was never suspended.
     """
 
     task: str
@@ -126,7 +126,7 @@ class Issued(Event):
 
 @dataclass(frozen=True, slots=True)
 class Commanded(Event):
-    """The gate of a device took a command, or refused it; it moves until ``until`` unless it is told again."""
+    """The gate of a device accepted or refused a command; the device moves until ``until`` without a further one."""
 
     task: str
     place: int
@@ -138,7 +138,7 @@ class Commanded(Event):
 
 @dataclass(frozen=True, slots=True)
 class Halted(Event):
-    """The robot of an agent was told to stop, and stands at ``still``."""
+    """An agent stopped its robot, which stands still from ``still`` on."""
 
     task: str
     place: int
@@ -147,7 +147,7 @@ class Halted(Event):
 
 @dataclass(frozen=True, slots=True)
 class Reached(Event):
-    """Whether an agent and a majority of a task's council hear each other from now on."""
+    """Whether an agent and a majority of a task's council can communicate from now on."""
 
     task: str
     place: int
@@ -156,7 +156,7 @@ class Reached(Event):
 
 @dataclass(frozen=True, slots=True)
 class Awaited(Event):
-    """From now on a command with a token ``above`` is waited for: at most ``within`` seconds after ``since``."""
+    """A command with a token ``above`` this one must follow within ``within`` seconds after ``since``."""
 
     task: str
     why: str
@@ -170,14 +170,14 @@ class Awaited(Event):
 
 @dataclass(frozen=True, slots=True)
 class Calm(Event):
-    """This run has no fault and no weather; whatever is said is heard by all ``within`` so many seconds."""
+    """This run has no faults and a perfect network; messages reach all nodes ``within`` so many seconds."""
 
     within: float
 
 
 @dataclass(frozen=True, slots=True)
 class Engaged(Event):
-    """The tasks on which an agent acts now, and those whose leases it holds."""
+    """The tasks on which an agent acts now, and the tasks whose leases it holds."""
 
     place: int
     acting: tuple[str, ...]
@@ -186,7 +186,7 @@ class Engaged(Event):
 
 @dataclass(frozen=True, slots=True)
 class Concluded(Event):
-    """A majority has the outcome of a task."""
+    """A majority of replicas has the outcome of a task."""
 
     task: str
     outcome: str
@@ -194,14 +194,14 @@ class Concluded(Event):
 
 @dataclass(frozen=True, slots=True)
 class Expired(Event):
-    """The record of a task's outcome has run out; the task is over and may still be listed."""
+    """The record of a task's outcome has expired; the task has ended and may still be listed."""
 
     task: str
 
 
 @dataclass(frozen=True, slots=True)
 class Open(Event):
-    """At the end: an agent holds a task for one that is not over, and is in this state about it."""
+    """At the end: an agent regards a task as open, and is in this state of it."""
 
     task: str
     place: int
@@ -210,7 +210,7 @@ class Open(Event):
 
 
 class Report(NamedTuple):
-    """A report that a decision used: whose, how old, and the cost in it (None: it cannot)."""
+    """A report used in a decision: its agent, its age, and its cost (None: not able)."""
 
     agent: str
     name: str
@@ -221,7 +221,7 @@ class Report(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Decided(Event):
-    """An agent decided a round: from these reports, its own first; ``basis`` is all that went into it."""
+    """An agent decided a round by these reports, its own first; ``basis`` is the whole input."""
 
     place: int
     group: str
@@ -237,7 +237,7 @@ class Decided(Event):
 
 @dataclass(frozen=True, slots=True)
 class Stored(Event):
-    """The store of a place holds something new in a slot; another ``memory`` may lack what an older one had."""
+    """The store of a place has new content in a slot; another ``memory`` may lack content of an older one."""
 
     place: int
     memory: int
@@ -260,7 +260,7 @@ class Met(Event):
 
 @dataclass(frozen=True, slots=True)
 class Counted(Event):
-    """At the end: the ids of the members that a node takes for alive, in their order."""
+    """At the end: the ids of the members that a node regards as alive, in its order."""
 
     place: int
     ids: tuple[bytes, ...]
@@ -271,7 +271,7 @@ class Counted(Event):
 
 @dataclass(frozen=True, slots=True)
 class Posted(Event):
-    """Some replica holds a tuple, which these members decide about."""
+    """A replica holds a tuple, on which these members decide."""
 
     mark: Hashable
     fields: Hashable
@@ -281,7 +281,7 @@ class Posted(Event):
 
 @dataclass(frozen=True, slots=True)
 class Voted(Event):
-    """A member of its council accepted, under a ballot, that a tuple goes to ``taker``."""
+    """A council member accepted, under a ballot, that a tuple goes to ``taker``."""
 
     mark: Hashable
     ballot: Hashable
@@ -291,14 +291,14 @@ class Voted(Event):
 
 @dataclass(frozen=True, slots=True)
 class Seated(Event):
-    """The members that live now, and the incarnation of each: another one has forgotten its votes."""
+    """The living members, with their incarnations: a new incarnation has forgotten its votes."""
 
     members: tuple[tuple[bytes, bytes], ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Repeated(Event):
-    """A member was asked again what it accepted for ``taker``, and said this (None: nothing lawful)."""
+    """A member was asked again for the tuple that it accepted for ``taker``, and answered this (None: invalid)."""
 
     fields: Hashable
     taker: bytes
@@ -310,7 +310,7 @@ class Repeated(Event):
 
 @dataclass(frozen=True, slots=True)
 class Shot(Event):
-    """A datagram that must change nothing came to a node: what stands for all that it remembers, and what it did."""
+    """An invalid datagram, which must change nothing, reached a node: digests of the node's state, and its reaction."""
 
     place: int
     kind: str
@@ -320,12 +320,12 @@ class Shot(Event):
     raised: str
     logged: str
     answers: tuple[tuple[bool, int], ...]
-    """Of each datagram that was sent because of it: whether to where it came from, and its size in bytes."""
+    """For each datagram sent in response: whether it went to the sender's address, and its size in bytes."""
 
 
 @dataclass(frozen=True, slots=True)
 class Ran(Event):
-    """A node ran what was asked of it under ``question``, which may run once in a life."""
+    """A node executed the request ``question``, which may happen once per life."""
 
     place: int
     life: int
@@ -334,7 +334,7 @@ class Ran(Event):
 
 @dataclass(frozen=True, slots=True)
 class Strange(Event):
-    """At the end: the bytes that were sent to an address that proved nothing, and those that came from it."""
+    """At the end: bytes sent to an unvalidated address, and bytes received from it."""
 
     sent: int
     got: int
@@ -342,7 +342,7 @@ class Strange(Event):
 
 @dataclass(frozen=True, slots=True)
 class Size(Event):
-    """A table of a node has so many entries, and may have ``cap``."""
+    """The number of entries in a table of a node, and its limit ``cap``."""
 
     place: int
     what: str

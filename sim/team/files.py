@@ -1,7 +1,7 @@
-"""Disk: a fleet whose nodes keep their stores in files, and lose power between any two instructions.
+"""Simulate nodes with stores in real SQLite files that lose power between any two instructions.
 
-A writer has no thread here: it commits at moments of the simulated clock, so that a run follows from its seed.  A kill
-leaves the files as they are at that moment, perhaps with a torn commit at their end; the next life opens a copy.
+The writer has no thread: it commits at times of the simulated clock, so that a run follows from its seed.  A kill
+leaves the files as they are, possibly with a torn commit at their end; the next life opens a copy.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ from sim.team.world import Fleet
 
 PARTS = ("", "-wal")
 MEMORY = "/dev/shm"
-"""Where files cost no time, if the machine has it: what is shown here does not rest on the real disk."""
+"""A folder in memory, if the machine has it: the tests do not depend on the real disk."""
 
 Facts = dict[Slot | str, Record | bytes | None]
-"""What slots and notes hold."""
+"""The content of slots and notes."""
 
 
 class TurnedWriter(Writer):
-    """A writer that commits when its clock says so; with ``fault`` set, every commit fails for that reason."""
+    """A writer that commits at times of its clock; with ``fault`` set, every commit fails for that reason."""
 
     def __init__(self, path: str, connection: sqlite3.Connection, clock: HeapClock, rng: random.Random) -> None:
         super().__init__(path, connection, lambda tell: clock.callLater(0.0, tell))
@@ -46,22 +46,22 @@ class TurnedWriter(Writer):
         self._timer: IDelayedCall | None = None
 
     def start(self, statements: list[Any]) -> None:
-        """Begin to write, ``statements`` first."""
+        """Start to write, ``statements`` first."""
         self._owed.statements += statements
         self._schedule()
 
     def owe(self, slot: Slot, record: Record | None) -> None:
-        """Have ``record`` written as what ``slot`` holds, or nothing."""
+        """Schedule ``record`` to be written as the content of ``slot``; None clears the slot."""
         super().owe(slot, record)
         self._schedule()
 
     def owe_note(self, name: str, value: bytes) -> None:
-        """Have a note written."""
+        """Schedule a note to be written."""
         super().owe_note(name, value)
         self._schedule()
 
     def turn(self) -> None:
-        """Commit what is owed."""
+        """Commit all pending changes."""
         self._timer = None
         batch, self._owed = self._owed, _Owed()
         waiting, self._waiting = self._waiting, []
@@ -72,11 +72,11 @@ class TurnedWriter(Writer):
         self._schedule()
 
     def tear(self) -> None:
-        """Commit what is owed, and tell nobody: the power fails meanwhile."""
+        """Commit all pending changes without an acknowledgement: the power fails meanwhile."""
         self._commit(self._owed)
 
     def abandon(self) -> None:
-        """Stop without a word."""
+        """Stop at once."""
         self._closing = True
         if self._timer is not None and self._timer.active():
             self._timer.cancel()
@@ -91,7 +91,7 @@ class TurnedWriter(Writer):
 
 
 class DiskStore(SqliteStore):
-    """A store that remembers what it said was safe; ``promised`` is that, ``fresh`` what was changed since."""
+    """A store that records acknowledged writes in ``promised``, and later changes in ``fresh``."""
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
@@ -100,17 +100,17 @@ class DiskStore(SqliteStore):
 
     @property
     def writer(self) -> TurnedWriter:
-        """What writes the file."""
+        """The writer of the file."""
         assert isinstance(self._writer, TurnedWriter)
         return self._writer
 
     def note(self, name: str, value: bytes) -> None:
-        """Keep a small fact of the node's own under ``name``."""
+        """Store a note of the node under ``name``."""
         self.fresh[name] = value
         super().note(name, value)
 
     def written(self) -> Deferred[None]:
-        """Fire when all that was put until now is in the file."""
+        """Fire when all writes until now are in the file."""
         until_now = dict(self.fresh)
 
         def safe(_: None) -> None:
@@ -122,7 +122,7 @@ class DiskStore(SqliteStore):
         return super().written().addCallback(safe)
 
     def lost(self, later: SqliteStore) -> list[str]:
-        """What was promised here and is not in the store of the ``later`` life."""
+        """Return the acknowledged writes that are missing in the store of the ``later`` life."""
         lost = []
         for place, fact in self.promised.items():
             if place in self.fresh:
@@ -135,7 +135,7 @@ class DiskStore(SqliteStore):
         return lost
 
     def abandon(self) -> None:
-        """Let go of the file as a kill does."""
+        """Close the file as a kill does."""
         self.writer.abandon()
         self._connection.close()
         os.close(self._lock)
@@ -146,17 +146,17 @@ class DiskStore(SqliteStore):
 
 
 class DiskFleet(Fleet):
-    """A fleet on files in a temporary folder.
+    """Nodes with stores in files of a temporary folder.
 
-    ``decay`` names places and what rots in their file when they are killed next ("row" or "file"); ``lost`` tells what
-    had been promised and was gone in the next life, ``overlooked`` what rotted and was not noticed.
+    ``decay`` maps places to the kind of corruption ("row" or "file") at their next kill; ``lost`` lists acknowledged
+    writes that were missing in the next life, ``overlooked`` corruption that was not detected.
     """
 
     def __init__(self, n: int, seed: int = 1, weather: Weather = CALM) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="schedule-", dir=MEMORY if os.path.isdir(MEMORY) else None)
-        self._dice = random.Random(f"{seed}/disk")
+        self._disk_rng = random.Random(f"{seed}/disk")
         self._memories: Counter[int] = Counter()
-        self._rotten: set[int] = set()
+        self._corrupt: set[int] = set()
         self.decay: dict[int, str] = {}
         self.decayed: list[int] = []
         self.lost: list[str] = []
@@ -164,49 +164,49 @@ class DiskFleet(Fleet):
         super().__init__(n, seed, weather)
 
     def memory(self, place: int) -> int:
-        """Which memory the node of a place has."""
+        """Return the number of the store of the node at a place."""
         return self._memories[place]
 
     def disk(self, place: int) -> DiskStore:
-        """The store of the node of a place."""
+        """Return the store of the node at a place."""
         store = self.stores[place]
         assert isinstance(store, DiskStore)
         return store
 
     def store(self, place: int) -> Store:
-        """The store of the next life of the node of this place."""
+        """Open the store of the next life of the node at this place."""
         former = self.stores.get(place)
-        store = self.stores[place] = self._opened(self._path(place))
-        if place in self._rotten:
-            self._rotten.discard(place)
+        store = self.stores[place] = self._open_store(self._path(place))
+        if place in self._corrupt:
+            self._corrupt.discard(place)
             if not store.rotten and store.origin != "replaced":
-                self.overlooked.append(f"node {place} does not notice that its store has rotted")
+                self.overlooked.append(f"node {place} does not detect that its store is corrupt")
         elif isinstance(former, DiskStore):
-            self.lost += [f"node {place} lost what was safe: {line}" for line in former.lost(store)]
+            self.lost += [f"node {place} lost an acknowledged write: {line}" for line in former.lost(store)]
         return store
 
     def kill(self, place: int, forgets: bool = True) -> None:
-        """End a node as a loss of power does: its file is left as it is, or with half a commit.
+        """Kill a node as a loss of power does: its file stays as it is, or has half a commit.
 
-        The next life may lack what was put a moment ago and is not in the file yet, and a file may rot.
+        The next life may lack recent writes that are not in the file yet, and the file may be corrupted.
         """
         super().kill(place, forgets)
         store, path = self.disk(place), self._path(place)
         self._memories[place] += 1
         later = self._path(place)
         before = _size(path + "-wal")
-        is_torn = self._dice.random() < 0.5
+        is_torn = self._disk_rng.random() < 0.5
         if is_torn:
             store.writer.tear()
         _copy(path, later)
         after = _size(later + "-wal")
         if is_torn and after > before:
-            os.truncate(later + "-wal", self._dice.randrange(before, after + 1))
+            os.truncate(later + "-wal", self._disk_rng.randrange(before, after + 1))
         store.abandon()
         kind = self.decay.get(place)
-        if kind is not None and self._rot(later, kind):
+        if kind is not None and self._corrupt_file(later, kind):
             del self.decay[place]
-            self._rotten.add(place)
+            self._corrupt.add(place)
             self.decayed.append(place)
 
     def stop(self) -> None:
@@ -219,10 +219,10 @@ class DiskFleet(Fleet):
         self._folder.cleanup()
 
     def differing(self, place: int) -> list[str]:
-        """What the file of a node would give after a kill now and its memory does not hold, or the other way round."""
+        """Compare a node's memory with the content that its file would give after a kill now."""
         store, path = self.disk(place), f"{self._path(place)}-copy"
         _copy(self._path(place), path)
-        copy = self._opened(path)
+        copy = self._open_store(path)
         here = {record for record in store.records() if record.lifetime == "team"}
         there = set(copy.records())
         found = []
@@ -238,13 +238,13 @@ class DiskFleet(Fleet):
     def _path(self, place: int) -> str:
         return str(Path(self._folder.name) / f"{place}-{self._memories[place]}")
 
-    def _opened(self, path: str) -> DiskStore:
-        dice = random.Random(f"{self._dice.random()}/{Path(path).name}")
+    def _open_store(self, path: str) -> DiskStore:
+        dice = random.Random(f"{self._disk_rng.random()}/{Path(path).name}")
         clock = self.clock
 
         class Store(DiskStore):
             make_writer = staticmethod(
-                # By its name alone: refusals name the file to peers, and the folder is another one each time.
+                # Only the file name, without the folder: refusals name it to peers, and the folder varies.
                 lambda path, connection, deliver: TurnedWriter(Path(path).name, connection, clock, dice)
             )
 
@@ -252,8 +252,8 @@ class DiskFleet(Fleet):
         assert isinstance(store, DiskStore)
         return store
 
-    def _rot(self, path: str, kind: str) -> bool:
-        """Let a row, or the file, rot; whether there was anything to rot."""
+    def _corrupt_file(self, path: str, kind: str) -> bool:
+        """Corrupt a row or the file; returns whether there was content to corrupt."""
         with closing(sqlite3.connect(path, isolation_level=None)) as connection:
             rows = [row for (row,) in connection.execute("SELECT id FROM records WHERE value IS NOT NULL ORDER BY id")]
             if not rows:
@@ -265,7 +265,7 @@ class DiskFleet(Fleet):
         if kind == "file":
             with open(path, "r+b") as file:
                 file.seek(4096)
-                file.write(self._dice.randbytes(4096))
+                file.write(self._disk_rng.randbytes(4096))
         return True
 
 

@@ -1,4 +1,4 @@
-"""History: everything that happened in a run, in its order; it is only ever added to, and judges nothing."""
+"""Record the events of a run in their order, without judgement; events are only appended."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from sim.team.event import Answered, Asked, Event, Unanswered
 
 
 class History:
-    """The events of one run; ``seconds`` tells the moment on the clock of its world.
+    """The events of one run; ``seconds`` returns the time of the simulator's clock.
 
-    Who acts writes down what it asked for and what it got; ``sim.team.checker`` judges it afterwards.  What was asked
-    and never answered may have been done: it stays open.
+    Clients record their requests and answers; ``sim.team.checker`` judges them afterwards.  A request without an answer
+    stays open: it may have been carried out.
     """
 
     def __init__(self, seconds: Callable[[], float]) -> None:
@@ -27,25 +27,25 @@ class History:
         return len(self.events)
 
     def note(self, kind: Callable[..., Event], *facts: object) -> None:
-        """Something of that ``kind`` happens now."""
+        """Append an event of the class ``kind``."""
         self.events.append(kind(self._seconds(), *facts))
 
     def asked(self, client: Hashable, what: str, subject: Hashable, argument: object = None) -> int:
-        """A client asks; the number under which to say what came of it."""
+        """Append a client's request; returns its number, for the answer."""
         self._asked += 1
         self.events.append(Asked(self._seconds(), self._asked, client, what, subject, argument))
         return self._asked
 
     def answered(self, number: int, result: object = None) -> None:
-        """What was asked is done."""
+        """Append the answer to a request."""
         self.events.append(Answered(self._seconds(), number, result))
 
     def unanswered(self, number: int, why: object, is_unavailable: bool = False) -> None:
-        """The client gave up: it is not known what came of it."""
+        """Append that the client gave up; the outcome of the request is unknown."""
         self.events.append(Unanswered(self._seconds(), number, str(why), is_unavailable))
 
     def digest(self) -> str:
-        """A hash over all events; runs of the same seed have the same."""
+        """Return a hash of all events; it is the same for runs of the same seed."""
         hashed = hashlib.blake2b(digest_size=16)
         for event in self.events:
             hashed.update(repr(event).encode())

@@ -1,7 +1,7 @@
-"""Link: what lies between the nodes of a team: a LAN, a radio or the internet, with bursts, queues and lost datagrams.
+"""Model the links between the nodes of a team: LAN, Wi-Fi or internet, with bursts, queues and losses.
 
-State is kept by sender and receiver, never by pair: ten thousand nodes have fifty million of those.  So a burst is that
-of a radio, a queue that of an access line, and the distance of two nodes follows from where each of them is.
+State is kept per sender and receiver, not per pair, as ten thousand nodes have fifty million pairs.  So a burst belongs
+to a sender's radio, a queue to an access link, and the distance of two nodes follows from their positions.
 """
 
 from __future__ import annotations
@@ -19,87 +19,87 @@ from middleware.entangled.network.network import Address
 
 KINDS = ("none", "lan", "wifi", "internet")
 MEAN_RTT = 0.156
-"""Seconds; what the measured delays of the King data set come to in the simulations that ours are held against."""
+"""Mean round-trip time of the King data set in seconds, as in the simulations that results are compared with."""
 HEIGHT = 0.0125
-"""Mean seconds that the last mile of a node adds to each way, whoever it talks to."""
+"""Mean one-way delay of a node's access link in seconds, for every peer."""
 SIDE = (MEAN_RTT / 2 - 2 * HEIGHT) / 0.521405
-"""Side, in seconds one way, of the square in which nodes lie; 0.5214 is the mean distance in a unit square."""
+"""Side of the square of node positions, in seconds one way; 0.5214 is the mean distance in a unit square."""
 SPREAD = 0.05
-"""Share by which the delays of one pair vary."""
+"""Relative variation of the delays of one pair."""
 LOST: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
 class LinkSettings:
-    """``[link]``: what lies between the nodes."""
+    """``[link]``: the links between the nodes."""
 
     kind: Annotated[str, one_of(KINDS)] = "lan"
-    """``none``: no delay.  ``lan``: 0.2 to 0.6 ms.  ``wifi``: 1 ms and up, 5 ms on average.  ``internet``: by where
-    nodes are, 156 ms there and back on average."""
+    """``none``: no delay.  ``lan``: 0.2 to 0.6 ms.  ``wifi``: 1 ms and more, 5 ms on average.  ``internet``: by the
+    positions of nodes, with a mean round-trip time of 156 ms."""
 
     loss: Annotated[float, Meta(ge=0.0, le=0.9)] = 0.0
-    """Share of the datagrams that is lost, each way."""
+    """Share of datagrams lost in each direction."""
 
     burst: Annotated[float, Meta(ge=0.0, le=10.0), Unit("seconds")] = 0.0
-    """Mean seconds for which a sender loses everything, so that the share is as ``loss`` says (Gilbert-Elliott); 0:
-    each datagram by itself."""
+    """Mean duration in seconds of a sender's loss burst, at the mean rate of ``loss`` (Gilbert-Elliott); 0: independent
+    losses."""
 
     asymmetry: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0
-    """Of two directions one loses this share more than ``loss`` says, and the other as much less."""
+    """Relative difference of losses: one direction of a pair loses this share more than ``loss``, the other less."""
 
     duplicate: Annotated[float, Meta(ge=0.0, le=0.9)] = 0.0
-    """Share of the datagrams that arrives twice."""
+    """Share of datagrams that arrive twice."""
 
     reorder: Annotated[float, Meta(ge=0.0, le=0.9)] = 0.0
-    """Share of the datagrams that takes as long again, and a millisecond, so that others overtake it."""
+    """Share of datagrams with twice the delay plus a millisecond, so that others overtake them."""
 
     bandwidth: Annotated[float, Meta(ge=0.0, le=1e9)] = 0.0
-    """Bytes a second that a node can send; 0: as many as it likes."""
+    """Bytes per second that a node can send; 0: unlimited."""
 
     queue: Annotated[float, Meta(ge=0.001, le=60.0), Unit("seconds")] = 0.5
-    """Seconds for which a datagram waits for its turn to be sent; what would have to wait longer is lost."""
+    """Maximum queueing time of a datagram in seconds; it is lost if it would wait longer."""
 
 
 class TeamLink:
-    """The link of a whole board (``switchboard.Link``); ``seed`` says where nodes are."""
+    """The link model of a switchboard (``switchboard.Link``); ``seed`` determines the positions of nodes."""
 
     def __init__(self, settings: LinkSettings, seed: str) -> None:
         self.settings = settings
         self.worse = 0.0
-        """Share of the datagrams that is lost besides, for as long as the weather is bad."""
+        """Additional share of datagrams lost while a fault of kind ``weather`` is active."""
         self._seed = seed
         self._loss = settings.loss
         self._plain_loss = settings.loss if not (settings.burst or settings.asymmetry) else 0.0
         self._bursts: dict[Address, tuple[float, bool]] = {}
         self._free_at: dict[Address, float] = {}
-        self._spots: dict[Address, tuple[float, float, float]] = {}
+        self._positions: dict[Address, tuple[float, float, float]] = {}
         self._delay = getattr(self, f"_{settings.kind}")
         self._is_plain = not (settings.duplicate or settings.reorder or settings.bandwidth)
 
     def delays(self, source: Address, to: Address, size: int, now: float, rng: random.Random) -> Sequence[float]:
-        """The seconds that each copy of a datagram takes; none where it is lost."""
+        """Return the delay of each copy of a datagram in seconds; empty if it is lost."""
         if self._loss and self._is_lost(source, to, now, rng):
             return LOST
         if self.worse and rng.random() < self.worse:
             return LOST
         if self._is_plain:
             return (self._delay(source, to, rng),)
-        settings, waited = self.settings, 0.0
+        settings, queueing = self.settings, 0.0
         if settings.bandwidth:
             begins = max(now, self._free_at.get(source, 0.0))
             if begins - now > settings.queue:
                 return LOST
             self._free_at[source] = begins + size / settings.bandwidth
-            waited = self._free_at[source] - now
+            queueing = self._free_at[source] - now
         copies = 2 if settings.duplicate and rng.random() < settings.duplicate else 1
         delays = [self._delay(source, to, rng) for _ in range(copies)]
         if settings.reorder:
             delays = [2 * d + 0.001 if rng.random() < settings.reorder else d for d in delays]
-        return [waited + delay for delay in delays]
+        return [queueing + delay for delay in delays]
 
     def distance(self, source: Address, to: Address) -> float:
-        """Seconds one way between two nodes on the internet, without what varies."""
-        (x, y, height), (x2, y2, height2) = self._spot(source), self._spot(to)
+        """Return the one-way delay between two nodes on the internet in seconds, without variation."""
+        (x, y, height), (x2, y2, height2) = self._position(source), self._position(to)
         return math.hypot(x - x2, y - y2) + height + height2
 
     # -- inside -----------------------------------------------------------------------------------------------------
@@ -112,20 +112,24 @@ class TeamLink:
             loss = min(0.99, loss * (1 + settings.asymmetry if source < to else 1 - settings.asymmetry))
         if not settings.burst:
             return rng.random() < loss
-        # The two-state chain in continuous time: what it is now follows from what it was when it was last looked at.
+        # A two-state Markov chain in continuous time: the state now follows from the last observed one.
         since, was_bad = self._bursts.get(source, (-1e9, False))
         remembered = math.exp((since - now) / (settings.burst * (1 - loss)))
         is_bad = rng.random() < loss + ((1.0 if was_bad else 0.0) - loss) * remembered
         self._bursts[source] = now, is_bad
         return is_bad
 
-    def _spot(self, address: Address) -> tuple[float, float, float]:
-        spot = self._spots.get(address)
-        if spot is None:
-            dice = random.Random(f"{self._seed}/{address}")
-            spot = dice.uniform(0, SIDE), dice.uniform(0, SIDE), dice.expovariate(1 / HEIGHT)
-            self._spots[address] = spot
-        return spot
+    def _position(self, address: Address) -> tuple[float, float, float]:
+        position = self._positions.get(address)
+        if position is None:
+            position_rng = random.Random(f"{self._seed}/{address}")
+            position = (
+                position_rng.uniform(0, SIDE),
+                position_rng.uniform(0, SIDE),
+                position_rng.expovariate(1 / HEIGHT),
+            )
+            self._positions[address] = position
+        return position
 
     def _none(self, source: Address, to: Address, rng: random.Random) -> float:
         return 0.0

@@ -1,7 +1,7 @@
-"""Logbook: a file of lines in JSON, each of which says what a stretch of seeds came to; it is only ever added to.
+"""Keep a logbook: a file with one line of JSON per range of seeds, to which lines are only appended.
 
-It is valid after every line, whatever ended the run: half a line at its end (a loss of power) is left out when it is
-read, and closed when it is added to.
+The file is valid after every line, however the run ended: an incomplete last line (after a loss of power) is skipped
+when reading, and removed when appending.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from middleware.errors import BadSetting
 
 @dataclass(frozen=True)
 class Entry:
-    """So many seeds from ``first`` on were run: which of them failed, and in how many seconds.
+    """The result of running ``count`` seeds from ``first`` on: the failed ones, and the duration in seconds.
 
-    ``what`` names the workloads where they were not those of the seeds; ``commit`` has a + where the tree was changed.
+    ``what`` names the workloads if they differ from those of the seeds; ``commit`` ends with + if the tree had changes.
     """
 
     date: str
@@ -31,31 +31,31 @@ class Entry:
     seconds: float
 
     def line(self) -> str:
-        """The entry as a line of the file."""
+        """Return the entry as a line of the file."""
         return json.dumps(asdict(self))
 
 
 def entries(text: str, file: str) -> list[Entry]:
-    """The entries of a logbook; raises ``BadSetting`` where a line is not one (but for half a line at the end)."""
+    """Parse a logbook; raises ``BadSetting`` for an invalid line (except an incomplete last one)."""
     found = []
     for number, line in enumerate(text.splitlines(), start=1):
         try:
             found.append(_entry(json.loads(line)))
         except (ValueError, TypeError, KeyError) as error:
             if line and number <= text.count("\n"):
-                problem = f"line {number} is no entry of a logbook ({error})"
-                raise BadSetting(file, "--log", problem, "name another file, or take the line out") from None
+                problem = f"line {number} is not a logbook entry ({error})"
+                raise BadSetting(file, "--log", problem, "name another file, or remove the line") from None
     return found
 
 
 def missing(seeds: range, logged: Iterable[Entry], what: str) -> list[int]:
-    """Those of ``seeds`` that no entry about the same workloads has, whichever commit it was."""
+    """Return the ``seeds`` that no entry with the same workloads has, whatever its commit."""
     done = {seed for one in logged if one.what == what for seed in range(one.first, one.first + one.count)}
     return [seed for seed in seeds if seed not in done]
 
 
 def stretches(seeds: Sequence[int], most: int) -> list[Sequence[int]]:
-    """``seeds`` in stretches without gaps, of at most so many."""
+    """Split ``seeds`` into ranges without gaps, of at most ``most`` seeds each."""
     found: list[Sequence[int]] = []
     begin = 0
     for end in range(1, len(seeds) + 1):
@@ -67,7 +67,7 @@ def stretches(seeds: Sequence[int], most: int) -> list[Sequence[int]]:
 
 
 def append(file: str, entry: Entry) -> None:
-    """Add a line to a logbook, and have it on the disk."""
+    """Append a line to a logbook and flush it to disk."""
     with open(file, "a+b") as book:
         book.seek(0, os.SEEK_END)
         is_torn = False
@@ -82,14 +82,14 @@ def append(file: str, entry: Entry) -> None:
 
 
 def _close_the_line(book: Any) -> None:
-    """Take half a line away."""
+    """Remove an incomplete last line."""
     book.seek(0)
     whole = book.read().rfind(b"\n") + 1
     book.truncate(whole)
 
 
-def _entry(told: dict[str, Any]) -> Entry:
-    known = {one.name: told[one.name] for one in fields(Entry)}
+def _entry(content: dict[str, Any]) -> Entry:
+    known = {one.name: content[one.name] for one in fields(Entry)}
     known["failures"] = tuple(map(int, known["failures"]))
     known["first"], known["count"] = int(known["first"]), int(known["count"])
     return Entry(**known)

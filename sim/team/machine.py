@@ -1,8 +1,7 @@
-"""The computer of one simulated node, with a clock of its own: it can be fast or slow, frozen, suspended, and die.
+"""Simulate the computer of one node, with its own clock: it can drift, be frozen or suspended, and die.
 
 It is the clock of the node, and receives the node's datagrams and the bytes of its robot.  Nothing runs on a frozen
-machine; when it continues, first its timers run that are overdue, then it receives what arrived, as a reactor does
-after SIGCONT.
+machine.  When it continues, overdue timers run first, then it receives pending data, as a reactor does after SIGCONT.
 """
 
 from __future__ import annotations
@@ -18,15 +17,15 @@ from drivers.link import Caller, Connector, Line, Link
 from middleware.entangled.network.network import Address, Network, Receiver, ports_of
 
 LEAST = 1e-6
-"""Seconds that a timer takes at least, unless it is due at once.  What is left of a wait after rounding two clocks may
-be too little to move the world's: who waits for the rest again and again would wait for ever."""
+"""Minimum delay of a timer in seconds, unless it is 0.  A remainder from rounding between two clocks may be too small
+to advance the simulator's clock: code that waits for it repeatedly would wait for ever."""
 MOST_WAITING = 200
-"""Datagrams that wait for a machine that stands still; the rest is dropped, as a full socket buffer does."""
+"""Maximum number of datagrams queued for a frozen machine; others are dropped, as by a full socket buffer."""
 
 
 @implementer(IDelayedCall)
 class _MachineCall:
-    """A call that a machine will make, unless it is cancelled or the machine dies first."""
+    """A scheduled call of a machine."""
 
     __slots__ = ("inner", "_machine", "_function", "_arguments", "_keywords", "_state")
 
@@ -39,20 +38,20 @@ class _MachineCall:
         self._state = "waiting"
 
     def due(self) -> None:
-        """The moment has come: run, or wait until the machine goes on."""
+        """Run the call, or queue it until the machine continues."""
         if self._machine.is_still:
             self._machine.timers.append(self)
         else:
             self.run()
 
     def run(self) -> None:
-        """Make the call, unless it was cancelled meanwhile."""
+        """Make the call, unless it was cancelled."""
         if self._state == "waiting" and self._machine.is_alive:
             self._state = "called"
             self._function(*self._arguments, **self._keywords)
 
     def active(self) -> bool:
-        """Whether the call is still to come."""
+        """Return whether the call is still scheduled."""
         return self._state == "waiting"
 
     def cancel(self) -> None:
@@ -63,18 +62,18 @@ class _MachineCall:
             self.inner.cancel()
 
     def getTime(self) -> float:
-        """The moment at which the call is due, on the machine's clock."""
+        """Return the time of the call on the machine's clock."""
         assert self.inner is not None
         return self._machine.shown_at(self.inner.getTime())
 
     def reset(self, seconds: float) -> None:
-        """Let it be due so many of the machine's seconds from now."""
+        """Reschedule the call to ``seconds`` of the machine's clock from now."""
         self._check()
         if self.inner is not None and self.inner.active():
             self.inner.reset(seconds / self._machine.rate)
 
     def delay(self, seconds: float) -> None:
-        """Let it be due so many of the machine's seconds later."""
+        """Postpone the call by ``seconds`` of the machine's clock."""
         self._check()
         if self.inner is not None and self.inner.active():
             self.inner.delay(seconds / self._machine.rate)
@@ -88,85 +87,85 @@ class _MachineCall:
 
 @implementer(IReactorTime)
 class Machine:
-    """A computer whose clock runs ``rate`` times as fast as the world's, and began at ``offset``."""
+    """A computer whose clock runs ``rate`` times as fast as the simulator's clock, and starts at ``offset``."""
 
     COUNTS_SUSPENSION = True
-    """Whether its clock goes on while it is suspended (CLOCK_BOOTTIME does, CLOCK_MONOTONIC does not)."""
+    """Whether its clock continues during a suspension (CLOCK_BOOTTIME does, CLOCK_MONOTONIC does not)."""
 
     def __init__(self, world: IReactorTime, rate: float = 1.0, offset: float = 0.0) -> None:
         self.rate = rate
         self.is_alive = True
         self.is_still = False
         self.timers: list[_MachineCall] = []
-        self._arrived: list[tuple[Callable[..., object], tuple[Any, ...]]] = []
-        self._world = world
-        # What the clock showed, and when, the last time that its rate was set.
-        self._shown = offset
-        self._since = 0.0
-        self._lost = 0.0
+        self._pending_input: list[tuple[Callable[..., object], tuple[Any, ...]]] = []
+        self._clock = world
+        # The clock's value at the last change of its rate, and the simulator's time of it.
+        self._base_value = offset
+        self._base_time = 0.0
+        self._suspended_s = 0.0
         self._stopped_at: float | None = None
 
     def seconds(self) -> float:
-        """The machine's own moment; it goes on while the machine stands still."""
-        return self.shown_at(self._world.seconds())
+        """Return the machine's time; it continues while the machine is frozen."""
+        return self.shown_at(self._clock.seconds())
 
     def shown_at(self, moment: float) -> float:
-        """What its clock shows at a ``moment`` of the world's, if its rate stays."""
+        """Return the value of its clock at a ``moment`` of the simulator's clock, if its rate stays the same."""
         if self._stopped_at is not None:
             moment = self._stopped_at
-        return self._shown + self.rate * (moment - self._since)
+        return self._base_value + self.rate * (moment - self._base_time)
 
     def at(self, shown: float) -> float:
-        """The world's moment at which the clock shows that, if its rate stays."""
-        return self._since + (shown - self._shown) / self.rate
+        """Return the simulator's time at which the clock shows ``shown``, if its rate stays the same."""
+        return self._base_time + (shown - self._base_value) / self.rate
 
     def unstopped_at(self, shown: float) -> float:
-        """The world's moment at which the clock would show that if it had never stopped in a suspension."""
-        return self.at(shown) - self._lost
+        """Return the simulator's time at which the clock would show ``shown`` without any suspension."""
+        return self.at(shown) - self._suspended_s
 
     def set_rate(self, rate: float) -> None:
-        """Run so fast from now on; timers that are set already are due when they were to be."""
-        self._shown, self._since = self.seconds(), self._world.seconds()
+        """Change the rate from now on; existing timers keep their times on the simulator's clock."""
+        self._base_value, self._base_time = self.seconds(), self._clock.seconds()
         self.rate = rate
 
     def callLater(self, delay: float, callable: Callable[..., object], *args: Any, **kw: Any) -> IDelayedCall:  # noqa: A002
-        """Make a call after ``delay`` of the machine's own seconds."""
+        """Schedule a call after ``delay`` seconds of the machine's clock."""
         call = _MachineCall(self, callable, args, kw)
-        call.inner = self._world.callLater(max(delay / self.rate, LEAST) if delay else 0.0, call.due)
+        call.inner = self._clock.callLater(max(delay / self.rate, LEAST) if delay else 0.0, call.due)
         return call
 
     def getDelayedCalls(self) -> Sequence[IDelayedCall]:
-        """The calls of everybody on the world's clock, for there is only one."""
-        return list(self._world.getDelayedCalls())
+        """Return all calls on the simulator's clock, which all machines share."""
+        return list(self._clock.getDelayedCalls())
 
     def heard(self, receive: Callable[..., object], *arguments: Any) -> None:
-        """Hand in something from outside, now or when the machine goes on."""
+        """Deliver external input, now or when the machine continues."""
         if self.is_still:
-            self._arrived.append((receive, arguments))
+            self._pending_input.append((receive, arguments))
         elif self.is_alive:
             receive(*arguments)
 
     def take(self, receive: Callable[..., object], *arguments: Any) -> None:
-        """Hand in a datagram; while the machine stands still only so many wait."""
-        if not self.is_still or len(self._arrived) < MOST_WAITING:
+        """Deliver a datagram; a frozen machine queues at most ``MOST_WAITING``."""
+        if not self.is_still or len(self._pending_input) < MOST_WAITING:
             self.heard(receive, *arguments)
 
     def freeze(self, is_suspended: bool = False) -> None:
-        """Stop the process, as SIGSTOP does, or suspend the whole machine."""
+        """Stop the process like SIGSTOP, or suspend the whole machine."""
         self.is_still = True
         if is_suspended and not self.COUNTS_SUSPENSION:
-            self._stopped_at = self._world.seconds()
+            self._stopped_at = self._clock.seconds()
 
     def thaw(self) -> None:
-        """Go on, with everything that is overdue."""
+        """Continue, with everything that is overdue."""
         self.is_still = False
         if self._stopped_at is not None:
-            stopped = self._world.seconds() - self._stopped_at
+            stopped = self._clock.seconds() - self._stopped_at
             self._stopped_at = None
-            self._lost += stopped
-            self._since += stopped
+            self._suspended_s += stopped
+            self._base_time += stopped
         timers, self.timers = self.timers, []
-        arrived, self._arrived = self._arrived, []
+        arrived, self._pending_input = self._pending_input, []
         for call in timers:
             call.run()
         for receive, arguments in arrived:
@@ -174,14 +173,14 @@ class Machine:
                 receive(*arguments)
 
     def die(self) -> None:
-        """Do nothing any more."""
+        """Stop for ever."""
         self.is_alive = False
         self.timers.clear()
-        self._arrived.clear()
+        self._pending_input.clear()
 
 
 class MachineNetwork:
-    """A network whose datagrams a machine receives."""
+    """A network whose datagrams pass through a machine."""
 
     def __init__(self, machine: Machine, network: Network) -> None:
         self._machine = machine
@@ -192,23 +191,23 @@ class MachineNetwork:
 
     @property
     def address(self) -> Address:
-        """The node's own address."""
+        """The node's address."""
         return self._network.address
 
     def listen(self, receiver: Receiver) -> None:
-        """Open the port; what comes in goes to ``receiver`` by way of the machine."""
+        """Open the port; datagrams reach ``receiver`` through the machine."""
         self._network.listen(lambda datagram, source: self._machine.take(receiver, datagram, source))
 
 
 class MachineConnector:
-    """A connector whose links a machine reads."""
+    """A connector whose links pass through a machine."""
 
     def __init__(self, machine: Machine, connector: Connector) -> None:
         self._machine = machine
         self._connector = connector
 
     def call(self, host: str, port: int, caller: Caller) -> Line:
-        """Open a link; what arrives on it goes to ``caller`` by way of the machine."""
+        """Open a link; its data reaches ``caller`` through the machine."""
         return self._connector.call(host, port, _MachineCaller(self._machine, caller))
 
 

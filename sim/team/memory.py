@@ -1,4 +1,4 @@
-"""Memory: what a team will need and what the machine has, so that a run that cannot end is not begun."""
+"""Estimate the memory of a team, to refuse a run that does not fit into the free memory."""
 
 from __future__ import annotations
 
@@ -9,28 +9,28 @@ from middleware.errors import BadSetting
 from sim.team.scenario import Scenario
 
 KIB = {"entangled": 250, "swarm": 1000}
-"""KiB of a node, rounded up from what was measured: 231 for one of 1,000 peers of the network alone; 937 for one of
-120 whole nodes of devices, each of which reads the whole directory when it comes."""
+"""KiB per node, rounded up from measurements: 231 per node of 1,000 peers of the library; 937 per node of 120 whole
+device nodes, each of which reads the whole directory when it joins."""
 BASE = 60 * 2**20
-"""Bytes of the interpreter and all modules."""
+"""Memory of the interpreter and all modules in bytes."""
 SPARED = 0.9
-"""Share of what is free that a run may take."""
+"""Share of the free memory that a run may use."""
 GROUPS = "/proc/self/cgroup"
 V2, V1 = "/sys/fs/cgroup", "/sys/fs/cgroup/memory"
 NO_LIMIT = 2**60
 
 Read = Callable[[str], str]
-"""The text of a file; raises ``OSError``."""
+"""Returns the text of a file; raises ``OSError``."""
 
 
 def foreseen(scenario: Scenario) -> int:
-    """Bytes that the team of a scenario will need."""
+    """Return the estimated memory of a scenario's team in bytes."""
     newcomers = sum(fault.count for fault in scenario.faults if fault.kind == "crowd")
     return BASE + (scenario.nodes + newcomers) * KIB[scenario.kind] * 1024
 
 
 def free(read: Read) -> int:
-    """Bytes that this process may still take: what the machine has, or what its groups of processes leave it."""
+    """Return the bytes that this process can still allocate: the machine's free memory or a limit of its cgroups."""
     found = [NO_LIMIT, *_group_limits(read)]
     with suppress(OSError, ValueError, IndexError):
         line = next(line for line in read("/proc/meminfo").splitlines() if line.startswith("MemAvailable:"))
@@ -39,7 +39,7 @@ def free(read: Read) -> int:
 
 
 def resident(read: Read) -> int:
-    """Bytes that this process has; 0 where the system does not tell."""
+    """Return the resident memory of this process in bytes; 0 if the system does not tell."""
     with suppress(OSError, ValueError, StopIteration):
         line = next(line for line in read("/proc/self/status").splitlines() if line.startswith("VmRSS:"))
         return int(line.split()[1]) * 1024
@@ -47,17 +47,17 @@ def resident(read: Read) -> int:
 
 
 def check(scenario: Scenario, read: Read) -> None:
-    """Raise ``BadSetting`` where the team of a scenario does not fit."""
+    """Raise ``BadSetting`` if the team of a scenario does not fit into memory."""
     needed, left = foreseen(scenario), free(read)
     if needed <= left * SPARED:
         return
     fit = max(0, int((left * SPARED - BASE) / (KIB[scenario.kind] * 1024)))
-    problem = f"{scenario.nodes:,} nodes need {_size(needed)} of memory, and {_size(int(left * SPARED))} can be had"
-    raise BadSetting("command line", "--nodes", problem, f"take at most {fit:,}, or a machine with more")
+    problem = f"{scenario.nodes:,} nodes need {_size(needed)} of memory, but {_size(int(left * SPARED))} are available"
+    raise BadSetting("command line", "--nodes", problem, f"use at most {fit:,}, or a machine with more memory")
 
 
 def _group_limits(read: Read) -> Iterator[int]:
-    """What each group of processes that this one is in has left."""
+    """Yield the free memory of each cgroup of this process."""
     try:
         lines = read(GROUPS).splitlines()
     except OSError:
@@ -74,7 +74,7 @@ def _group_limits(read: Read) -> Iterator[int]:
         parts = [part for part in path.split("/") if part and part != ".."]
         for depth in range(len(parts), -1, -1):
             folder = "/".join([root, *parts[:depth]])
-            with suppress(OSError, ValueError):  # "max" is no number
+            with suppress(OSError, ValueError):  # "max" is not a number
                 yield max(0, int(read(f"{folder}/{most}")) - int(read(f"{folder}/{used}")))
 
 

@@ -1,4 +1,4 @@
-"""Picture: a run's figures over time as one SVG, a small diagram each, without a library."""
+"""Draw a run's figures over time as SVG, one small diagram each."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ LINE, AXIS, FAULT = "#2563a8", "#6b7280", "#c2410c"
 
 
 def drawn(title: str, series: Series, faults: Sequence[tuple[float, str]] = ()) -> str:
-    """The picture; ``faults`` are moments and what happened then, drawn as vertical lines."""
+    """Return the SVG; ``faults`` are times and descriptions, drawn as vertical lines."""
     parts: list[str] = []
     shown = {name: points for name, points in series.items() if len(points) > 1}
     end = max((points[-1][0] for points in shown.values()), default=1.0) or 1.0
@@ -23,11 +23,11 @@ def drawn(title: str, series: Series, faults: Sequence[tuple[float, str]] = ()) 
         parts.append(_diagram(x, y, name, points, end, faults))
     rows = math.ceil(len(shown) / COLUMNS)
     width, height = COLUMNS * (WIDE + LEFT + 20), TOP + max(1, rows) * (HIGH + GAP) + 10
-    said = escape("; ".join(f"{moment:g} s {what}" for moment, what in faults) or "no faults")
+    text = escape("; ".join(f"{moment:g} s {what}" for moment, what in faults) or "no faults")
     nothing = "" if shown else f'<text x="{LEFT}" y="{TOP + 20}">nothing was measured</text>'
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}" height="{height}" viewBox="0 0 {width} {height}" '
-        f'font-family="sans-serif" font-size="11" role="img">\n<title>{escape(title)}</title>\n<desc>{said}</desc>\n'
+        f'font-family="sans-serif" font-size="11" role="img">\n<title>{escape(title)}</title>\n<desc>{text}</desc>\n'
         f'<rect width="100%" height="100%" fill="white"/>\n<text x="{LEFT}" y="20" font-size="14" font-weight="bold">'
         f"{escape(title)}</text>\n{nothing}" + "\n".join(parts) + "\n</svg>\n"
     )

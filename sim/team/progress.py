@@ -1,4 +1,4 @@
-"""Progress: how far a run is, as a bar on a terminal and in lines elsewhere."""
+"""Show the progress of a run, as a bar on a terminal and as lines elsewhere."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from sim.team.run import Run
 
 BAR = 24
 OFTEN, RARELY = 0.2, 10.0
-"""Seconds between two looks on a terminal, and between two lines elsewhere."""
+"""Seconds between two updates on a terminal, and between two lines elsewhere."""
 FIGURES_EVERY = 2.0
-"""Seconds between two looks at the workloads' figures: some of them go through all there is."""
+"""Seconds between two evaluations of the workloads' figures, as some of them are expensive."""
 
 
 class Progress:
-    """Writes to ``out`` how a run goes; ``seconds`` is the real time, and ``resident`` gives bytes of memory.
+    """Writes the progress of a run to ``out``; ``seconds`` returns real time, ``resident`` bytes of memory.
 
-    ``columns`` is how wide the terminal is, 0 where there is none.
+    ``columns`` is the width of the terminal, 0 without one.
     """
 
     def __init__(self, out: TextIO, columns: int, seconds: Callable[[], float], resident: Callable[[], int]) -> None:
@@ -32,7 +32,7 @@ class Progress:
         self._figures_at = float("-inf")
 
     def looked(self, run: Run) -> None:
-        """Say how far it is, unless that was said a moment ago."""
+        """Show the progress, unless it was shown recently."""
         now, moment = self._seconds(), run.team.clock.seconds()
         if self._last is None:
             self._last = now, moment
@@ -51,9 +51,9 @@ class Progress:
         self._say(self.line(run, (moment - then) / (now - before)))
 
     def line(self, run: Run, pace: float) -> str:
-        """How far it is, in one line, with the figures that have targets, marked where these are missed so far.
+        """Return the progress as one line, with the figures that have targets; missed ones are marked.
 
-        ``pace`` is how many times as fast as the world's time it goes.
+        ``pace`` is the speed relative to real time.
         """
         team, moment, end = run.team, run.team.clock.seconds(), run.expected_end
         share = min(1.0, moment / end) if end else 0.0
@@ -69,7 +69,7 @@ class Progress:
         )
 
     def close(self) -> None:
-        """Leave the terminal as it was."""
+        """Clear the line on the terminal."""
         if self._width:
             self._out.write("\r" + " " * self._width + "\r")
             self._out.flush()

@@ -1,4 +1,4 @@
-"""What came of a run, for people and as JSON, with the line that repeats it; its figures over time, and its trace."""
+"""Report the result of a run with the command that repeats it; sample figures, and write the trace."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from sim.team.scenario import Scenario
 VERSION = 1
 MOST_SHOWN = 20
 MOST_SAMPLES = 240
-"""Samples of a run; where it takes longer than was thought, every other one is dropped."""
+"""Number of samples of a run; if a run takes longer than expected, every other one is dropped."""
 FIGURES_EVERY = 6
-"""The workloads' figures are asked for in every sixth sample only: some of them look at all there is."""
+"""Figures of workloads are taken in every sixth sample only, as some are expensive."""
 
 Series = dict[str, list[tuple[float, float]]]
 
 
 class Samples:
-    """What was there at moments of the team's time; by name, (moment, value)."""
+    """Samples of a run over the team's time: (time, value) by name."""
 
     def __init__(self) -> None:
         self.series: Series = {}
@@ -33,7 +33,7 @@ class Samples:
         self._before = (0.0, 0, 0)
 
     def looked(self, run: Run) -> None:
-        """Take a sample where it is time for one."""
+        """Take a sample if one is due."""
         now = run.team.clock.seconds()
         if now < self._next:
             return
@@ -65,7 +65,7 @@ class Samples:
 
 @dataclass(frozen=True)
 class Cost:
-    """What a run took: seconds of a processor, seconds of the wall clock, and bytes of memory at its end."""
+    """The cost of a run: processor seconds, wall clock seconds, and bytes of memory at its end."""
 
     cpu: float
     wall: float
@@ -73,13 +73,13 @@ class Cost:
 
 
 def again(scenario: str, seed: int, nodes: int | None) -> str:
-    """The line that repeats a run."""
+    """Return the command that repeats a run."""
     words = ["sim", "run", "--scenario", scenario, "--seed", str(seed)]
     return shlex.join(words if nodes is None else [*words, "--nodes", str(nodes)])
 
 
 def text(scenario: Scenario, outcome: Outcome, cost: Cost, line: str) -> str:
-    """The report for people."""
+    """Return the report as text."""
     lines = [table(outcome.figures)] if outcome.figures else []
     if outcome.is_partial:
         lines.append(f"PARTIAL   ended while {outcome.phase}, after {outcome.seconds:.1f} s; nothing above is final")
@@ -98,7 +98,7 @@ def text(scenario: Scenario, outcome: Outcome, cost: Cost, line: str) -> str:
 
 
 def packed(scenario: Scenario, outcome: Outcome, cost: Cost, line: str, series: Series) -> str:
-    """The report as JSON."""
+    """Return the report as JSON."""
     content = {
         "report": VERSION,
         "scenario": scenario.name,
@@ -118,13 +118,13 @@ def packed(scenario: Scenario, outcome: Outcome, cost: Cost, line: str, series: 
         "wall_seconds": round(cost.wall, 3),
         "resident_bytes": cost.resident,
         "faults": [str(fault) for fault in scenario.faults],
-        "series": _jagged(series),
+        "series": _finite(series),
     }
     return json.dumps(content, indent=1, allow_nan=False) + "\n"
 
 
-def _jagged(series: Series) -> dict[str, Sequence[tuple[float, float | None]]]:
-    """``series`` without what JSON does not know: None stands for what is not finite."""
+def _finite(series: Series) -> dict[str, Sequence[tuple[float, float | None]]]:
+    """Return ``series`` with None for values that are not finite, as JSON has none."""
     return {
         name: [(moment, value if abs(value) != float("inf") and value == value else None) for moment, value in points]
         for name, points in series.items()
@@ -132,25 +132,25 @@ def _jagged(series: Series) -> dict[str, Sequence[tuple[float, float | None]]]:
 
 
 MOST_LINES = 200_000
-"""Lines; after these only the last one follows, which says how many are not there."""
+"""Maximum number of lines; after them only the last line follows, with the number of omitted ones."""
 
 
 class Trace:
-    """Writes to ``out`` what a team tells (``Team.told``)."""
+    """Writes the events of a team to ``out`` (``Team.told``)."""
 
     def __init__(self, out: TextIO, most: int = MOST_LINES) -> None:
         self._out = out
         self._most = most
-        self._told = 0
+        self._count = 0
 
     def begin(self, **facts: object) -> None:
-        """Write what run this is."""
+        """Write the parameters of the run."""
         self._write({"trace": 1, **facts})
 
     def told(self, now: float, event: str, place: int, more: str) -> None:
-        """Write one event: the moment in seconds, what happened, at which place, and more about it."""
-        self._told += 1
-        if self._told > self._most:
+        """Write one event: the time in seconds, its name, its place, and details."""
+        self._count += 1
+        if self._count > self._most:
             return
         line: dict[str, object] = {"at": round(now, 6), "event": event}
         if place >= 0:
@@ -160,8 +160,8 @@ class Trace:
         self._write(line)
 
     def end(self, **facts: object) -> None:
-        """Write how it ended, and how many events are not there."""
-        self._write({"end": True, "events": self._told, "left_out": max(0, self._told - self._most), **facts})
+        """Write the last line, with the number of omitted events."""
+        self._write({"end": True, "events": self._count, "left_out": max(0, self._count - self._most), **facts})
         self._out.flush()
 
     def _write(self, line: dict[str, object]) -> None:

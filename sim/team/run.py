@@ -1,4 +1,4 @@
-"""Run: a scenario from the first node to the verdict; it may be ended at any moment, and then says what there is."""
+"""Run a scenario from the first node to the verdict; it can be stopped at any time and then gives a partial result."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ from sim.team.team import Team
 from sim.team.workload import Kinds, Workload
 
 ASKED = 10.0
-"""Seconds in which the workloads get what they ask for at the end."""
+"""Seconds that the workloads get for their final requests."""
 SLICE = 0.25
-"""Seconds of the team's time between two looks at it."""
+"""Seconds of the team's time between two calls of the observers."""
 MOST_VIOLATIONS = 1000
 NONE = 1e-9
-"""Seconds that are no time at all: what is left over from adding up steps."""
+"""Tolerance in seconds for rounding errors of summed steps."""
 LONG, SHORT, LEAST_GRAIN = 0.5, 0.1, 1e-4
-"""Real seconds that a person waits for a word at most, about; where that takes longer the grain gets finer, where it
-takes less, coarser; and how fine it gets, in seconds of the team's time."""
+"""Real seconds for one grain: above ``LONG`` the grain becomes finer, so that a user can stop the run soon, and below
+``SHORT`` coarser.  ``LEAST_GRAIN`` is the finest one in seconds of the team's time."""
 
 Phase = str
 JOINING, SETTLING, RUNNING, REPAIRING, ASKING, DONE = "joining", "settling", "running", "repairing", "asking", "done"
 Looked = Callable[["Run"], bool]
-"""Called after every slice; True ends the run."""
+"""Called after every slice; True stops the run."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a run; ``is_partial`` where it was ended before its time, in the ``phase`` that it names."""
+    """The result of a run; ``is_partial`` if it was stopped early, in the phase ``phase``."""
 
     seed: int
     phase: Phase
@@ -47,21 +47,21 @@ class Outcome:
 
     @property
     def is_partial(self) -> bool:
-        """Whether it was ended before its time."""
+        """Whether the run was stopped early."""
         return self.phase != DONE
 
     @property
     def missed(self) -> list[Figure]:
-        """The figures that are not as they should be."""
+        """The figures that miss their targets."""
         return [figure for figure in self.figures if figure.holds is False]
 
 
 class Run:
     """One run of a ``scenario``.
 
-    ``looked`` is called now and then, at moments that follow from the seed, and may end it.  ``watched`` is called more
-    often where the machine is slow, ``seconds`` being its real time, and may end it, too.  ``grown`` is called when
-    the nodes are there: from then on most of what the process has lives as long as they do.
+    ``looked`` is called after each slice, at times that follow from the seed, and may stop the run.  ``watched`` is
+    called more often on a slow machine, according to the real time ``seconds``, and may stop the run as well.
+    ``grown`` is called when all nodes exist: from then on most of the memory has their lifetime.
     """
 
     _log = Logger()
@@ -80,14 +80,14 @@ class Run:
         self.team = Team(scenario, seed)
         self.phase: Phase = JOINING
         self.began_at: float | None = None
-        """When the team stood, on its clock."""
+        """The time on the team's clock when the team was complete and had settled."""
         self.workloads: list[tuple[str, Workload]] = [
             (name, kinds[name].make(self.team, settings)) for name, settings in scenario.loads
         ]
         self.violations: list[str] = []
         join = scenario.join
         self.expected_end = join.settle + scenario.seconds + scenario.repair + (ASKED if self.workloads else 0.0)
-        """When it will have ended, on the team's clock, as far as is known."""
+        """The expected end on the team's clock."""
         self._looked = looked
         self._grown = grown
         self._watched = watched
@@ -97,7 +97,7 @@ class Run:
         self._is_ended = False
 
     def go(self) -> Outcome:
-        """Run everything; what came of it."""
+        """Run all phases and return the result."""
         phases = (
             (JOINING, self._join),
             (SETTLING, self._settle),
@@ -105,31 +105,31 @@ class Run:
             (REPAIRING, self._repair),
             (ASKING, self._ask),
         )
-        logged = cast(ILogObserver, self._logged)
-        globalLogPublisher.addObserver(logged)
+        observer = cast(ILogObserver, self._on_log_event)
+        globalLogPublisher.addObserver(observer)
         try:
             for self.phase, work in phases:
                 work()
                 if self._is_ended:
                     return self.outcome()
         finally:
-            globalLogPublisher.removeObserver(logged)
+            globalLogPublisher.removeObserver(observer)
         self.phase = DONE
         return self.outcome()
 
     def figures(self) -> list[Figure]:
-        """Every figure so far, held to the targets of the scenario."""
+        """Return every figure so far, with the targets of the scenario."""
         found = [figure for _, workload in self.workloads for figure in workload.figures()]
         targets: dict[str, Bound] = dict(self.scenario.targets)
         return [figure.against(targets[figure.name]) if figure.name in targets else figure for figure in found]
 
     def outcome(self) -> Outcome:
-        """What came of it so far."""
+        """Return the result so far."""
         team = self.team
         figures = self.figures()
         violations = [
             *self.violations,
-            *self._unheld(figures),
+            *self._unmatched_targets(figures),
             *(line for _, workload in self.workloads for line in workload.verdict()),
             *check(team.history),
         ]
@@ -144,8 +144,8 @@ class Run:
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
-    def _logged(self, event: LogEvent) -> None:
-        """A failure that a node logged, where nobody else would hear of it, is one of the team."""
+    def _on_log_event(self, event: LogEvent) -> None:
+        """Record a failure that a node logged as a violation, as no client would notice it."""
         failure = event.get("log_failure")
         if failure is not None and len(self.violations) < MOST_VIOLATIONS:
             name, moment = failure.type.__name__, self.team.clock.seconds()
@@ -155,19 +155,19 @@ class Run:
         team, within = self.team, self.scenario.join.within
         last = team.come()
         self.expected_end += last
-        self._pass(last)
-        self._pass(within, until=team.is_standing)
+        self._advance(last)
+        self._advance(within, until=team.is_standing)
         self.expected_end += team.clock.seconds() - last
         outside = len(team.living) - len(team.inside())
         if outside and not self._is_ended:
-            self.violations.append(f"join: {outside} nodes are not in {within:g} s after the last came")
+            self.violations.append(f"join: {outside} nodes have not joined {within:g} s after the last one started")
 
     def _settle(self) -> None:
         self._grown()
-        self._pass(self.scenario.join.settle)
+        self._advance(self.scenario.join.settle)
 
     def _act(self) -> None:
-        """Let faults and sessions befall the team while the workloads act."""
+        """Apply faults and sessions while the workloads run."""
         scenario, clock = self.scenario, self.team.clock
         self.began_at = began = clock.seconds()
         self._faults.begin()
@@ -176,28 +176,28 @@ class Run:
             if clock.seconds() >= began + scenario.lead - NONE:
                 for _, workload in self.workloads:
                     workload.step()
-            self._pass(min(scenario.step, end - clock.seconds()))
+            self._advance(min(scenario.step, end - clock.seconds()))
 
     def _repair(self) -> None:
         if self.scenario.repair:
             self._faults.end()
-        self._pass(self.scenario.repair)
+        self._advance(self.scenario.repair)
 
     def _ask(self) -> None:
         if self.scenario.repair:
             self.team.history.note(Settled)
         for _, workload in self.workloads:
             workload.settled()
-        self._pass(ASKED if self.workloads else 0.0)
+        self._advance(ASKED if self.workloads else 0.0)
 
-    def _unheld(self, figures: list[Figure]) -> list[str]:
-        """The targets that no figure was held to."""
+    def _unmatched_targets(self, figures: list[Figure]) -> list[str]:
+        """Return the targets that match no figure."""
         names = [figure.name for figure in figures]
-        unheld = [] if self.phase != DONE else [name for name, _ in self.scenario.targets if name not in names]
-        return [f"targets: nothing measured {name!r}; there are {', '.join(names) or 'none'}" for name in unheld]
+        unmatched = [] if self.phase != DONE else [name for name, _ in self.scenario.targets if name not in names]
+        return [f"targets: nothing measured {name!r}; there are {', '.join(names) or 'none'}" for name in unmatched]
 
-    def _pass(self, seconds: float, until: Callable[[], bool] = lambda: False) -> None:
-        """Let time pass, a slice after the other."""
+    def _advance(self, seconds: float, until: Callable[[], bool] = lambda: False) -> None:
+        """Let time pass in slices."""
         clock = self.team.clock
         end = clock.seconds() + seconds
         while not self._is_ended and clock.seconds() < end - NONE and not until():
@@ -205,15 +205,15 @@ class Run:
             self._is_ended = self._is_ended or self._looked(self)
 
     def _slice(self, seconds: float) -> None:
-        """Let time pass, in grains; what happens does not depend on how fine they are."""
+        """Let time pass in grains, whose size does not affect the result."""
         clock = self.team.clock
         end = clock.seconds() + seconds
         while not self._is_ended and clock.seconds() < end:
             began = self._seconds()
             try:
                 clock.run_until(min(end, clock.seconds() + self._grain))
-            except Exception:  # a reactor would go on, too
-                self._log.failure("a call of the team failed")
+            except Exception:  # a reactor would continue as well
+                self._log.failure("a scheduled call of the team failed")
             self._is_ended = self._watched(self)
             took = self._seconds() - began
             if took > LONG:

@@ -1,7 +1,7 @@
-"""Schedule: one random run of a fleet under loss, partitions, kills and restarts, with workloads that watch it.
+"""Run one random schedule of nodes with losses, partitions, kills and restarts, observed by workloads.
 
-Everything follows from the seed.  After the faults everything heals, those that are to come back come back, and when
-the repair interval is over the workloads give their verdicts.
+Everything follows from the seed.  Finally all faults end and killed nodes restart, and after the repair interval the
+workloads give their verdicts.
 """
 
 from __future__ import annotations
@@ -20,68 +20,67 @@ from sim.team.workload import Workload
 from sim.team.world import Fleet
 
 STRANDED = 0.15
-"""The share of schedules in which a cut leaves a few with newcomers of their own."""
+"""Share of schedules in which a partition separates a minority together with newcomers."""
 STEP = 0.5
 SETTLE = 45.0
-"""Seconds after which a healed team is as it should be: tries, three rounds of mending, and a struck member."""
+"""Repair interval in seconds: retries, three rounds of anti-entropy, and the removal of a dead member."""
 
 
 class Schedule:
-    """The run of ``seed``: a fleet, its weather and its faults.
+    """The run of ``seed``: nodes, network conditions and faults.
 
-    ``workloads`` are made with the schedule when the fleet stands.  ``rng`` is for the first of them; the others have
-    dice of their own, so that the seeds that show a bug go on showing it.  ``world`` is what makes the nodes; ``trim``
-    says what is left of it.
+    ``workloads`` are made when the nodes exist.  ``rng`` belongs to the first workload; the others have their own
+    generators, so that a seed that shows a bug keeps showing it.  ``world`` makes the nodes; ``trim`` reduces the run.
     """
 
     def __init__(self, seed: int, world: type[Fleet] = Fleet, trim: Trim = WHOLE) -> None:
         self.seed = seed
         self.trim = trim
         self.rng = random.Random(f"invariants/{seed}")
-        dice = random.Random(f"faults/{seed}")
-        self.n = dice.choice([3, 4, 5, 5, 6, 7, 9, 10, 11])
-        self.seconds = dice.choice([20.0, 30.0, 45.0])
+        generator = random.Random(f"faults/{seed}")
+        self.n = generator.choice([3, 4, 5, 5, 6, 7, 9, 10, 11])
+        self.seconds = generator.choice([20.0, 30.0, 45.0])
         self.fleet = world(self.n, seed, Weather(delay_s=0.002))
         self.history = self.fleet.history
-        self.liar: int | None = dice.randrange(self.n) if dice.random() < 0.2 else None
+        self.liar: int | None = generator.randrange(self.n) if generator.random() < 0.2 else None
         self.weather = Weather(
-            delay_s=dice.choice([0.001, 0.01, 0.05]),
-            jitter_s=dice.choice([0.0, 0.01]),
-            loss=dice.choice([0.0, 0.0, 0.05, 0.2]),
-            duplicate=dice.choice([0.0, 0.1]),
-            reorder=dice.choice([0.0, 0.2]),
+            delay_s=generator.choice([0.001, 0.01, 0.05]),
+            jitter_s=generator.choice([0.0, 0.01]),
+            loss=generator.choice([0.0, 0.0, 0.05, 0.2]),
+            duplicate=generator.choice([0.0, 0.1]),
+            reorder=generator.choice([0.0, 0.2]),
         )
-        self.faults = self._faults(dice)
+        self.faults = self._faults(generator)
         if trim.calm:
             self.weather = Weather(delay_s=self.weather.delay_s)
-        dice = random.Random(f"stranded/{seed}")
-        if dice.random() < STRANDED and self.n <= 7:
-            self.faults += self._stranded(dice)
+        generator = random.Random(f"stranded/{seed}")
+        if generator.random() < STRANDED and self.n <= 7:
+            self.faults += self._minority_faults(generator)
         self.seconds = trim.within(self.seconds)
         self.down: set[int] = set()
-        """The places whose nodes are to come back."""
+        """The places whose nodes will restart."""
 
     def alive(self) -> list[int]:
-        """The places whose nodes run."""
+        """Return the places with running nodes."""
         return self.fleet.alive()
 
     def node(self, place: int) -> EntangledNode:
-        """The node of a place, in its present life."""
+        """Return the node at a place in its present life."""
         return self.fleet.nodes[place]
 
     def addresses(self, places: Sequence[int]) -> list[Address]:
-        """Where those places listen."""
+        """Return the addresses of these places."""
         return [self.fleet.address(place) for place in places]
 
     def run(self, workloads: Sequence[Workload]) -> list[str]:
-        """Run everything; the violations, a line each."""
+        """Run the schedule; returns the violations, one line each."""
         fleet = self.fleet
         fleet.run(2.0)
         fleet.board.weather = self.weather
         timeline, now = Timeline(self.faults, self.trim), 0.0
         while now < self.seconds:
             for fault, is_end in timeline.due(now):
-                (self._end if is_end else self._begin)(fault)
+                (self._end_fault if is_end else self._start_fault)(fault)
             for workload in workloads:
                 workload.step()
             fleet.run(STEP)
@@ -100,49 +99,49 @@ class Schedule:
         return found + check(self.history)
 
     def restart(self, place: int) -> None:
-        """Let the node of a place live again, on the store of its former life."""
+        """Restart the node of a place with the store of its former life."""
         self.down.discard(place)
         others = sorted({*self.alive(), place})
         self.fleet.restart(place, [one for one in self.rng.sample(others, min(2, len(others))) if one != place])
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
-    def _faults(self, dice: random.Random) -> list[TimedFault]:
+    def _faults(self, generator: random.Random) -> list[TimedFault]:
         places, faults = list(range(self.n)), []
-        # As many may die for good as a majority can do without, one quorum of the smallest record kept.
-        mortal = dice.sample(places, max(0, (min(self.n, 8) - 1) // 2))
-        for _ in range(dice.randrange(1, 6)):
-            at = dice.uniform(0.0, self.seconds * 0.8)
-            until = at + dice.choice([0.5, 2.0, 8.0, 20.0])
-            kind = dice.choice(["cut", "cut", "one way", "kill", "kill", "kill all", "die"])
+        # Permanent failures never exceed a minority of the smallest replica set.
+        mortal = generator.sample(places, max(0, (min(self.n, 8) - 1) // 2))
+        for _ in range(generator.randrange(1, 6)):
+            at = generator.uniform(0.0, self.seconds * 0.8)
+            until = at + generator.choice([0.5, 2.0, 8.0, 20.0])
+            kind = generator.choice(["cut", "cut", "one way", "kill", "kill", "kill all", "die"])
             if kind == "cut":
-                chosen = dice.sample(places, dice.randrange(1, self.n))
+                chosen = generator.sample(places, generator.randrange(1, self.n))
             elif kind == "one way":
-                chosen = dice.sample(places, 2)
+                chosen = generator.sample(places, 2)
             elif kind == "kill":
-                chosen = dice.sample(places, dice.randrange(1, 1 + self.n // 2))
+                chosen = generator.sample(places, generator.randrange(1, 1 + self.n // 2))
             elif kind == "kill all":
-                chosen = places if dice.random() < 0.3 else places[:1]
+                chosen = places if generator.random() < 0.3 else places[:1]
             else:
-                chosen = [mortal.pop()] if mortal and dice.random() < 0.5 else []
+                chosen = [mortal.pop()] if mortal and generator.random() < 0.5 else []
             faults.append(TimedFault(at, until, kind, tuple(chosen)))
         return faults
 
-    def _stranded(self, dice: random.Random) -> list[TimedFault]:
-        """Less than half are cut off, and so many newcomers join them that together they are more than half."""
-        few = dice.sample(range(self.n), (self.n - 1) // 2)
+    def _minority_faults(self, generator: random.Random) -> list[TimedFault]:
+        """Cut off a minority, which newcomers join until they are a majority together."""
+        few = generator.sample(range(self.n), (self.n - 1) // 2)
         newcomers = range(self.n, 2 * self.n - 2 * len(few) + 1)
-        at = dice.uniform(2.0, self.seconds * 0.5)
-        faults = [TimedFault(at, at + dice.choice([8.0, 15.0]), "cut", (*few, *newcomers))]
-        first = at + dice.choice([0.5, 2.0, 5.0])
+        at = generator.uniform(2.0, self.seconds * 0.5)
+        faults = [TimedFault(at, at + generator.choice([8.0, 15.0]), "cut", (*few, *newcomers))]
+        first = at + generator.choice([0.5, 2.0, 5.0])
         return faults + [TimedFault(first + n, first + n, "join", (place, *few)) for n, place in enumerate(newcomers)]
 
-    def _begin(self, fault: TimedFault) -> None:
+    def _start_fault(self, fault: TimedFault) -> None:
         board = self.fleet.board
         if fault.kind == "join":
             known: Sequence[int] = fault.places[1:]
             if not {*self.alive(), *self.down}.intersection(known):
-                known = self.alive()[:1]  # who knows nobody but the dead never gets in
+                known = self.alive()[:1]  # a newcomer that knows only dead nodes could not join
             self.fleet.restart(len(self.fleet.nodes), known)
             self.n += 1
         elif fault.kind == "cut":
@@ -157,7 +156,7 @@ class Schedule:
                         self.down.add(place)
                     self.fleet.kill(place)
 
-    def _end(self, fault: TimedFault) -> None:
+    def _end_fault(self, fault: TimedFault) -> None:
         if fault.kind in ("cut", "one way"):
             self.fleet.board.heal()
         elif fault.kind not in ("die", "join"):

@@ -1,8 +1,8 @@
-"""Session: how long nodes stay, and how long they are away, as drawn from a distribution with a given median.
+"""Draw durations of sessions and absences from distributions with a given median.
 
-A team that is watched from some moment on has been alive before: what is left of a node's session then is not a fresh
-draw, for long sessions are the ones that are met (the inspection paradox).  ``left`` draws that, so that the rate of
-churn is the same from the first second to the last.
+When an observation starts, sessions are already in progress: their remaining durations are not fresh draws, as long
+sessions are more likely to be observed (the inspection paradox).  ``left`` draws these, so that the churn rate is the
+same from the first second on.
 """
 
 from __future__ import annotations
@@ -12,36 +12,36 @@ import random
 from dataclasses import dataclass
 
 SHAPES = {"exponential": 1.0, "weibull": 0.5}
-"""Weibull with a shape of 0.5 is what measurements of file-sharing networks come to: most leave soon, some stay."""
+"""Weibull with a shape of 0.5 fits measurements of file-sharing networks: most nodes leave soon, some stay long."""
 KINDS = (*SHAPES, "fixed")
 
 
 @dataclass(frozen=True)
 class Session:
-    """Durations of a ``kind``, half of them shorter than ``median`` seconds."""
+    """A distribution of the given ``kind`` with the median ``median`` in seconds."""
 
     kind: str
     median: float
 
     @property
     def mean(self) -> float:
-        """The mean duration, in seconds."""
+        """The mean duration in seconds."""
         if self.kind == "fixed":
             return self.median
         return self._scale * math.gamma(1 + 1 / SHAPES[self.kind])
 
     def drawn(self, rng: random.Random) -> float:
-        """How long one lasts, in seconds."""
+        """Draw a duration in seconds."""
         if self.kind == "fixed":
             return self.median
         return float(self._scale * rng.expovariate(1.0) ** (1 / SHAPES[self.kind]))
 
     def left(self, rng: random.Random) -> float:
-        """How long one that is met under way still lasts."""
+        """Draw the remaining duration of a session in progress, in seconds."""
         if self.kind == "fixed":
             return self.median * rng.random()
         shape = SHAPES[self.kind]
-        # Weighted by its own length, the exponential behind the Weibull becomes a gamma variable.
+        # Weighted by length, the exponential behind the Weibull becomes a gamma variable.
         whole = self._scale * rng.gammavariate(1 + 1 / shape, 1.0) ** (1 / shape)
         return float(whole * rng.random())
 

@@ -1,6 +1,6 @@
-"""Shrink: the least of a failing run that still fails in the same way: fewest faults, calm, fewest workloads, shortest.
+"""Shrink a failing run: fewest faults, no network impairments, fewest workloads, shortest duration.
 
-It knows no run: it is told how many faults there were, and whether what is left of a run still fails.
+This module knows nothing of runs: the caller gives the number of faults, and tells whether a reduced run still fails.
 """
 
 from __future__ import annotations
@@ -11,15 +11,15 @@ from dataclasses import dataclass, replace
 Fails = Callable[["Trim"], bool]
 
 SHARES = (0.125, 0.25, 0.5, 0.75)
-"""The shares of its length to which a run is cut, the shortest first."""
+"""The shares of its length to which a run is shortened, shortest first."""
 
 
 @dataclass(frozen=True)
 class Trim:
-    """What is left of a run.
+    """A reduction of a run.
 
-    ``keep`` are the numbers of the faults that happen (None: all), ``calm`` takes the weather away, ``only`` are the
-    workloads (none named: those of the seed), and faults and workloads end after ``seconds`` (None: as drawn).
+    ``keep`` are the indices of the remaining faults (None: all), ``calm`` removes network impairments, ``only`` are the
+    remaining workloads (empty: those of the seed), and faults and workloads end after ``seconds`` (None: as drawn).
     """
 
     keep: tuple[int, ...] | None = None
@@ -28,11 +28,11 @@ class Trim:
     seconds: float | None = None
 
     def keeps(self, number: int) -> bool:
-        """Whether a fault happens."""
+        """Return whether a fault remains."""
         return self.keep is None or number in self.keep
 
     def within(self, seconds: float) -> float:
-        """How long a run lasts that was to last so many ``seconds``."""
+        """Return the reduced duration of a run of ``seconds``."""
         return seconds if self.seconds is None else min(seconds, self.seconds)
 
 
@@ -40,10 +40,10 @@ WHOLE = Trim()
 
 
 def shrunk(whole: Trim, faults: int, workloads: Sequence[str], seconds: float, fails: Fails) -> Trim:
-    """The least that fails, of a run with so many ``faults`` which lasts ``seconds``.
+    """Return the smallest failing reduction of a run with ``faults`` faults that lasts ``seconds``.
 
-    First the faults are dropped, then the weather, the workloads, and time.  ``fails`` may begin to say False, where
-    there is no more time to try: then it stays at what failed last.
+    Faults are removed first, then network impairments, workloads, and time.  ``fails`` may return False when its time
+    budget is used up; the result is then the last reduction that failed.
     """
     kept = fewest(range(faults) if whole.keep is None else whole.keep, lambda keep: fails(replace(whole, keep=keep)))
     left = replace(whole, keep=kept)
@@ -62,9 +62,9 @@ def _with(trim: Trim, workloads: Sequence[str], numbers: Sequence[int]) -> Trim:
 
 
 def fewest(numbers: Sequence[int], fails: Callable[[tuple[int, ...]], bool]) -> tuple[int, ...]:
-    """So few of ``numbers`` that without any one of them it no longer fails (Zeller and Hildebrandt's ddmin, 2002).
+    """Return a 1-minimal subset of ``numbers`` that still fails (ddmin, Zeller and Hildebrandt, 2002).
 
-    Halves are dropped first, then ever smaller parts; the empty set is tried before all.
+    The empty set is tried first, then halves are removed, then smaller and smaller parts.
     """
     kept, parts = tuple(numbers), 2
     if not kept or fails(()):

@@ -1,4 +1,4 @@
-"""Standing: whether those who live are in the network and know others; the least that any run can be held to."""
+"""Workload that checks the minimum: living nodes have joined the network and have contacts."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from sim.team.workload import Kind, Workload
 
 @dataclass(frozen=True)
 class StandingSettings:
-    """``[load.standing]``: nothing can be set."""
+    """``[load.standing]``: no settings."""
 
 
 class Standing(Workload):
-    """Looks at the team; it asks nobody anything."""
+    """A workload that observes the team and sends nothing."""
 
     def __init__(self, team: Team, settings: StandingSettings) -> None:
         self._team = team
 
     def verdict(self) -> list[str]:
-        """Who is in the network and knows nobody."""
+        """Return the nodes that have joined but have no contacts."""
         team = self._team
         lonely = [p for p in sorted(team.inside()) if len(team.living) > 1 and not team.entangled(p).overlay.contacts()]
-        return [f"standing: node {place} knows nobody" for place in lonely]
+        return [f"standing: node {place} has no contacts" for place in lonely]
 
     def figures(self) -> list[Figure]:
-        """How many there are, and what they sent."""
+        """Return the numbers of nodes, and the traffic."""
         team = self._team
         sent = sum(team.traffic(place).sent_bytes for place in team.places)
         seconds = team.clock.seconds() * max(1, len(team.living))

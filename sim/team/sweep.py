@@ -1,7 +1,7 @@
-"""Sweep: the same run with many seeds, on all cores of this machine or on several machines; results in their order.
+"""Run a function for many seeds, on all cores of this machine or on several machines; results keep their order.
 
-Several machines are joined by Dask (the extra ``[sweep]``): ``dask scheduler`` on one, ``dask worker ADDRESS --nworkers
-auto`` on each, started in a tree that is the same as here, which is checked before anything is run.
+Several machines are connected by Dask (the extra ``[sweep]``): ``dask scheduler`` on one, and ``dask worker ADDRESS
+--nworkers auto`` on each, started in the same source tree as here, which is verified before anything runs.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ T = TypeVar("T")
 
 ROOT = Path(__file__).resolve().parents[2]
 ROOMS = ("formats", "middleware", "agents", "drivers", "sim", "benchmarks", "tests")
-"""What a run is made of; other trees may differ in the rest."""
+"""The packages that affect a run; other files of the trees may differ."""
 AHEAD = 4
-"""So many runs are given out for each worker, that none has to wait for its next one."""
+"""Number of runs submitted in advance per worker, so that none is idle."""
 
 _one_at_a_time = threading.Lock()
 _is_spared: list[bool] = []
 
 
 def sweep(seeds: Sequence[int], one: Callable[[int], T], jobs: int, scheduler: str = "") -> Iterator[T]:
-    """What ``one`` gives for each seed, ``jobs`` at a time, or as many as the workers of a ``scheduler`` can.
+    """Yield the result of ``one`` for each seed, with ``jobs`` processes or with the workers of a ``scheduler``.
 
-    Raises ``BadSetting`` where the scheduler cannot be used.
+    Raises ``BadSetting`` if the scheduler cannot be used.
     """
     if scheduler:
         yield from _on_machines(seeds, one, scheduler)
@@ -43,20 +43,19 @@ def sweep(seeds: Sequence[int], one: Callable[[int], T], jobs: int, scheduler: s
         spare_the_collector()
         yield from map(one, seeds)
     else:
-        # Not by forking: this may run in a process that has threads and a reactor's signal handlers, which a fork
-        # inherits.
+        # Spawned, not forked: a fork would inherit threads and a reactor's signal handlers.
         with multiprocessing.get_context("spawn").Pool(jobs, _begin) as pool:
             yield from pool.imap(one, seeds)
 
 
 def spare_the_collector() -> None:
-    """Look for garbage rarely: a run makes much that lives as long as it."""
+    """Collect garbage rarely, as most objects of a run live until its end."""
     gc.freeze()
     gc.set_threshold(200_000, 20, 20)
 
 
 def fingerprint() -> str:
-    """What the runs of this tree are made of: a hash over its sources, and the version of Python."""
+    """Return a hash of the sources that affect a run, and the version of Python."""
     hashed = hashlib.blake2b(digest_size=8)
     for path in sorted(path for room in ROOMS for path in (ROOT / room).rglob("*.py")):
         hashed.update(str(path.relative_to(ROOT)).encode() + path.read_bytes())
@@ -64,13 +63,13 @@ def fingerprint() -> str:
 
 
 def _begin() -> None:
-    """Begin in a process of its own: whoever gave the order ends it, not the keyboard."""
+    """Initialize a worker process: it ignores Ctrl-C, as its parent ends it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     spare_the_collector()
 
 
 def _alone(one: Callable[[int], T], seed: int) -> T:
-    """Run one, and no other beside it in this process: runs change what they share there."""
+    """Run ``one`` exclusively in this process, as runs modify shared state."""
     with _one_at_a_time:
         if not _is_spared:
             spare_the_collector()
@@ -86,14 +85,14 @@ def _on_machines(seeds: Sequence[int], one: Callable[[int], T], address: str) ->
     try:
         client: Any = Client(address, timeout="10s", set_as_default=False)
     except (OSError, ValueError, TypeError) as error:
-        raise _bad(f"nobody answers at {address} ({error})", "start one: dask scheduler") from None
+        raise _bad(f"no scheduler answers at {address} ({error})", "start one: dask scheduler") from None
     with client:
         prints: dict[str, str] = client.run(fingerprint)
         if not prints:
             raise _bad(f"{address} has no workers", f"start some: dask worker {address} --nworkers auto --nthreads 1")
         here = fingerprint()
         if others := sorted(worker for worker, known in prints.items() if known != here):
-            raise _bad(f"{', '.join(others)} would run another tree than this one", "update the tree there")
+            raise _bad(f"the source trees of {', '.join(others)} differ from this one", "update them")
         ahead: deque[Any] = deque()
         for seed in seeds:
             ahead.append(client.submit(partial(_alone, one), seed, pure=False))

@@ -1,7 +1,7 @@
-"""Team: places with nodes in their present lives, on one turned clock and one switchboard.
+"""A simulated team: places with nodes in their present lives, with one virtual clock and one switchboard.
 
-The nodes are those that ship; only clock, wire, store and dice are the simulation's.  Everything follows from the
-scenario and the seed: ``digest`` is the same wherever they are, and whatever else the process does.
+The nodes are production code; only clock, network, store and random generators are simulated.  Everything follows from
+the scenario and the seed: ``digest`` is the same on every machine, whatever else the process does.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ from sim.team.world import CAPABILITIES, PORT, TEAM, World
 
 Node = EntangledNode | SwarmNode
 Told = Callable[[float, str, int, str], object]
-"""Called with the moment, what happened, at which place (-1: at none), and more about it."""
+"""Called with the time, the event, its place (-1: none), and details."""
 
 
 def core(node: Node) -> EntangledNode:
-    """The peer of the network that a node is, or has."""
+    """Return the library's node that ``node`` is or contains."""
     return node.entangled if isinstance(node, SwarmNode) else node
 
 
 class Place:
-    """What stays at a place from life to life; ``step`` is how wrong its wall clock is."""
+    """The state of a place that is kept from life to life; ``step`` is the error of its wall clock."""
 
     __slots__ = ("address", "identity", "store", "traffic", "step", "rate", "home", "machine", "entered")
 
@@ -54,11 +54,11 @@ class Place:
         self.home: Nat | None = None
         self.machine: Machine | None = None
         self.entered: list[Deferred[bool]] | None = None
-        """Those who wait for it to be in the network; None: it is."""
+        """Deferreds that wait for the node to join; None if it has joined."""
 
 
 class Team(World):
-    """The team of a ``scenario``; nobody is there before ``stand`` or ``come``."""
+    """The team of a ``scenario``; no node exists before ``stand`` or ``come``."""
 
     seed: int
     living: dict[int, Node]
@@ -71,50 +71,50 @@ class Team(World):
         self.board.link = self.link
         self.told: list[Told] = []
         self._places: list[Place] = []
-        self._dice = self.generator("team")
+        self._rng = self.generator("team")
         self._inside: list[int] = []
         self._inside_at: dict[int, int] = {}
         self._hash = hashlib.blake2b(digest_size=32)
         for _ in range(scenario.nodes):
             self._new_place()
 
-    # -- who is there -----------------------------------------------------------------------------------------------
+    # -- members ----------------------------------------------------------------------------------------------------
 
     @property
     def places(self) -> range:
-        """Every place that ever was."""
+        """All places, also those without a living node."""
         return range(len(self._places))
 
     def inside(self) -> list[int]:
-        """The places whose nodes are in the network, in no order that means anything; not to be changed."""
+        """Return the places whose nodes have joined, in no particular order; must not be modified."""
         return self._inside
 
     def address(self, place: int) -> Address:
-        """Where the node of a place listens."""
+        """Return the address of the node at a place."""
         return self._places[place].address
 
     def node(self, place: int) -> Node:
-        """The node of a place in its present life; ``KeyError`` where there is none."""
+        """Return the node at a place in its present life; raises ``KeyError`` if there is none."""
         return self.living[place]
 
     def entangled(self, place: int) -> EntangledNode:
-        """The peer of the network that the node of a place is, or has."""
+        """Return the library's node at a place."""
         return core(self.living[place])
 
     def identity(self, place: int) -> Identity:
-        """Who the node of a place is."""
+        """Return the identity of the node at a place."""
         return self._places[place].identity
 
     def traffic(self, place: int) -> Traffic:
-        """What the node of a place has sent and taken in, in all its lives."""
+        """Return the traffic of the node at a place over all its lives."""
         return self._places[place].traffic
 
     def place(self, place: int) -> Place:
-        """What stays at a place from life to life."""
+        """Return the state of a place that is kept from life to life."""
         return self._places[place]
 
     def entered(self, place: int) -> Deferred[bool]:
-        """Fire when the node of a place is in the network: with True, or with False if it ends before."""
+        """Fire with True when the node at a place has joined, or with False if it ends before."""
         done: Deferred[bool] = Deferred()
         waiting = self._places[place].entered
         if place not in self.living:
@@ -128,26 +128,26 @@ class Team(World):
     # -- time -------------------------------------------------------------------------------------------------------
 
     def at(self, seconds: float, call: Callable[[], object]) -> IDelayedCall:
-        """Call in so many seconds from now."""
+        """Schedule a call after ``seconds``."""
         return self.clock.callLater(seconds, call)
 
     def tell(self, event: str, place: int = -1, more: str = "") -> None:
-        """Write down what happened; it is part of the digest."""
+        """Report an event, which becomes part of the digest."""
         now = self.clock.seconds()
         self._hash.update(f"{now!r} {event} {place} {more}\n".encode())
         for told in self.told:
             told(now, event, place, more)
 
     def digest(self) -> str:
-        """The hash of every datagram that was delivered and of everything that was told, in hex."""
+        """Return the hash of every delivered datagram and every reported event, in hex."""
         whole = self._hash.copy()
         whole.update(self.board.digest().encode())
         return whole.hexdigest()
 
-    # -- coming together --------------------------------------------------------------------------------------------
+    # -- joining ----------------------------------------------------------------------------------------------------
 
     def come(self) -> float:
-        """Let the team come, as its scenario says; returns in how many seconds the last one comes."""
+        """Start the nodes as the scenario says; returns the seconds until the last one starts."""
         join, moment = self.scenario.join, 0.0
         for place in self.places:
             if place and (
@@ -160,11 +160,11 @@ class Team(World):
         return moment
 
     def is_standing(self) -> bool:
-        """Whether every node that lives is in the network."""
+        """Return whether every living node has joined."""
         return len(self._inside) == len(self.living)
 
     def stand(self) -> None:
-        """Let the team come and settle; who is not in by then is still trying."""
+        """Start the nodes and let the team settle; nodes that have not joined by then keep trying."""
         join = self.scenario.join
         self.run(self.come())
         end = self.clock.seconds() + join.within
@@ -175,15 +175,15 @@ class Team(World):
     # -- lives ------------------------------------------------------------------------------------------------------
 
     def start(self, place: int, known: Sequence[int] | None = None) -> Node:
-        """The next life of the node of a place; it joins through the ``known`` places (None: some that are in)."""
+        """Start the next life of a node; it joins through the ``known`` places (None: some joined ones)."""
         if place in self.living:
-            raise ValueError(f"the node of place {place} lives")
+            raise ValueError(f"the node at place {place} is alive")
         here = self._places[place]
         if self.life[place]:
             here.store = next_life(here.store, self._store(place), self.clock.seconds())
         here.entered = []
-        through = [self.address(other) for other in (self._known(place) if known is None else known)]
-        node = self._made(place, here, through)
+        through = [self.address(other) for other in (self._draw_known(place) if known is None else known)]
+        node = self._make_node(place, here, through)
         self.tell("born", place, here.identity.node_id.hex())
         self.begin_life(place, node, here.identity)
         life = self.life[place]
@@ -193,21 +193,21 @@ class Team(World):
         else:
             node.start()
             joined = node.join(through)
-        joined.addCallback(lambda _: self._is_in(place, life))
-        # It may be killed before it has found anybody.
+        joined.addCallback(lambda _: self._on_joined(place, life))
+        # The node may be killed before it has joined.
         joined.addErrback(lambda failure: failure.trap(NotRunning))
-        joined.addErrback(lambda failure: self._log.failure("while joining", failure))
+        joined.addErrback(lambda failure: self._log.failure("joining failed", failure))
         return node
 
     def add(self, known: Sequence[int] | None = None) -> int:
-        """A newcomer, at a place of its own; returns that."""
+        """Start a new node at a new place; returns the place."""
         place = self._new_place()
         self.start(place, known)
         return place
 
     def kill(self, place: int) -> None:
-        """End a node as a loss of power does; its disk is left as it is."""
-        node = self._ends(place, "killed")
+        """Kill a node like a loss of power; its disk stays as it is."""
+        node = self._end_node(place, "killed")
         here = self._places[place]
         if here.machine is not None:
             here.machine.die()
@@ -216,12 +216,12 @@ class Team(World):
         node.vanish()
 
     def leave(self, place: int) -> None:
-        """End a node with a goodbye; one that stands still can say none, and is killed."""
+        """Let a node leave gracefully; a frozen one is killed."""
         machine = self._places[place].machine
         if machine is not None and machine.is_still:
             self.kill(place)
             return
-        node = self._ends(place, "left")
+        node = self._end_node(place, "left")
         if isinstance(node, SwarmNode):
             node.stopService()
         else:
@@ -229,20 +229,20 @@ class Team(World):
         self._places[place].store.close()
 
     def replace(self, place: int) -> None:
-        """Let somebody else have the place of a node that has ended: another identity, and an empty store."""
+        """Give the place of an ended node to a new one, with another identity and an empty store."""
         if place in self.living:
-            raise ValueError(f"the node of place {place} lives")
+            raise ValueError(f"the node at place {place} is alive")
         here = self._places[place]
         here.identity = self._identity(place, self.life[place])
-        here.store = self._store(place)  # which is empty, and so is what is left of it
+        here.store = self._store(place)  # empty, so the next life starts with nothing
 
     def freeze(self, place: int) -> None:
-        """Let a node stand still; raises ``ValueError`` where the scenario gives it no machine of its own."""
+        """Freeze a node; raises ``ValueError`` if the scenario has no simulated machines."""
         self._machine(place).freeze()
         self.tell("frozen", place)
 
     def thaw(self, place: int) -> None:
-        """Let a node that stands still go on."""
+        """Let a frozen node continue."""
         self.tell("thawed", place)
         self._machine(place).thaw()
 
@@ -257,15 +257,15 @@ class Team(World):
         place = len(self._places)
         address = Address(f"10.{place >> 16}.{place >> 8 & 255}.{place & 255}", PORT)
         here = Place(address, self._identity(place, 0), self._store(place))
-        scenario, dice = self.scenario, self.generator(f"place/{place}")
+        scenario, place_rng = self.scenario, self.generator(f"place/{place}")
         if scenario.clocks.drift:
-            here.rate = 1 + dice.uniform(-1, 1) * scenario.clocks.drift
+            here.rate = 1 + place_rng.uniform(-1, 1) * scenario.clocks.drift
         if scenario.clocks.wall:
-            here.step = dice.uniform(-1, 1) * scenario.clocks.wall
+            here.step = place_rng.uniform(-1, 1) * scenario.clocks.wall
         nat = scenario.nat
-        if nat.share and place >= scenario.join.known and dice.random() < nat.share:
+        if nat.share and place >= scenario.join.known and place_rng.random() < nat.share:
             kind: Any = nat.kinds[place % len(nat.kinds)]
-            here.home = self.board.router(Nat(kind, f"100.{place >> 16}.{place >> 8 & 255}.{place & 255}", dice))
+            here.home = self.board.router(Nat(kind, f"100.{place >> 16}.{place >> 8 & 255}.{place & 255}", place_rng))
         self._places.append(here)
         return place
 
@@ -273,16 +273,16 @@ class Team(World):
         return Identity(self.generator(f"identity/{place}/{lives}").randbytes(32))
 
     def _store(self, place: int) -> Memory:
-        return Disk(self.clock, self._dice) if self.scenario.has_disks else Memory()
+        return Disk(self.clock, self._rng) if self.scenario.has_disks else Memory()
 
-    def _made(self, place: int, here: Place, known: Sequence[Address]) -> Node:
+    def _make_node(self, place: int, here: Place, known: Sequence[Address]) -> Node:
         port = self.board.network(*here.address, here.home, here.traffic)
         network: Network = port
         clock: IReactorTime = self.clock
         if self.scenario.has_machines:
             clock = here.machine = Machine(self.clock, here.rate)
             network = MachineNetwork(here.machine, port)
-        rng = self.generator(f"{place}/{self.life[place] + 1}")  # dice never fall as those of a former life
+        rng = self.generator(f"{place}/{self.life[place] + 1}")  # never the numbers of a former life
 
         def wall() -> float:
             return self.clock.seconds() + here.step
@@ -293,16 +293,16 @@ class Team(World):
         device = Device("", f"dog{place}", capabilities=CAPABILITIES)
         return SwarmNode(device, here.identity, TEAM, known, network, here.store, clock, rng, wall, lease)
 
-    def _known(self, place: int) -> list[int]:
-        """Whom a node knows: some that are in the network, and first of all the first one."""
+    def _draw_known(self, place: int) -> list[int]:
+        """Return the places that a new node knows: some that have joined, or the first one."""
         others = self._inside if self._inside else [other for other in list(self.living)[:1] if other != place]
         count = min(self.scenario.join.known, len(others))
-        if self.scenario.nat.share:  # who is behind a router cannot be written to by strangers
+        if self.scenario.nat.share:  # nodes behind a router cannot be reached without an introduction
             others = [other for other in others if self._places[other].home is None]
             count = min(count, len(others))
-        return self._dice.sample(others, count)
+        return self._rng.sample(others, count)
 
-    def _is_in(self, place: int, life: int) -> None:
+    def _on_joined(self, place: int, life: int) -> None:
         here = self._places[place]
         if self.life[place] != life or place not in self.living or here.entered is None:
             return
@@ -313,7 +313,7 @@ class Team(World):
         for done in waiting:
             done.callback(True)
 
-    def _ends(self, place: int, how: str) -> Node:
+    def _end_node(self, place: int, how: str) -> Node:
         node: Node = self.end_life(place)
         at = self._inside_at.pop(place, None)
         if at is not None:
@@ -329,5 +329,5 @@ class Team(World):
     def _machine(self, place: int) -> Machine:
         machine = self._places[place].machine
         if machine is None:
-            raise ValueError("the scenario gives nodes no machines of their own; write [clocks] drift = 0.001")
+            raise ValueError("the scenario has no simulated machines; write [clocks] drift = 0.001")
         return machine

@@ -1,4 +1,4 @@
-"""Workload: what clients do in a team beside the faults, what must hold of it, and the figures that come of it."""
+"""Define workloads: the clients of a simulated team, their checks, and their figures."""
 
 from __future__ import annotations
 
@@ -11,35 +11,34 @@ from sim.team.team import Team
 
 
 class Workload:
-    """Made before the first node joins; births and deaths are told by ``World.attend``.
+    """A workload, created before the first node joins; it observes births and deaths through ``World.attend``.
 
-    What clients ask for and what they get they write down in the history, which the checker judges.
+    It records requests and answers in the history, which the checker judges.
     """
 
     def step(self) -> None:
-        """Do something, now and then while the faults last."""
+        """Act; called repeatedly while the faults last."""
 
     def settled(self) -> None:
-        """The faults are over and the repair interval has passed: ask what is to be asked; 10 s are left for it."""
+        """Make the final requests, after the faults and the repair interval; 10 s remain for the answers."""
 
     def verdict(self) -> list[str]:
-        """Write down how things stand; returns the violations that only the workload itself can judge, a line each."""
+        """Record the final state; returns the violations that only this workload can judge, one line each."""
         return []
 
     def figures(self) -> list[Figure]:
-        """What was measured so far; asked now and then while it runs, and at the end.
+        """Return the figures so far; called repeatedly during the run, and at its end.
 
-        The names are there from the beginning, so that targets can be checked, with None as long as nothing was
-        measured.
+        All names are present from the beginning, so that targets can be validated; values are None until measured.
         """
         return []
 
 
 @dataclass(frozen=True)
 class Kind:
-    """A sort of workload: ``settings`` is a frozen dataclass whose fields have rules (``middleware.config.types``).
+    """A kind of workload: ``settings`` is a frozen dataclass with constrained fields (``formats.convert``).
 
-    ``make(team, settings)`` makes one.
+    ``make(team, settings)`` creates one.
     """
 
     settings: type[Any]

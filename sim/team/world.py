@@ -1,7 +1,7 @@
-"""Nodes of one process in virtual time: a clock, a switchboard, the lives of the nodes, and what outlives a node.
+"""Nodes of one process in virtual time: clock, switchboard, the nodes' lives, and state that survives a node.
 
-``World`` is what every simulated team has; ``Fleet`` has peers of the library, ``SwarmFleet`` whole nodes.  A team with
-a scenario of its own is ``sim.team.team.Team``.
+``World`` is the base of every simulated team; ``Fleet`` has nodes of the library, ``SwarmFleet`` whole device nodes.
+A team with a scenario is ``sim.team.team.Team``.
 """
 
 from __future__ import annotations
@@ -36,69 +36,69 @@ Watcher = Callable[[int, Any], object]
 
 
 class World:
-    """The clock, the network, the stores and the history; what ends on one node's death lives on here."""
+    """The clock, the network, the stores and the history, which survive the nodes."""
 
     def __init__(self, seed: int | str, weather: Weather = CALM) -> None:
         self.seed = seed
         self.clock = HeapClock()
         self.board = Switchboard(self.clock, self.generator("board"), weather)
         self.history = History(self.clock.seconds)
-        """What happened, for the checker: who lived, and what clients asked for and were told."""
+        """The events for the checker: lives of nodes, and clients' requests and answers."""
         self.total_traffic = Traffic()
-        """What all nodes together have sent and received."""
+        """The traffic of all nodes together."""
         self.stores: dict[int, Store] = {}
         self.lives = 0
         self.living: dict[int, Any] = {}
-        """By place, the nodes that live."""
+        """The living nodes by place."""
         self.life: Counter[int] = Counter()
-        """By place, the number of the present or last life."""
+        """The number of the present or last life by place."""
         self.on_birth: list[Watcher] = []
         self.on_death: list[Watcher] = []
 
     def generator(self, name: str) -> random.Random:
-        """A random generator of that name, whose numbers follow from the seed alone."""
+        """Return a random generator that depends only on the seed and ``name``."""
         return random.Random(f"{self.seed}/{name}")
 
     def address(self, place: int) -> Address:
-        """Where the node of this place listens."""
+        """Return the address of the node at this place."""
         return Address("10.0.0.1", PORT + place)
 
     def network(self, place: int) -> SwitchboardNetwork:
-        """The port of the node of this place."""
+        """Return the network port of the node at this place."""
         return self.board.network(*self.address(place), traffic=self.total_traffic)
 
     def identity(self, place: int) -> Identity:
-        """The lasting identity of the node of this place."""
+        """Return the permanent identity of the node at this place."""
         return Identity(self.generator(str(place)).randbytes(32))
 
     def rng(self, place: int) -> random.Random:
-        """Dice that never fall as those of a former life."""
+        """Return a random generator that differs from the generators of former lives."""
         self.lives += 1
         return self.generator(f"{place}/{self.lives}")
 
     def store(self, place: int) -> Store:
-        """The store of the node of this place, the same in each of its lives."""
+        """Return the store of the node at this place, the same in each life."""
         return self.stores.setdefault(place, MemoryStore())
 
     def run(self, seconds: float) -> None:
-        """Let time pass."""
+        """Let ``seconds`` pass."""
         self.clock.advance(seconds)
 
     # -- lives ------------------------------------------------------------------------------------------------------
 
     def alive(self) -> list[int]:
-        """The places whose nodes run, those included that stand still."""
+        """Return the places with running nodes, frozen ones included."""
         return sorted(self.living)
 
     def attend(self, born: Watcher, died: Watcher) -> None:
-        """Call ``born`` with every node that lives, and with each that is made later before it starts, and ``died``."""
+        """Call ``born`` with every living node and each later one before it starts, and ``died`` at each end."""
         self.on_birth.append(born)
         self.on_death.append(died)
         for place in self.alive():
             born(place, self.living[place])
 
     def begin_life(self, place: int, node: Any, identity: Identity) -> None:
-        """Write down that a node of this place is about to start, and tell the watchers."""
+        """Record that a node of this place starts, and call the watchers."""
         self.living[place] = node
         self.life[place] += 1
         address = str(self.address(place))
@@ -107,7 +107,7 @@ class World:
             born(place, node)
 
     def end_life(self, place: int, forgets: bool = False) -> Any:
-        """Write down that the node of this place ends, and tell the watchers; returns the node."""
+        """Record that the node of this place ends, and call the watchers; returns the node."""
         node = self.living[place]
         self.history.note(Died, place, forgets)
         for died in self.on_death:
@@ -116,7 +116,7 @@ class World:
 
 
 class Fleet(World):
-    """``n`` entangled nodes that join one after the other through the first."""
+    """``n`` nodes of the library that join one after the other through the first."""
 
     def __init__(self, n: int, seed: int = 1, weather: Weather = CALM) -> None:
         super().__init__(seed, weather)
@@ -126,7 +126,7 @@ class Fleet(World):
             self.run(JOINING)
 
     def made(self, place: int, lease: float = 1.0) -> EntangledNode:
-        """A node of this place, not started; the next life of one that was there before."""
+        """Return a node of this place for its next life, not started."""
         network = self.network(place)
         identity, store = self.identity(place), self.store(place)
         return EntangledNode(identity, TEAM, network, store, self.clock, self.rng(place), lease)
@@ -137,26 +137,26 @@ class Fleet(World):
         return node.join(known)
 
     def add(self) -> EntangledNode:
-        """One more node, which joins."""
+        """Add a node, which joins."""
         node = self.restart(len(self.nodes))
         self.run(JOINING)
         return node
 
     def memory(self, place: int) -> int:
-        """Which memory the node of a place has; another one may lack what was not acknowledged."""
+        """Return the number of the node's store; a new one may lack unacknowledged writes."""
         return 0
 
     def kill(self, place: int, forgets: bool = False) -> None:
-        """End a node as a loss of power does; its store is left as it is.
+        """Kill a node like a loss of power; its store stays as it is.
 
-        ``forgets``: the next life may lack what this one has stored.
+        ``forgets``: the next life may lack stored data.
         """
         if place in self.living:
             self.end_life(place, forgets)
         self.nodes[place].vanish()
 
     def restart(self, place: int, known: Sequence[int] = (0,)) -> EntangledNode:
-        """The next life of a node, on the store of the last one; the first life, where the place is a new one."""
+        """Start the next life of a node with the store of the last one; the first life for a new place."""
         node = self.made(place)
         if place == len(self.nodes):
             self.nodes.append(node)
@@ -164,7 +164,7 @@ class Fleet(World):
             self.nodes[place] = node
         self.begin_life(place, node, node.identity)
         joining = self.enter(node, [self.address(other) for other in known])
-        # It may be killed before it has found anybody.
+        # The node may be killed before it has joined.
         joining.addErrback(lambda failure: failure.trap(NotRunning))
         return node
 
@@ -175,7 +175,7 @@ class Fleet(World):
 
 
 class SwarmFleet(World):
-    """``n`` swarm nodes named dog0, dog1 ...; with ``pause`` 0 all of them join at the same moment."""
+    """``n`` swarm nodes named dog0, dog1 ...; with ``pause`` 0 all of them join at the same time."""
 
     def __init__(self, n: int, seed: int = 1, weather: Weather = CALM, pause: float = JOINING) -> None:
         super().__init__(seed, weather)
@@ -186,7 +186,7 @@ class SwarmFleet(World):
             self.run(pause)
 
     def made(self, place: int) -> SwarmNode:
-        """A node of this place, not started."""
+        """Return a node of this place, not started."""
         network = self.network(place)
         device = Device("", f"dog{place}", capabilities=CAPABILITIES)
         known = [self.address(0)] if place else []

@@ -53,7 +53,7 @@ class Demonstration:
             said.append(line)
             if line.startswith(begins):
                 break
-            if line.startswith("If the node that serves"):
+            if line.startswith("If its node fails"):
                 raise AssertionError("".join(said))  # no address is said after that
         else:
             raise AssertionError("".join(said) + log.read_text(encoding="utf-8"))

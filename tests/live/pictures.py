@@ -212,7 +212,7 @@ def stopped(photographer: Photographer) -> None:
     phone.locator(".halted").wait_for()
     phone.locator("#line", has_text="Stopped: 3 robots stand").wait_for()
     photographer.take(phone, "stop-phone")
-    phone.get_by_role("button", name="Let it go on").click()
+    phone.get_by_role("button", name="Release").click()
 
 
 def outdoors(browser: Any) -> None:

@@ -17,8 +17,8 @@ class ActionPageTests(PageCase):
         page.locator(".stop").tap()
         self.told(page, "Stopped: 3 robots stand.")
         page.locator(".halted").wait_for()
-        page.get_by_role("button", name="Let it go on").tap()
-        self.told(page, "The team goes on.")
+        page.get_by_role("button", name="Release").tap()
+        self.told(page, "The team is released.")
         page.locator(".halted").wait_for(state="hidden")
         self.view(page, "tasks")
         page.locator("#assign").scroll_into_view_if_needed()
@@ -45,7 +45,7 @@ class ActionPageTests(PageCase):
         page.locator(".halted").wait_for()
         self.tab_to(page, ".halted button")
         page.keyboard.press("Enter")
-        self.told(page, "The team goes on.")
+        self.told(page, "The team is released.")
 
     def test_ask_before_assigning(self) -> None:
         """Who could take the chosen task and who not, and why, stands below it before it is assigned."""
@@ -63,7 +63,7 @@ class ActionPageTests(PageCase):
             self.view(page, "tasks")
             page.locator(".preview li").first.wait_for()
             self.assertEqual(page.locator(".preview [data-can=with]").count(), 0)
-            self.assertIn("divided together", page.locator("label[for=group]").inner_text())
+            self.assertIn("divided among", page.locator("label[for=group]").inner_text())
             if type_on:
                 self.tab_to(page, "#group")
                 page.keyboard.type("yard")
@@ -79,7 +79,9 @@ class ActionPageTests(PageCase):
             self.assertEqual(asked.value.post_data_json, {"name": "search", "group": "yard"})
             self.told(page, "Assigned")
             page.locator("#group").fill("elsewhere")
-            page.locator("[data-can=with]", has_text="nothing yet; it begins the group elsewhere").wait_for()
+            page.locator(
+                "[data-can=with]", has_text="no other task yet; this is the first of group elsewhere"
+            ).wait_for()
             self.sound(page)
 
     def test_lift_a_robot(self) -> None:
@@ -94,11 +96,11 @@ class ActionPageTests(PageCase):
         page.locator(".ghost").wait_for(state="attached")
         page.mouse.move(*at(2.2, 2.0), steps=4)
         page.mouse.up()
-        self.told(page, "dog1 stands at 2.2")
+        self.told(page, "dog1 moved to 2.2")
         self.assertEqual(page.locator(".ghost").count(), 0)
         page.locator(".dog[data-key=dog2]").focus()
         page.keyboard.press("ArrowRight")
-        self.told(page, "dog2 stands at 1.45, 1.20")
+        self.told(page, "dog2 moved to 1.45, 1.20")
         nose = page.locator(".dog[data-key=dog2] > g").get_attribute("transform")
         page.keyboard.press("Enter")
         page.wait_for_function(
@@ -130,7 +132,7 @@ class ActionPageTests(PageCase):
         for step in range(1, 6):
             finger("touchMove", (0.6, 0.6 + 0.2 * step))
         finger("touchEnd")
-        self.told(page, "dog1 stands at")
+        self.told(page, "dog1 moved to")
         x, y = (float(word.strip(",")) for word in page.locator("#line").inner_text().split()[3:5])
         self.assertLess(abs(x - 0.6) + abs(y - 1.6), 0.1)
         finger("touchStart", (1.8, 1.7))
@@ -155,13 +157,13 @@ class ActionPageTests(PageCase):
         name.fill("lame")
         page.keyboard.press("Enter")
         answer = page.locator(".settings + .hint")
-        page.locator(".settings + .hint", has_text="The device has taken it").wait_for()
+        page.locator(".settings + .hint", has_text="Settings saved").wait_for()
         self.assertEqual(name.input_value(), "lame")
         page.get_by_role("button", name="Save settings").tap()
-        self.assertEqual(answer.inner_text(), "Nothing was changed.")
+        self.assertEqual(answer.inner_text(), "No changes to save.")
         page.get_by_label("beyond what its driver says").fill("{arm")
         page.get_by_role("button", name="Save settings").tap()
-        self.assertIn("it is no table", answer.inner_text())
+        self.assertIn("not a table", answer.inner_text())
         page.get_by_label("How long the others believe").fill("99")
         page.get_by_role("button", name="Save settings").tap()
         self.assertFalse(page.get_by_label("How long the others believe").evaluate("e => e.checkValidity()"))

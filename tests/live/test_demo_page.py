@@ -87,7 +87,7 @@ class DemonstrationPageTests(DemonstrationPageCase):
         page.locator(".device[data-state=IDLE]", has_text="dog2").wait_for()
 
         self.view(page, "map")
-        page.get_by_role("button", name="Take away").tap()
+        page.get_by_role("button", name="Remove target").tap()
         page.locator("#place", has_text="No target").wait_for()
         page.get_by_role("button", name="Place target").tap()
         page.locator("#place", has_text="Target at").wait_for()
@@ -111,7 +111,7 @@ class DemonstrationPageTests(DemonstrationPageCase):
         self.assertEqual(seen["moved"], 0)
         page.locator(".halted").wait_for()
         self.fits(page)
-        page.get_by_role("button", name="Let it go on").tap()
+        page.get_by_role("button", name="Release").tap()
         page.locator(".halted").wait_for(state="hidden")
 
     def look(self, page: Any) -> None:

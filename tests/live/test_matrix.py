@@ -10,7 +10,7 @@ LINKS = {
     "devices": "Devices",
     "tasks": "Tasks",
     "cameras": "Cameras",
-    "map": "Yard",
+    "map": "Simulator",
     "more": "More",
     "groups": "Consensus",
     "network": "Network",

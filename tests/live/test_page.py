@@ -52,7 +52,7 @@ class PageTests(PageCase):
             "devices": ["Devices"],
             "tasks": ["Tasks"],
             "cameras": ["Cameras"],
-            "map": ["Yard"],
+            "map": ["Simulator"],
             "groups": ["More", "Consensus"],
             "network": ["More", "Network"],
             "events": ["More", "Events"],
@@ -238,7 +238,7 @@ class PageTests(PageCase):
         """What happens is told in words, newest first: of all, of one kind, and of one device or task."""
         page = self.opened(DESK)
         story = page.locator("#events li")
-        page.locator("#events li", has_text="begins to look").wait_for()
+        page.locator("#events li", has_text="starts to observe").wait_for()
         self.team.order("gone dog2")
         page.locator("#events li[data-kind=gone]", has_text="dog2 is gone").wait_for()
         self.team.order("status dog1 EXECUTING")
@@ -280,7 +280,7 @@ class PageTests(PageCase):
         page.locator(".device[data-state=DONE]", has_text="done").wait_for()
         # Where the events have the screen to themselves the page is scrolled, and not a list within it.
         self.view(page, "events")
-        page.locator("#events li", has_text="begins to look").wait_for()
+        page.locator("#events li", has_text="starts to observe").wait_for()
         inside = """events => {
           for (let n = 0; n < 100; n += 1) events.append(events.firstElementChild.cloneNode(true));
           return events.scrollHeight - events.clientHeight;
@@ -307,7 +307,7 @@ class PageTests(PageCase):
         for _ in range(4):
             page.keyboard.press("ArrowRight")
         page.locator("#place", has_text="Target at 1.2").wait_for()
-        page.get_by_role("button", name="Take away").click()
+        page.get_by_role("button", name="Remove target").click()
         page.locator("#place", has_text="No target").wait_for()
         page.get_by_role("button", name="Place target").click()
         page.locator("#place", has_text="Target at 1.50, 1.20").wait_for()

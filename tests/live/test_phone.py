@@ -68,7 +68,7 @@ class PhoneViewTests(BrowserCase, TeamCase):
             page.locator(".phone", has_text="Target at about 0.2").wait_for()
             look(page)
             page.get_by_role("button", name="Stop taking part").click()
-            page.locator(".phone .trouble", has_text="takes no part any more").wait_for()
+            page.locator(".phone .trouble", has_text="has left the team").wait_for()
             look(page)
             page.context.close()
 
@@ -79,10 +79,12 @@ class PhoneViewTests(BrowserCase, TeamCase):
         page.locator(".phone .said", has_text="Look for the red target").wait_for()
         secret = page.evaluate("localStorage.getItem('swarm.phone')")
         page.evaluate(HIDE, True)
-        page.locator(".phone .trouble", has_text="Left, as this page was out of sight").wait_for()
+        page.locator(".phone .trouble", has_text="Left the team, as this page was hidden").wait_for()
         with page.expect_request("**/api/v1/phones") as joined:
             page.evaluate(HIDE, False)
-        page.locator(".phone .trouble", has_text="It left while this page was out of sight, and is back").wait_for()
+        page.locator(
+            ".phone .trouble", has_text="The phone left while this page was hidden, and has returned"
+        ).wait_for()
         page.locator(".phone .said", has_text="Look for the red target").wait_for()
         self.assertEqual(json.loads(joined.value.post_data)["secret"], json.loads(secret)["secret"])
         self.assertEqual(self.faults, [])
@@ -91,10 +93,10 @@ class PhoneViewTests(BrowserCase, TeamCase):
         """A refused camera, a page that is not secure and a visitor who only looks: each is told what to do."""
         page = self.opened(may_film=False)
         page.get_by_role("button", name="Take part", exact=True).tap()
-        page.locator(".phone .trouble", has_text="The camera was refused. Allow it").wait_for()
+        page.locator(".phone .trouble", has_text="The camera is not allowed. Allow it").wait_for()
         self.sound(page)
         page = self.opened(base=f"http://vaio.local:{self.team.port}/", may_film=False)
-        page.locator(".phone .trouble", has_text="https pages alone").wait_for()
+        page.locator(".phone .trouble", has_text="allow the camera on https pages").wait_for()
         self.assertTrue(page.get_by_role("button", name="Take part", exact=True).is_disabled())
         page = self.tab(PHONE)
         page.goto(f"{self.team.url}#code={self.invited('viewer')}/phone")

@@ -25,8 +25,8 @@ class WaysTests(PageCase):
             [(row[0], row[1], row[2]) for row in rows],
             [
                 ("dog1", "98 \N{EN DASH} well", "LAN, for 2 min"),
-                ("dog2", "63 \N{EN DASH} fair", "punched through routers, for 2 min"),
-                ("dog3", "24 \N{EN DASH} poor", "carried by dog1, for 2 min"),
+                ("dog2", "63 \N{EN DASH} fair", "hole punched, for 2 min"),
+                ("dog3", "24 \N{EN DASH} poor", "relayed by dog1, for 2 min"),
             ],
         )
         self.assertEqual(rows[2][3], "110 ms, jitter 11 ms, 20 % lost")
@@ -48,14 +48,14 @@ class WaysTests(PageCase):
             told,
             [
                 [
-                    "dog9 is not let in by vaio, dog1; 3 min ago, 6 times",
+                    "dog9 is rejected by vaio, dog1; 3 min ago, 6 times",
                     "revoked: the operator revoked the certificate",
-                    "Do: only a new invitation lets it in",
+                    "Remedy: only a new invitation lets it in",
                 ],
                 [
-                    "a newcomer at 192.0.2.66:8484 is not let in by vaio; 3 min ago",
+                    "a newcomer at 192.0.2.66:8484 is rejected by vaio; 3 min ago",
                     "used: this code was used as often as it may be",
-                    "Do: ask the operator for another one",
+                    "Remedy: ask the operator for another one",
                 ],
             ],
         )
@@ -70,7 +70,7 @@ class WaysTests(PageCase):
         self.assertEqual(page.locator("#team-kind").inner_text(), "Closed team yard")
         self.assertIn("Fingerprint 1a2b 3c4d 5e6f 7081", page.locator("#team-about").inner_text())
         first, second, third = (item.inner_text() for item in page.locator("#members li").all())
-        self.assertIn("! ends in 9 d", first)
+        self.assertIn("! expires in 9 d", first)
         self.assertIn("device, bootstrap", second)
         self.assertIn("not here", third)
         self.assertNotIn("!", second + third)

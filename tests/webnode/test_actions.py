@@ -115,7 +115,7 @@ class ActionTests(SynchronousTestCase):
         """A message is answered with who has it; a device that was lost meanwhile is an error that says so."""
         self.assertEqual(self.ask("POST", "message", {"text": "sit"}), (202, {"delivered": [], "failed": {}}))
         self.assertEqual(self.ask("POST", "devices/01/message", {"text": "sit"})[1]["id"], "01")
-        left = Refusal("device", "dog1 left while it was asked", "wait until it is back", 409)
+        left = Refusal("device", "dog1 left during the request", "wait until it is back", 409)
 
         def lost(*wish: object) -> Deferred[Any]:
             return fail(left)

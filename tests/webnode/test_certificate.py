@@ -78,7 +78,7 @@ class LeafTests(SynchronousTestCase):
         """It is good now and until a month before it ends; then, or before it is valid, it says so."""
         self.assertEqual(self.flaw(), "")
         self.assertEqual(self.flaw(NOW + (LASTS - LEFT).total_seconds() - 3 * DAY), "")
-        self.assertEqual(self.flaw(NOW + (LASTS - LEFT).total_seconds()), "it runs out")
+        self.assertEqual(self.flaw(NOW + (LASTS - LEFT).total_seconds()), "it expires soon")
         self.assertEqual(self.flaw(NOW - 3 * DAY), "it is not valid yet")
         lasts = self.leaf.certificate.not_valid_after_utc - self.leaf.certificate.not_valid_before_utc
         self.assertEqual(lasts, timedelta(days=365))

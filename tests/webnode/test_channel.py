@@ -157,7 +157,7 @@ class ChannelTests(SynchronousTestCase):
             self.opened().send(b"GET / HT")
         third = self.opened()
         third.send(b"GET / HT")
-        self.assert_refused(third, 503, "unfinished")
+        self.assert_refused(third, 503, "incomplete")
         self.assertIn(b"hello", self.opened().ask("/").taken())
         self.assertFalse(self.is_closed(self.opened("10.0.0.2").send(b"GET / HT")))
         self.connections[0].send(b"TP/1.1\r\nHost: vaio\r\n\r\n")
@@ -169,7 +169,7 @@ class ChannelTests(SynchronousTestCase):
         """The third answer under way of an address is refused; when one ends, the next is taken."""
         held = [self.opened().ask("/held") for _ in range(2)]
         third = self.opened().ask("/held")
-        self.assert_refused(third, 503, "being answered")
+        self.assert_refused(third, 503, "open requests")
         self.assertEqual(len(self.echo.held), 2)
         self.assertIn(b"hello", self.opened("10.0.0.2").ask("/").taken())
         held[0].leave()

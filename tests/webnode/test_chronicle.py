@@ -48,7 +48,7 @@ class ChronicleTests(SynchronousTestCase):
         """It begins with when it began and who was here then; a state that is the same adds nothing."""
         self.assertEqual(
             self.saw(1.0, dog(1), dog(2)),
-            ["vaio begins to look", "dog1 is here, number 1: idle", "dog2 is here, number 2: idle"],
+            ["vaio starts to observe", "dog1 is here, number 1: idle", "dog2 is here, number 2: idle"],
         )
         self.assertEqual(self.saw(2.0, dog(1), dog(2)), [])
 
@@ -66,7 +66,7 @@ class ChronicleTests(SynchronousTestCase):
         self.saw(1.0)
         self.assertEqual(self.saw(2.0, tasks=[job("OPEN")]), ["Find it: open"])
         self.assertEqual(self.saw(3.0, tasks=[job("OPEN", paused=True)]), ["Find it: paused"])
-        self.assertEqual(self.saw(3.5, tasks=[job("OPEN", note="no device is here")]), ["Find it: goes on"])
+        self.assertEqual(self.saw(3.5, tasks=[job("OPEN", note="no device is here")]), ["Find it: resumed"])
         self.assertEqual(self.saw(3.6, tasks=[job("OPEN", note="nobody can")]), ["Find it: nobody can"])
         done = job("COMPLETED", result={"by": "dog2", "took": 13.24})
         self.assertEqual(self.saw(4.0, tasks=[done]), ["Find it: open → completed by dog2 in 13.2 s"])
@@ -95,7 +95,7 @@ class ChronicleTests(SynchronousTestCase):
         """That the whole team is halted, and goes on, is told."""
         self.saw(1.0)
         self.assertEqual(self.saw(2.0, halted=True), ["the team is halted"])
-        self.assertEqual(self.saw(3.0, halted=False), ["the team goes on"])
+        self.assertEqual(self.saw(3.0, halted=False), ["the team is released"])
 
     def takeover(self) -> list[tuple[str, str, float | None]]:
         kinds = ("takeover", "handover")
@@ -120,7 +120,7 @@ class ChronicleTests(SynchronousTestCase):
         both = dog(1, "EXECUTING", "t1"), dog(2, "WAITING", "t1")
         self.saw(1.0, *both, tasks=tasks)
         self.chronicle.faulted(uuid(1), "radio", 9.0)
-        self.assertEqual(self.told(), ["dog1: radio, caused on purpose"])
+        self.assertEqual(self.told(), ["dog1: radio (injected fault)"])
         self.saw(10.0, both[1], tasks=tasks)
         self.saw(10.5, dog(2, "EXECUTING", "t1"), tasks=tasks)
         self.assertEqual(self.takeover(), [("takeover", uuid(2), 1.5)])

@@ -177,7 +177,7 @@ class EventsTests(SynchronousTestCase):
         self.board.chronicle.faulted("01", "kill", 1e9)
         self.clock.advance(0.1)
         ((name, (row,)),) = events_in(page.taken())
-        self.assertEqual((name, row["n"], row["text"]), ("event", 1, "01: kill, caused on purpose"))
+        self.assertEqual((name, row["n"], row["text"]), ("event", 1, "01: kill (injected fault)"))
         self.clock.advance(0.1)
         self.assertEqual([each for each in events_in(page.taken()) if each[0] == "event"], [])
         self.assertIn("event", [name for name, _ in events_in(self.connected().taken())])

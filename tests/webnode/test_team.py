@@ -54,7 +54,7 @@ class TeamDeskTests(SynchronousTestCase):
             self.team.kill("dog2")
             refusal = self.refusal(order(uuid, what))
             self.assertEqual((refusal.field, refusal.status), ("device", 409))
-            self.assertEqual(refusal.problem, "dog2 left while it was asked")
+            self.assertEqual(refusal.problem, "dog2 left during the request")
             self.team.add("dog2")
             self.team.clock.advance(3.0)
 
@@ -69,8 +69,8 @@ class TeamDeskTests(SynchronousTestCase):
         """What a device refuses is passed on in its own words; who is unknown is no device."""
         refusal = self.refusal(self.desk.message(self.uuid("dog2"), "x" * 300))
         self.assertEqual(refusal.status, 409)
-        self.assertIn("dog2 says no: a message is a text of 1 to 200 characters", refusal.problem)
-        self.assertIn("is not here", self.refusal(self.desk.disconnect("ab" * 16, 5.0)).problem)
+        self.assertIn("dog2 refused: a message is a text of 1 to 200 characters", refusal.problem)
+        self.assertIn("has left the network", self.refusal(self.desk.disconnect("ab" * 16, 5.0)).problem)
 
     def test_disconnect_is_answered_before_it_leaves(self) -> None:
         """A device says that it leaves, and then does."""

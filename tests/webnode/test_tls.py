@@ -91,12 +91,12 @@ class CertifiedTests(SynchronousTestCase):
             self.now += 340 * DAY
 
         faults: list[tuple[Any, str]] = [
-            (lambda: self.path.chmod(0o644), "others may read"),
+            (lambda: self.path.chmod(0o644), "other users can read"),
             (cut, "no certificate with its key"),
             (lambda: self.path.write_bytes(b""), "no certificate with its key"),
             (moved, "it lacks 192.168.0.8"),
             (sworn, "another authority"),
-            (aged, "it runs out"),
+            (aged, "it expires soon"),
         ]
         for seed, (fault, words) in enumerate(faults):
             self.certified(seed)
@@ -104,7 +104,7 @@ class CertifiedTests(SynchronousTestCase):
             fault()
             _, said = self.certified(100 + seed)
             self.assertIn(words, said)
-            self.assertIn("is made anew", said)
+            self.assertIn("is replaced", said)
             self.assertNotEqual(read(self.path.read_bytes()).certificate.serial_number, before)
             self.assertEqual(stat.S_IMODE(self.path.stat().st_mode), 0o600)
 
@@ -112,7 +112,7 @@ class CertifiedTests(SynchronousTestCase):
         """Where it cannot be kept it serves all the same, and the log says why the next start makes another."""
         self.path = self.path.parent / "nowhere" / "a.tls"
         certified, said = self.certified()
-        self.assertIn("cannot be kept", said)
+        self.assertIn("cannot store", said)
         self.assertIn("192.168.0.7", self.served(certified))
 
     def test_follow_the_machine(self) -> None:

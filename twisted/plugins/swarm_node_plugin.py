@@ -1,10 +1,10 @@
-"""Makes ``twistd swarm-node`` known; names only, so that an error in our modules cannot spoil ``twistd --help``."""
+"""Register ``twistd swarm-node``; names only, so that an import error cannot break ``twistd --help``."""
 
 from twisted.application.service import ServiceMaker
 
 swarm_node = ServiceMaker(
     "swarm node",
     "swarmnode.plugin",
-    "A node of a swarm: peer-to-peer store, agent and driver of one device, and the page where it is asked for.",
+    "A node of a swarm: peer-to-peer store, the agent and driver of one device, and optionally the web page.",
     "swarm-node",
 )

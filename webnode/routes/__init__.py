@@ -1,1 +1,1 @@
-"""The routes of the API, a module for each thing that can be asked about; ``table`` has them all."""
+"""The routes of the API, one module per subject; ``table`` collects all of them."""

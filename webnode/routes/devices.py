@@ -1,4 +1,4 @@
-"""Routes of the devices: who is here, messages to them, and leaving the network for a while."""
+"""Routes of the devices: list, messages, and leaving the network for some time."""
 
 from __future__ import annotations
 
@@ -10,28 +10,28 @@ from webnode.route import API, DEVICE, Ask, Field, Route, device
 MAX_MESSAGE = 140
 MIN_AWAY_S, MAX_AWAY_S = 0.1, 600.0
 AWAY_S = 15.0
-TEXT = Field("text", "text", "what it is told", most=MAX_MESSAGE)
+TEXT = Field("text", "text", "the message", most=MAX_MESSAGE)
 
 
 def devices(ask: Ask) -> Json:
-    """All of them."""
+    """Return all devices."""
     listed: Json = ask.state["devices"]
     return listed
 
 
 def announce(ask: Ask) -> Any:
-    """Tell all of them."""
+    """Send a message to all devices."""
     return ask.board.desk.message("", ask.given["text"])
 
 
 def message(ask: Ask) -> Any:
-    """Tell one."""
+    """Send a message to one device."""
     uuid = device(ask)["uuid"]
     return ask.board.desk.message(uuid, ask.given["text"]).addCallback(lambda answer: {"id": uuid, **answer})
 
 
 def disconnect(ask: Ask) -> Any:
-    """Take one off the network."""
+    """Let a device leave the network for some time."""
     uuid, seconds = device(ask)["uuid"], ask.given["seconds"]
 
     def left(_: object) -> Json:
@@ -41,7 +41,7 @@ def disconnect(ask: Ask) -> Any:
     return ask.board.desk.disconnect(uuid, seconds).addCallback(left)
 
 
-GIVES = "delivered (names), failed (why, by name)"
+GIVES = "delivered (names), failed (reason by name)"
 ROUTES = (
     Route(
         "GET", f"{API}/devices", "The devices, in the order of joining", "viewer", devices, gives="a list of devices"
@@ -60,7 +60,7 @@ ROUTES = (
     Route(
         "POST",
         f"{API}/devices/{{uuid}}/disconnect",
-        "The device leaves the network and comes back",
+        "The device leaves the network and returns after the given time",
         "operator",
         disconnect,
         (
@@ -68,7 +68,7 @@ ROUTES = (
             Field(
                 "seconds",
                 "number",
-                "how long",
+                "duration",
                 least=MIN_AWAY_S,
                 most=MAX_AWAY_S,
                 default=AWAY_S,

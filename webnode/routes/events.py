@@ -1,4 +1,4 @@
-"""Routes of what happened: in the team since this node looks, and through this node by order of whom."""
+"""Routes of the event log of the team and of this node's audit log."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from webnode.route import API, Ask, Field, Route
 
 
 def events(ask: Ask) -> Json:
-    """The entries of the chronicle, the oldest first."""
+    """Return the entries of the chronicle, oldest first."""
     entries = ask.board.chronicle.since(ask.given["after"], ask.given["about"])
     return [asdict(entry) for entry in entries]
 
 
 def audit(ask: Ask) -> Json:
-    """The newest lines of the audit."""
+    """Return the newest lines of the audit log."""
     return [*ask.board.audit.newest(ask.given["count"])]
 
 
@@ -24,15 +24,15 @@ ROUTES = (
     Route(
         "GET",
         f"{API}/events",
-        "What happened since this node looks, the oldest first",
+        "Events since this node started to observe the team, oldest first",
         "viewer",
         events,
         (
-            Field("after", "whole", "number of the last one known", "query", least=0, default=0),
+            Field("after", "whole", "number of the last event received", "query", least=0, default=0),
             Field(
                 "about",
                 "text",
-                "uuid of a device or id of a task: only what concerns it",
+                "uuid of a device or id of a task: only its events",
                 "query",
                 least=0,
                 most=64,
@@ -44,10 +44,10 @@ ROUTES = (
     Route(
         "GET",
         f"{API}/audit",
-        "Who changed what through this node, the newest first",
+        "Changes made through this node, newest first",
         "operator",
         audit,
-        (Field("count", "whole", "how many", "query", least=1, most=AUDITED, default=50),),
+        (Field("count", "whole", "maximum number of lines", "query", least=1, most=AUDITED, default=50),),
         gives="a list of at (unix seconds), who, role, from, session, route, target, outcome",
     ),
 )

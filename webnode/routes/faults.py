@@ -1,4 +1,4 @@
-"""Routes of faults that are caused on purpose."""
+"""Routes of fault injection."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from webnode.route import API, DEVICE, Ask, Field, Route, device
 
 
 def faults(ask: Ask) -> Json:
-    """What can be caused where, and what goes on; nothing where this node has no faults."""
+    """Return the kinds of faults, the devices that allow them, and active faults; empty without fault injection."""
     known = ask.board.faults
     if known is None:
         return {"kinds": [], "can": {}, "active": []}
@@ -34,11 +34,11 @@ def faults(ask: Ask) -> Json:
 
 
 def cause(ask: Ask) -> Any:
-    """Let a device fail."""
+    """Inject a fault into a device."""
     uuid, board, kind = device(ask)["uuid"], ask.board, ask.given["kind"]
     if board.faults is None:
         raise Refusal(
-            "device", "this node causes no faults", 'write "allow = true" below [faults] of its settings', 409
+            "device", "this node does not inject faults", 'set "allow = true" below [faults] in its settings', 409
         )
     seconds, amount = ask.given["seconds"], ask.given["amount"]
 
@@ -54,7 +54,7 @@ ROUTES = (
     Route(
         "GET",
         f"{API}/faults",
-        "What can be made to fail, and what was, with the seconds until another took over",
+        "Faults that can be injected, and injected faults with their takeover times",
         "viewer",
         faults,
         gives="kinds, can (kinds by uuid), active (n, uuid, name, kind, amount, left_s, since_s, task, takeover_s, to)",
@@ -62,22 +62,22 @@ ROUTES = (
     Route(
         "POST",
         f"{API}/devices/{{uuid}}/faults",
-        "Let a device fail on purpose, where its settings allow it; it heals by itself",
+        "Inject a fault into a device that allows it; the fault ends by itself",
         "operator",
         cause,
         (
             DEVICE,
-            Field("kind", "choice", "what it suffers", choices=tuple(KINDS)),
+            Field("kind", "choice", "kind of fault", choices=tuple(KINDS)),
             Field(
                 "seconds",
                 "number",
-                "how long",
+                "duration",
                 least=MIN_S,
                 most=MAX_S,
                 default=USUAL_S,
                 unit="s",
             ),
-            Field("amount", "number", f"how much, where it has an amount (usual {_USUAL})", default=None),
+            Field("amount", "number", f"strength, for kinds with an amount (usual {_USUAL})", default=None),
         ),
         gives="id, kind, seconds",
         status=202,

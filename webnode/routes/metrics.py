@@ -1,7 +1,7 @@
-"""Routes of the metrics: what a node's page knows, in the text format of Prometheus, by its own client library.
+"""Routes of the metrics: the state of the team in the Prometheus text format, by the library prometheus_client.
 
-Everything is read at the moment of asking; the library is loaded at the first one, and its global registry, which would
-add figures of this process and keep them for good, is not used.
+Values are read at each request.  The library is imported at the first request; its global registry is not used, as it
+would add permanent metrics of this process.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from webnode.route import Ask, Content, Route
 from webnode.state import State
 
 TEXT = "text/plain; version=0.0.4; charset=utf-8"
-"""The format that every version of Prometheus reads."""
+"""The format that every version of Prometheus supports."""
 FLOWS = ("sent", "received", "dropped")
 
 
 def metrics(state: State, board: Board, now: float) -> bytes:
-    """The whole text; ``now`` is unix seconds.  Raises ``ModuleNotFoundError`` where the library is missing."""
+    """Return the exposition; ``now`` is unix seconds.  Raises ``ModuleNotFoundError`` without the library."""
     from prometheus_client import CollectorRegistry
     from prometheus_client.exposition import generate_latest
 
@@ -53,9 +53,9 @@ def _families(state: State, board: Board, now: float) -> Iterator[Any]:
         return family
 
     devices = list(state["devices"])
-    yield by_status("swarm_devices", "Devices, those that left a moment ago as GONE.", devices)
-    yield by_status("swarm_tasks", "Tasks.", state["tasks"])
-    contacts = GaugeMetricFamily("swarm_device_contacts", "Nodes that a device knows.", labels=("uuid", "device"))
+    yield by_status("swarm_devices", "Devices by status; recently departed ones as GONE.", devices)
+    yield by_status("swarm_tasks", "Tasks by status.", state["tasks"])
+    contacts = GaugeMetricFamily("swarm_device_contacts", "Nodes in a device's contacts.", labels=("uuid", "device"))
     since = GaugeMetricFamily("swarm_device_joined_seconds", "Unix time of joining.", labels=("uuid", "device"))
     flow = CounterMetricFamily("swarm_device_datagrams", "Datagrams of a device.", labels=("uuid", "device", "flow"))
     for device in devices:
@@ -67,7 +67,7 @@ def _families(state: State, board: Board, now: float) -> Iterator[Any]:
             if name in network:
                 flow.add_metric([*whose, name], network[name])
     yield from (contacts, since, flow)
-    agree = GaugeMetricFamily("swarm_group_agreeing", "Members of a group that name the same device.", labels=("task",))
+    agree = GaugeMetricFamily("swarm_group_agreeing", "Members of a group that agree.", labels=("task",))
     members = GaugeMetricFamily("swarm_group_members", "Members of a group.", labels=("task",))
     for group in state["groups"]:
         agree.add_metric([group["task"]], group["agree"])
@@ -75,7 +75,7 @@ def _families(state: State, board: Board, now: float) -> Iterator[Any]:
     yield from (agree, members)
     kept = GaugeMetricFamily(
         "swarm_page_connections",
-        "To this node's page: open, with an unfinished request, with an answer under way.",
+        "Connections of this node's page: open, with an incomplete request, with a response in progress.",
         labels=("kind",),
     )
     for kind in get_args(Kept):
@@ -89,16 +89,16 @@ def _families(state: State, board: Board, now: float) -> Iterator[Any]:
 
 
 def read(ask: Ask) -> Content:
-    """All of them."""
+    """Return all metrics."""
     try:
         return Content(metrics(ask.state, ask.board, ask.now), TEXT)
     except ModuleNotFoundError as error:
         if error.name != "prometheus_client":
             raise
-        remedy = "install it by: pip install 'swarm-node[web]'"
-        raise Refusal("metrics", "the node lacks the library prometheus-client", remedy, 404) from error
+        remedy = "install it with: pip install 'swarm-node[web]'"
+        raise Refusal("metrics", "the library prometheus-client is not installed", remedy, 404) from error
 
 
 ROUTES = (
-    Route("GET", "/metrics", "Figures of the team and the page, for Prometheus", "viewer", read, gives="text/plain"),
+    Route("GET", "/metrics", "Metrics of the team and the page, for Prometheus", "viewer", read, gives="text/plain"),
 )

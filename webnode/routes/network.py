@@ -1,4 +1,4 @@
-"""Routes of the network: who knows whom, by which ways, in what team, and what each device stores."""
+"""Routes of the network: contacts, paths, the team, and the stored records of each device."""
 
 from __future__ import annotations
 
@@ -10,28 +10,28 @@ from webnode.survey import TeamSurvey
 
 
 def network(ask: Ask) -> Any:
-    """Who knows whom, and how far they are."""
+    """Return the contacts of each device and their round-trip times."""
     return _survey(ask).network()
 
 
 def links(ask: Ask) -> Any:
-    """How each reaches the others."""
+    """Return the path and its quality from each device to the others."""
     return _survey(ask).links()
 
 
 def team(ask: Ask) -> Any:
-    """What team this is."""
+    """Return the kind of team and its members."""
     return _survey(ask).team()
 
 
 def inventory(ask: Ask) -> Any:
-    """What a device stores."""
+    """Return the records that a device stores."""
     return _survey(ask).inventory(device(ask)["uuid"])
 
 
 def _survey(ask: Ask) -> TeamSurvey:
     if ask.board.survey is None:
-        raise Refusal("node", "it cannot ask devices", "ask another web node of the team", 409)
+        raise Refusal("node", "it cannot query devices", "use another web node of the team", 409)
     return ask.board.survey
 
 
@@ -39,7 +39,7 @@ ROUTES = (
     Route(
         "GET",
         f"{API}/network",
-        "Who knows whom, with round trips, traffic and the newest lookups; each device is asked",
+        "Contacts of each device with round-trip times, traffic and the newest lookups; queries each device",
         "viewer",
         network,
         gives="devices (by uuid: contacts, known, sent, received, lost, lookups), silent",
@@ -47,7 +47,7 @@ ROUTES = (
     Route(
         "GET",
         f"{API}/links",
-        "By which way each device reaches the others, and how well, measured while somebody asks; who was not let in",
+        "Path and measured quality from each device to the others, and refused nodes; measured while a client asks",
         "viewer",
         links,
         gives="here (this node), devices (by uuid: links, refusals), silent",
@@ -55,7 +55,7 @@ ROUTES = (
     Route(
         "GET",
         f"{API}/team",
-        "Open or closed; of a closed team its members, their roles, and until when they are certified",
+        "Open or closed team; for a closed one its members, their roles, and the expiry of their certificates",
         "viewer",
         team,
         gives="kind; unprotected, or name, fingerprint, me, until, is_renewable, is_ending, known, members",
@@ -63,7 +63,7 @@ ROUTES = (
     Route(
         "GET",
         f"{API}/devices/{{uuid}}/inventory",
-        "What a device stores; the device is asked",
+        "Records that a device stores; queries the device",
         "viewer",
         inventory,
         (DEVICE,),

@@ -1,4 +1,4 @@
-"""Routes of the node itself: who it is, everything that it knows, its streams, and what lets the page outlive it."""
+"""Routes of the node itself: its identity, the state, its streams, and the service worker."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from webnode.field import Json
 from webnode.route import API, DEVICE, Ask, Content, Field, Route
 
 VERSION = 1
-"""Of the API; a page of another one does not go on here."""
+"""Version of the API; a page of another version does not switch to this node."""
 WORKER = Path(__file__).parents[1] / "static" / "sw.js"
 
 
 def node(ask: Ask) -> Json:
-    """Who answers; nothing that only those who have signed in may know."""
+    """Return the identity of this node, with nothing that requires signing in."""
     board = ask.board
     pages = board.fallbacks.here()
     return {
@@ -30,17 +30,17 @@ def node(ask: Ask) -> Json:
 
 
 def rows(pages: Iterable[Page]) -> list[Json]:
-    """The web nodes as the page is told them."""
+    """Return the web nodes as JSON."""
     return [asdict(page) for page in pages]
 
 
 def worker(ask: Ask) -> Content:
-    """The service worker; what lies below /static could keep only what lies there."""
+    """Return the service worker; its scope would be limited to /static if it were served there."""
     return Content(WORKER.read_bytes(), "text/javascript; charset=utf-8")
 
 
 def state(ask: Ask) -> Json:
-    """Everything that the page shows."""
+    """Return the whole state that the page shows."""
     return ask.state
 
 
@@ -48,7 +48,7 @@ ROUTES = (
     Route(
         "GET",
         f"{API}/node",
-        "Who serves, and where else the team serves the page",
+        "The serving node, and the URLs of the team's other web nodes",
         "anyone",
         node,
         gives="node, api, name, sign_in, pages (node, url, is_secure, is_self), has",
@@ -56,13 +56,13 @@ ROUTES = (
     Route(
         "GET",
         "/sw.js",
-        "What keeps the page in the browser when its node is gone",
+        "The service worker, which keeps the page in the browser",
         "anyone",
         worker,
         gives="text/javascript",
     ),
     Route(
-        "GET", f"{API}/state", "Everything that the page shows", "viewer", state, gives="node, devices, tasks, groups"
+        "GET", f"{API}/state", "The state that the page shows", "viewer", state, gives="node, devices, tasks, groups"
     ),
     Route(
         "GET",
@@ -71,23 +71,23 @@ ROUTES = (
         "viewer",
         None,
         (
-            Field("since", "text", "the last id heard", "query", least=0, most=40, default=""),
-            Field("whole", "flag", "whole states, never changes", "query", default=False),
+            Field("since", "text", "the last event id received", "query", least=0, most=40, default=""),
+            Field("whole", "flag", "send whole states instead of changes", "query", default=False),
         ),
         gives="text/event-stream",
     ),
     Route(
         "GET",
         "/shot/{uuid}",
-        "The newest picture of a camera, as soon as there is a newer one; 204 after five seconds without",
+        "The newest picture of a camera, as soon as there is a new one; 204 after five seconds without",
         "viewer",
         None,
         (
             DEVICE,
             Field("after", "text", "number of the last picture (X-Seq)", "query", least=0, default=""),
-            Field("viewer", "text", "name of who looks", "query", least=0, most=40, default=""),
+            Field("viewer", "text", "name of the viewer", "query", least=0, most=40, default=""),
         ),
         gives="image/jpeg",
     ),
-    Route("GET", "/static/{file}", "A file of the page", "anyone", None, (Field("file", "text", "its name", "path"),)),
+    Route("GET", "/static/{file}", "A file of the page", "anyone", None, (Field("file", "text", "file name", "path"),)),
 )

@@ -1,6 +1,6 @@
-"""Routes of the API's own description: the table of routes as an OpenAPI 3.1 document.
+"""Route of the API's description: the table of routes as an OpenAPI 3.1 document.
 
-What is documented is what is checked.
+Requests are checked against the same table.
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ ERROR = {
     "properties": {
         "error": {
             "type": "object",
-            "description": "Where, what, and what to do about it; for people.",
+            "description": "The field, the problem and the remedy; for people.",
             "required": ["field", "problem", "remedy"],
             "properties": {name: {"type": "string"} for name in ("field", "problem", "remedy")},
         }
     },
 }
-ABOUT = f"""What the page of a node does, and how to do it without the page.
+ABOUT = f"""The HTTP API of a node's page.
 
-An order (any method but GET) is sent as JSON, or with the header `X-Swarm: 1`, and is done once for each
-`Idempotency-Key`.  Bodies have at most {MAX_BODY // 1024} KiB; a field that a route does not know is refused.  What is
-refused is answered with a status from 400 on and an `Error`."""
+A request that changes something (any method but GET) is sent as JSON or with the header `X-Swarm: 1`, and is carried
+out once per `Idempotency-Key`.  Bodies have at most {MAX_BODY // 1024} KiB; unknown fields are rejected.  A rejected
+request is answered with a status of 400 or above and an `Error`."""
 
 
 def document(table: Sequence[Route], node: str = "") -> dict[str, Any]:
-    """The document, ready to be written as JSON; ``node`` is the name of the node that serves it."""
+    """Return the document as JSON data; ``node`` is the name of the serving node."""
     paths: dict[str, dict[str, Any]] = {}
     for route in table:
         paths.setdefault(route.path, {})[route.method.lower()] = _operation(route)
@@ -47,11 +47,11 @@ def document(table: Sequence[Route], node: str = "") -> dict[str, Any]:
         "components": {
             "schemas": {"Error": ERROR},
             "responses": {
-                "Refused": {"description": "It was refused.", "content": _json({"$ref": "#/components/schemas/Error"})}
+                "Refused": {"description": "Rejected.", "content": _json({"$ref": "#/components/schemas/Error"})}
             },
             "securitySchemes": {
                 "token": {"type": "http", "scheme": "bearer", "description": f"From POST {API}/session."},
-                "ticket": {"type": "apiKey", "in": "query", "name": "ticket", "description": "Lets look only."},
+                "ticket": {"type": "apiKey", "in": "query", "name": "ticket", "description": "Read only."},
             },
         },
     }
@@ -86,7 +86,7 @@ def _operation(route: Route) -> dict[str, Any]:
 
 
 def _answer(route: Route) -> dict[str, Any]:
-    """What is given: a media type where ``gives`` is one, else words about JSON."""
+    """Describe the response: a media type if ``gives`` is one, else text about JSON."""
     if re.fullmatch(r"\w+/[\w.+-]+", route.gives):
         return {"description": route.about, "content": {route.gives: {}}}
     if route.answer is None and route.method == "GET":
@@ -100,7 +100,7 @@ def _schema(field: Field) -> dict[str, Any]:
     if field.default not in (REQUIRED, None):
         schema["default"] = field.default
         if field.kind == "text" and field.default == "":
-            # What may be left out as an empty text may not be given as one, where there is a least length.
+            # An omitted field may be empty, but a given one has a minimum length.
             del schema["default"]
     return schema
 
@@ -118,13 +118,13 @@ def _security(route: Route) -> list[dict[str, list[str]]]:
 
 
 def _mark(is_needed: bool) -> dict[str, Any]:
-    about = "Says that no foreign site's form sends this; needed where there is no JSON."
+    about = "Shows that the request is not an HTML form of another site; required without a JSON body."
     schema = {"type": "string", "enum": ["1"]}
     return {"name": "X-Swarm", "in": "header", "required": is_needed, "description": about, "schema": schema}
 
 
 def _key() -> dict[str, Any]:
-    about = "The client's name for the order: what comes twice by one name is done once."
+    about = "The client's id of the request: requests with the same id are carried out once."
     schema = {"type": "string", "maxLength": 64, "pattern": "^[!-~]*$"}
     return {"name": "Idempotency-Key", "in": "header", "required": False, "description": about, "schema": schema}
 
@@ -135,7 +135,7 @@ def _json(schema: dict[str, Any]) -> dict[str, Any]:
 
 def _name(route: Route) -> str:
     words = re.findall(r"\w+", route.path.removeprefix(API).replace("{", "").replace("}", ""))
-    # What the page reads beside the API may have the name of a route of it.
+    # Routes outside the API may have the same name as a route of the API.
     return "_".join([route.method.lower(), *([] if route.path.startswith(API) else ["page"]), *words])
 
 
@@ -145,7 +145,7 @@ def _tag(route: Route) -> str:
 
 
 def openapi(ask: Ask) -> dict[str, Any]:
-    """The document, from the table that is asked through."""
+    """Return the OpenAPI document."""
     return document(ask.table, str(ask.state["node"]))
 
 

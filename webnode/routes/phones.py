@@ -1,6 +1,6 @@
-"""Routes of phones that take part as devices: joining, what they see, leaving.
+"""Routes of phones that take part as devices: joining, pictures, leaving.
 
-What a phone sees comes ten times a second, and passes none of the workers that pages wait for.
+A phone sends ten pictures a second; they bypass the worker threads.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from webnode.route import API, Ask, Field, Route
 from webnode.visitor import Visitor
 
 SECRET = 32
-"""Bytes of a phone's own secret, in twice as many hexadecimal digits."""
+"""Length of a phone's secret in bytes; sent as twice as many hexadecimal digits."""
 TICKET_S = 12 * 3600.0
 BOUND = "phone/"
-"""Begins the name that a ticket is made out to; the phone's uuid follows, and nobody else's looks does it let in."""
+"""Prefix of the name in a phone's ticket, before the phone's uuid; the ticket is valid for that phone only."""
 MAX_VALUES = 1000
 MOST_SIDE = 640
-"""Pixels of a side of a picture; a few bytes can claim to be far more, and would be in each viewer's memory."""
+"""Maximum side of a picture in pixels: a small file can declare huge dimensions, and viewers would decode it."""
 FPS = 10.0
 
 
 @dataclass(frozen=True)
 class Measure:
-    """A value that a look may carry."""
+    """The range of a value that a phone measures."""
 
     least: float
     most: float
@@ -52,21 +52,21 @@ MEASURES: Mapping[str, Measure] = {
     "position.accuracy": Measure(0.0, 1e6, "m"),
 }
 TOGETHER = (("target.bearing", "target.distance"), ("position.lat", "position.lon"))
-"""Neither says anything without the other."""
+"""Pairs of values of which both or none have to be present."""
 
 
 def join(ask: Ask) -> Deferred[Json]:
-    """Let a phone take part."""
+    """Register a phone as a device."""
     if ask.board.phones is None:
-        raise Refusal("phone", "this node takes no phones", "look at another web node", 409)
+        raise Refusal("phone", "this node does not accept phones", "use another web node", 409)
     if ask.who.name.startswith(BOUND):
-        raise Refusal("ticket", "it is good for one phone's looks alone", "sign in, and join with that", 403)
+        raise Refusal("ticket", "it is valid for one phone's pictures only", "sign in and use that token", 403)
     given = ask.given
     secret, name = given["secret"], given["name"]
     if not re.fullmatch(rf"[0-9a-fA-F]{{{2 * SECRET}}}", secret):
-        raise Refusal("secret", "it is no secret of a phone", f"give {2 * SECRET} hexadecimal digits, always the same")
+        raise Refusal("secret", "invalid secret", f"send {2 * SECRET} hexadecimal digits, always the same")
     if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
-        raise Refusal("name", "a device is not called so", "give 1 to 40 letters, digits, _ or -")
+        raise Refusal("name", "invalid device name", "send 1 to 40 letters, digits, _ or -")
     can = {key: given[key] for key in ("width", "height", "orientation", "position")}
 
     def joined(uuid: str) -> Json:
@@ -77,29 +77,29 @@ def join(ask: Ask) -> Deferred[Json]:
 
 
 def values_of(text: str) -> dict[str, float]:
-    """What was measured with a picture; raises ``Refusal``."""
+    """Parse the values measured with a picture; raises ``Refusal``."""
     try:
         found = json.loads(text or "{}") if len(text) <= MAX_VALUES else None
     except (ValueError, RecursionError):
         found = None
     if not isinstance(found, dict):
-        raise Refusal("values", "it is no JSON object", 'give something like {"target.bearing": 0.1}')
+        raise Refusal("values", "not a JSON object", 'send for example {"target.bearing": 0.1}')
     for name, value in found.items():
         measure = MEASURES.get(name)
         if measure is None:
-            raise Refusal("values", f"{name[:40]!r} is no measure", f"give some of {', '.join(MEASURES)}")
+            raise Refusal("values", f"unknown value {name[:40]!r}", f"send some of {', '.join(MEASURES)}")
         is_number = isinstance(value, int | float) and not isinstance(value, bool)
         if not is_number or not measure.least <= value <= measure.most:
             bounds = f"{measure.least:.4g} to {measure.most:.4g} {measure.unit}"
-            raise Refusal("values", f"{name} is out of range", f"give a number from {bounds}")
+            raise Refusal("values", f"{name} is out of range", f"send a number from {bounds}")
     for pair in TOGETHER:
         if len([name for name in pair if name in found]) == 1:
-            raise Refusal("values", f"{' and '.join(pair)} go together", "give both, or neither")
+            raise Refusal("values", f"{' and '.join(pair)} belong together", "send both, or neither")
     return {name: float(value) for name, value in found.items()}
 
 
 class OfPhone(JsonResource):
-    """What a phone sends of itself, by its own ticket, or an operator in its name."""
+    """Native resource for a phone's requests, authorized by its ticket or by an operator."""
 
     isLeaf = True
     methods = (b"POST",)
@@ -107,32 +107,32 @@ class OfPhone(JsonResource):
     def __init__(self, board: Board, take: Callable[[Board, Phones, str, Request], Json]) -> None:
         super().__init__()
         self._board = board
-        self._take = take
+        self._handle = take
 
     def render_POST(self, request: Request) -> bytes:
-        """Take what the phone sends, or say why not."""
+        """Process the request, or refuse it."""
         uuid = request.prepath[-2].decode("ascii", "replace")  # type: ignore[attr-defined]
         who = who_asks(request)
         try:
             if self._board.phones is None:
-                raise Refusal("phone", "this node takes no phones", "look at another web node", 409)
+                raise Refusal("phone", "this node does not accept phones", "use another web node", 409)
             if who.role == "phone" and who.name != f"{BOUND}{uuid}":
-                raise Refusal("ticket", "it is another phone's", f"join by POST {API}/phones", 403)
-            told = self._take(self._board, self._board.phones, uuid, request)
+                raise Refusal("ticket", "it belongs to another phone", f"join by POST {API}/phones", 403)
+            reply = self._handle(self._board, self._board.phones, uuid, request)
         except Refusal as refusal:
             return answer(request, refusal)
         request.setHeader("Content-Type", "application/json")
         request.setHeader("Cache-Control", "no-store")
-        return json.dumps(told).encode()
+        return json.dumps(reply).encode()
 
 
 def who_asks(request: Request) -> Visitor:
-    """Who asks a native resource."""
+    """Return the visitor of a native request."""
     return getattr(request, "who", Visitor())
 
 
 def look(board: Board, phones: Phones, uuid: str, request: Request) -> Json:
-    """Hand on one picture, and what was measured with it."""
+    """Take one picture and its measured values."""
     given: bytes = (request.args or {}).get(b"values", [b""])[0]
     values = values_of(given.decode("utf-8", "replace"))
     wanted = phones.look(uuid, request.content.read() if request.content is not None else b"", values)
@@ -140,7 +140,7 @@ def look(board: Board, phones: Phones, uuid: str, request: Request) -> Json:
 
 
 def leave(board: Board, phones: Phones, uuid: str, request: Request) -> Json:
-    """Let the phone go: the last word of a page that is closed or hidden."""
+    """Remove the phone; sent by a page that is closed or hidden."""
     phones.leave(uuid)
     source = str(getattr(request.getClientAddress(), "host", ""))
     board.audit.note(who_asks(request), source, f"POST {API}/phones/{{uuid}}/leave", uuid[:64], "200")
@@ -152,24 +152,26 @@ ROUTES = (
     Route(
         "POST",
         f"{API}/phones",
-        "Let a phone take part as a device, with this node as its way into the team; again, where it does already",
+        "Register a phone as a device, which this node connects to the team; can be repeated",
         "phone",
         join,
         (
-            Field("secret", "text", "its own, as hexadecimal digits: one secret is one device", most=2 * SECRET),
-            Field("name", "text", "what people call it: letters, digits, _ or -", most=40),
+            Field(
+                "secret", "text", "the phone's secret in hexadecimal digits; it identifies the device", most=2 * SECRET
+            ),
+            Field("name", "text", "display name: letters, digits, _ or -", most=40),
             Field("width", "whole", "of its pictures", least=16, most=MOST_SIDE, unit="pixels"),
             Field("height", "whole", "of its pictures", least=16, most=MOST_SIDE, unit="pixels"),
-            Field("orientation", "flag", "whether it tells how it is held", default=False),
-            Field("position", "flag", "whether it tells where it is", default=False),
+            Field("orientation", "flag", "whether it measures its orientation", default=False),
+            Field("position", "flag", "whether it measures its position", default=False),
         ),
-        gives="uuid, ticket (for its looks and no others, in the query), until (unix seconds), fps",
+        gives="uuid, ticket (for its pictures only, in the query), until (unix seconds), fps",
         limit_s=4.5,
     ),
     Route(
         "POST",
         f"{API}/phones/{{uuid}}/look",
-        "A picture that the phone took, and what it measured with it",
+        "A picture of the phone, and the values measured with it",
         "phone",
         None,
         (
@@ -177,7 +179,7 @@ ROUTES = (
             Field(
                 "values",
                 "text",
-                "what was measured, as a JSON object: "
+                "measured values as a JSON object: "
                 + ", ".join(f"{name} ({measure.unit})" for name, measure in MEASURES.items()),
                 "query",
                 least=0,
@@ -185,14 +187,14 @@ ROUTES = (
                 default="",
             ),
         ),
-        gives="fps (so many a second are wanted), say (words for who holds it)",
+        gives="fps (requested pictures per second), say (text to show on the phone)",
         native=lambda board, reactor: OfPhone(board, look),
         takes="image/jpeg",
     ),
     Route(
         "POST",
         f"{API}/phones/{{uuid}}/leave",
-        "Let the phone go",
+        "Remove the phone from the team",
         "phone",
         None,
         (UUID,),

@@ -1,4 +1,4 @@
-"""Routes of the session: signing in and out, and inviting others."""
+"""Routes of the session: sign in, sign out, and invite others."""
 
 from __future__ import annotations
 
@@ -22,85 +22,90 @@ MAX_INVITED_S = MAX_SIGNED_S
 
 
 def sign_in(ask: Ask) -> Deferred[Json]:
-    """Sign in with one of the two."""
+    """Sign in with a code or a password."""
     code, password = ask.given["code"], ask.given["password"]
     if bool(code) == bool(password):
-        problem = "code and password are both there" if code else "it is missing or empty"
-        raise Refusal("code", problem, 'give {"code": "..."} or {"password": "..."}')
-    return ask.board.sessions.sign_in(code or password, ask.source, ask.now).addCallback(_told)
+        problem = "both code and password are given" if code else "it is missing or empty"
+        raise Refusal("code", problem, 'send {"code": "..."} or {"password": "..."}')
+    return ask.board.sessions.sign_in(code or password, ask.source, ask.now).addCallback(_token_fields)
 
 
 def session(ask: Ask) -> Json:
-    """Who asks."""
+    """Return the name and role of the visitor."""
     return {"name": ask.who.name, "role": ask.who.role}
 
 
 def sign_out(ask: Ask) -> Json:
-    """Let in nobody with this token any more."""
+    """End the session."""
     if ask.who.token_id:
-        # What was renewed elsewhere, a moment ago, ends with it.
+        # Another web node may have renewed the session just now; that token ends as well.
         until = min(ask.who.limit, max(ask.who.until, ask.now + SIGNED_S))
         ask.board.sessions.revoke(ask.who.token_id, until)
     return {}
 
 
 def renew(ask: Ask) -> Json:
-    """Another token for who asks."""
-    return _told(ask.board.sessions.renewed(ask.who, ask.now))
+    """Return another token for the session."""
+    return _token_fields(ask.board.sessions.renewed(ask.who, ask.now))
 
 
 def passes(ask: Ask) -> Json:
-    """What lets the page of who asks go on at the team's other web nodes."""
+    """Return tokens with which the page can continue at the team's other web nodes."""
     nodes = [page.node for page in ask.board.fallbacks.here() if not page.is_self]
-    return {node: _told(token) for node, token in ask.board.sessions.passes(ask.who, nodes, ask.now).items()}
+    return {node: _token_fields(token) for node, token in ask.board.sessions.passes(ask.who, nodes, ask.now).items()}
 
 
 def invite(ask: Ask) -> Any:
-    """A token for somebody else, and the link by which a person comes with it."""
+    """Return a token for a guest, and the link with which the guest opens the page."""
     given, invites = ask.given, ask.board.invites
     urls = [] if invites is None else invites.urls()
     if given["page"] and given["page"] not in urls:
-        raise Refusal("page", "this node does not serve it", f"choose one of {', '.join(urls) or 'none'}")
+        raise Refusal("page", "not a URL of this node's page", f"choose one of {', '.join(urls) or 'none'}")
     token = ask.board.sessions.token(ask.who, given["name"], given["role"], ask.now, given["seconds"])
     if invites is None or not urls:
-        return _told(token)
+        return _token_fields(token)
     url = given["page"] or urls[0]
     link = f"{url}/#code={token.text}" + ("/phone" if token.role == "phone" else "")
-    told: dict[str, Json] = {**_told(token), "link": link, **_reach(url), **_authority(invites, urls)}
-    told["pages"] = [*urls]
+    answer: dict[str, Json] = {
+        **_token_fields(token),
+        "link": link,
+        **_url_fields(url),
+        **_authority_fields(invites, urls),
+    }
+    answer["pages"] = [*urls]
     if not given["draw"]:
-        return told
-    drawn = gatherResults([invites.drawn(text) for text in (link, str(told["certificate"]))], consumeErrors=True)
-    return drawn.addCallback(partial(_with_codes, told))
+        return answer
+    qr_codes = gatherResults([invites.drawn(text) for text in (link, str(answer["certificate"]))], consumeErrors=True)
+    return qr_codes.addCallback(partial(_with_codes, answer))
 
 
 def authority(ask: Ask) -> Content:
-    """The certificate that a browser has to trust, for whoever comes: it is no secret."""
+    """Return the certificate authority that a browser has to trust; it is public."""
     pem = b"" if ask.board.invites is None else ask.board.invites.authority
     if not pem:
-        raise Refusal("certificate", "the page is not served over TLS", "set tls = 'auto' below [web]", 404)
+        raise Refusal("certificate", "the page is not served over TLS", 'set tls = "auto" below [web]', 404)
     return Content(pem, "application/x-x509-ca-cert")
 
 
-def _with_codes(told: dict[str, Json], codes: list[str]) -> Json:
-    return {**told, "code": codes[0], "certificate_code": codes[1]}
+def _with_codes(answer: dict[str, Json], codes: list[str]) -> Json:
+    return {**answer, "code": codes[0], "certificate_code": codes[1]}
 
 
-def _reach(url: str) -> dict[str, Json]:
-    """Who can open a page at ``url``, and whether a browser gives it the camera."""
+def _url_fields(url: str) -> dict[str, Json]:
+    """Return who can open a page at ``url``, and whether the browser allows it to use the camera."""
     is_here = is_loopback(urlsplit(url).hostname or "")
     return {"is_secure": url.startswith("https:"), "reaches": "machine" if is_here else "network"}
 
 
-def _authority(invites: TeamInvites, urls: list[str]) -> dict[str, Json]:
-    """Where the authority is to be had: without TLS, as who lacks it is warned of the other way."""
+def _authority_fields(invites: TeamInvites, urls: list[str]) -> dict[str, Json]:
+    """Return the URL of the authority, without TLS, as a browser that lacks it would show a warning."""
     if not invites.authority:
         return {"certificate": "", "fingerprint": ""}
     plain = next((url for url in urls if url.startswith("http:")), urls[0])
     return {"certificate": f"{plain}{API}/ca.crt", "fingerprint": invites.fingerprint}
 
 
-def _told(token: Token) -> dict[str, Json]:
+def _token_fields(token: Token) -> dict[str, Json]:
     return {"token": token.text, "ticket": token.ticket, "role": token.role, "until": token.until}
 
 
@@ -108,7 +113,7 @@ ROUTES = (
     Route(
         "POST",
         f"{API}/session",
-        "Sign in, with the code that is printed at start (`swarm web` tells it, too), an invitation, or the password",
+        "Sign in with the code printed at start (also shown by `swarm web`), an invitation, or the password",
         "anyone",
         sign_in,
         (
@@ -116,14 +121,14 @@ ROUTES = (
             Field("password", "text", "the password", default=""),
         ),
         gives="token, ticket, role, until (unix seconds)",
-        # A password takes a small device a while.
+        # Checking a password takes a small device some time.
         limit_s=4.5,
     ),
-    Route("GET", f"{API}/session", "Who asks: anyone, until signed in", "anyone", session, gives="name, role"),
+    Route("GET", f"{API}/session", "The visitor; anyone if not signed in", "anyone", session, gives="name, role"),
     Route(
         "PUT",
         f"{API}/session",
-        "Go on being signed in: another token for the session of the one that is sent, which stays good for its time",
+        "Renew the session: another token for it; the present token stays valid until its expiry",
         "viewer",
         renew,
         gives="token, ticket, role, until (unix seconds)",
@@ -131,8 +136,8 @@ ROUTES = (
     Route(
         "GET",
         f"{API}/session/passes",
-        "Tokens for the same session at the team's other web nodes, by uuid: each good at that one, for minutes; "
-        "there PUT session makes a session of it",
+        "Tokens for the same session at the team's other web nodes, by uuid: each valid only there, for minutes; "
+        "PUT session at that node renews it",
         "viewer",
         passes,
         gives="uuid: token, ticket, role, until (unix seconds)",
@@ -141,23 +146,23 @@ ROUTES = (
     Route(
         "POST",
         f"{API}/invitations",
-        "A token for somebody else: a link for a person, who signs in by it, or for a program, which uses it as it is",
+        "A token for a guest: as a link for a person, who signs in with it, or for a program, which uses it directly",
         "operator",
         invite,
         (
-            Field("role", "choice", "what it lets do", choices=("viewer", "phone", "operator")),
-            Field("name", "text", "who it is for", most=40, default="guest"),
+            Field("role", "choice", "role of the guest", choices=("viewer", "phone", "operator")),
+            Field("name", "text", "name of the guest", most=40, default="guest"),
             Field(
                 "seconds",
                 "number",
-                "for how long",
+                "validity",
                 least=1,
                 most=MAX_INVITED_S,
                 default=INVITED_S,
                 unit="s",
             ),
-            Field("page", "text", "at which of this node's pages", least=0, default=""),
-            Field("draw", "flag", "as QR codes, too", default=False),
+            Field("page", "text", "URL of the page, one of this node's", least=0, default=""),
+            Field("draw", "flag", "also draw QR codes", default=False),
         ),
         gives="token, ticket, role, until (unix seconds), link, reaches (network, or this machine), is_secure, pages, "
         "certificate (URL), fingerprint, code (SVG), certificate_code",
@@ -165,7 +170,7 @@ ROUTES = (
     Route(
         "GET",
         f"{API}/ca.crt",
-        "This node's authority, which a browser has to trust to open its page over TLS without a warning",
+        "The certificate authority of this node, to be trusted by browsers that open its page over TLS",
         "anyone",
         authority,
         gives="application/x-x509-ca-cert",

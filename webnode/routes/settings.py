@@ -1,4 +1,4 @@
-"""Routes of the settings of devices that can be changed while they run; each device checks its own."""
+"""Routes of the settings of devices that can change at runtime; each device validates its own."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from webnode.route import API, DEVICE, Ask, Field, Route, device
 from webnode.team import TeamDesk
 
 Row = dict[str, Json]
-"""A setting as the page is told it."""
+"""A setting in JSON."""
 KNOBS = (
     Field("description", "text", "a line about the device", least=0, most=200, default=None),
-    Field("presence_lease", "number", "how long the others believe in it without a sign", default=None, unit="s"),
-    Field("capabilities", "table", "what it can do beyond what its driver says", default=None),
-    Field("camera_fps", "number", "pictures that its camera takes", default=None, unit="per second"),
+    Field("presence_lease", "number", "time until the others drop it if it is silent", default=None, unit="s"),
+    Field("capabilities", "table", "capabilities in addition to those of its driver", default=None),
+    Field("camera_fps", "number", "pictures of its camera", default=None, unit="per second"),
 )
 
 
 def read_settings(desk: TeamDesk, uuid: str) -> Deferred[list[Row]]:
-    """Return the settings of a device that can be changed, as the page is told them."""
+    """Read the settings of a device that can change at runtime."""
     return desk.call(uuid, SETTINGS).addCallback(_rows)
 
 
 def change_settings(desk: TeamDesk, uuid: str, changes: Mapping[str, Json]) -> Deferred[list[Row]]:
-    """Change all of ``changes`` or none; fails with ``Refusal``: 400 names the setting, 409 and 504 the device."""
+    """Change all of ``changes`` or none; fails with ``Refusal`` 400 for a setting, 409 and 504 for the device."""
     return desk.call(uuid, TUNE, dict(changes), refused=_refusal).addCallback(_rows)
 
 
@@ -42,7 +42,7 @@ def _change(ask: Ask) -> Any:
     uuid = device(ask)["uuid"]
     changes = {knob.name: ask.given[knob.name] for knob in KNOBS if ask.given[knob.name] is not None}
     if not changes:
-        raise Refusal("body", "it names no setting", f"give some of {', '.join(knob.name for knob in KNOBS)}")
+        raise Refusal("body", "no setting given", f"send some of {', '.join(knob.name for knob in KNOBS)}")
     return change_settings(ask.board.desk, uuid, changes)
 
 
@@ -52,12 +52,12 @@ def _rows(answer: object) -> list[Row]:
 
 
 def _row(key: object, value: object, about: object, unit: object, least: object, most: object) -> Row:
-    lawful: Any = (
+    valid: Any = (
         properties(value) if isinstance(value, dict) else text(value) if isinstance(value, str) else number(value)
     )
     return {
         "key": text(key, limit=64),
-        "value": lawful,
+        "value": valid,
         "about": text(about),
         "unit": text(unit, limit=20),
         "least": None if least is None else number(least),
@@ -67,7 +67,7 @@ def _row(key: object, value: object, about: object, unit: object, least: object,
 
 
 def _refusal(refused: Refused) -> Refusal | None:
-    """What a device says is wrong with a setting; None where it says no to something else."""
+    """Return the error of a setting as the device reports it; None for any other refusal."""
     key, _, words = str(refused).partition(": ")
     problem, _, remedy = words.rpartition("; ")
     return Refusal(text(key), text(problem), text(remedy)) if refused.code == WRONG and problem else None
@@ -80,7 +80,7 @@ ROUTES = (
     Route(
         "PUT",
         PATH,
-        "Change some of them; the device checks all before any",
+        "Change some of them; the device validates all before it changes any",
         "operator",
         _change,
         (DEVICE, *KNOBS),

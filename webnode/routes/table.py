@@ -1,4 +1,4 @@
-"""Table: every route of the API, from the ``ROUTES`` of each module of this package."""
+"""Collect the routes of the API from the ``ROUTES`` of each module of this package."""
 
 from __future__ import annotations
 

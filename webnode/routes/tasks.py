@@ -1,4 +1,4 @@
-"""Routes of the tasks: what there is to do, what is done, and what an operator wants of it."""
+"""Routes of the tasks: list, catalogue, assignment, and orders of the operator."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ TASK = Field("task_id", "text", "the task", "path", most=64)
 
 
 def tasks(ask: Ask) -> Json:
-    """All of them."""
+    """Return all tasks."""
     listed: Json = ask.state["tasks"]
     return listed
 
 
 def catalogue(ask: Ask) -> Json:
-    """Those that can be assigned."""
+    """Return the predefined tasks."""
     return [dict(task) for task in ask.board.desk.catalogue()]
 
 
@@ -32,16 +32,16 @@ def demo(ask: Ask) -> Any:
 
 
 def assign(ask: Ask) -> Any:
-    """Assign one; the answer may be its id alone."""
+    """Assign a predefined task."""
     given = ask.given["name"], ask.given["tolerates"], ask.given["group"]
     return maybeDeferred(ask.board.desk.assign, *given, _id(ask, "task")).addCallback(_named)
 
 
 def _id(ask: Ask, what: str) -> str:
-    """The id of the task that this wish makes; any where its visitor gave it no name.
+    """Derive the id of the new task from the idempotency key; empty without a key.
 
-    It is the same at every web node: a page whose node died before it answered asks the next one, and only the task's
-    own name tells that one whether the wish is new.
+    It is the same at every web node: a page whose node failed before answering repeats the request at another one,
+    which recognizes it by the id of the task.
     """
     if not ask.id:
         return ""
@@ -55,17 +55,17 @@ def _named(answer: Any) -> Json:
 
 
 def preview(ask: Ask) -> Any:
-    """Who could take one."""
+    """Return which devices can take a predefined task."""
     return ask.board.desk.preview(ask.given["name"], ask.given["group"])
 
 
 def _order(word: str, about: str, wish: Callable[[Ask], Callable[[str], Any]]) -> Route:
-    """The route that orders ``word`` of a task that is there."""
+    """Return the route of the order ``word`` for an existing task."""
 
     def answer(ask: Ask) -> Json:
         task_id = ask.given["task_id"]
         if task_id not in [task["id"] for task in ask.state["tasks"]]:
-            raise Refusal("task", "there is no such task", f"choose one of {API}/tasks", 404)
+            raise Refusal("task", "unknown task", f"choose one of {API}/tasks", 404)
         wish(ask)(task_id)
         return {"id": task_id}
 
@@ -73,8 +73,8 @@ def _order(word: str, about: str, wish: Callable[[Ask], Callable[[str], Any]]) -
     return Route("POST", path, about, "operator", answer, (TASK,), gives="id", status=202)
 
 
-NAME = Field("name", "text", "its name in the catalogue", most=64)
-GROUP = Field("group", "text", "tasks of one group are divided together", most=64, default="")
+NAME = Field("name", "text", "name in the catalogue", most=64)
+GROUP = Field("group", "text", "tasks of one group are divided among the devices together", most=64, default="")
 ROUTES = (
     Route("GET", f"{API}/tasks", "The tasks, the newest first", "viewer", tasks, gives="a list of tasks"),
     Route(
@@ -88,7 +88,7 @@ ROUTES = (
     Route(
         "POST",
         f"{API}/demo",
-        "Run Demo: cancels open tasks, takes the target away, assigns the demonstration's task, places it 5 s later",
+        "Run Demo: cancel open tasks, remove the target, assign the demonstration's task, place the target 5 s later",
         "operator",
         demo,
         gives="id",
@@ -105,27 +105,27 @@ ROUTES = (
             Field(
                 "tolerates",
                 "whole",
-                "members of its council that may be lost at once",
+                "members of its council that may fail at once",
                 least=1,
                 most=3,
                 default=1,
             ),
             GROUP,
         ),
-        gives="id, able, refused (why, by name)",
+        gives="id, able, refused (reasons by name)",
         status=202,
     ),
     Route(
         "POST",
         f"{API}/tasks/preview",
-        "Who could take a predefined task and who not, and why; nothing is assigned",
+        "Which devices can take a predefined task, and why others cannot; assigns nothing",
         "viewer",
         preview,
         (NAME, GROUP),
-        gives="able (uuid, name, busy: its task now), refused (why, by name), likely (a name, or null), "
-        "together (id, title: what the group divides it with)",
+        gives="able (uuid, name, busy: its current task), refused (reasons by name), likely (a name, or null), "
+        "together (id, title: tasks that the group divides with it)",
     ),
-    _order("cancel", "End a task; nobody is granted it any more", lambda ask: ask.board.desk.cancel),
-    _order("pause", "Let a task rest; its devices stop and are free for others", lambda ask: ask.board.desk.pause),
-    _order("resume", "Let a task go on from where it was", lambda ask: ask.board.desk.resume),
+    _order("cancel", "End a task; its lease is no longer granted", lambda ask: ask.board.desk.cancel),
+    _order("pause", "Pause a task; its devices stop and are free for other tasks", lambda ask: ask.board.desk.pause),
+    _order("resume", "Resume a paused task", lambda ask: ask.board.desk.resume),
 )

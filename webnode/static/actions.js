@@ -1,4 +1,4 @@
-// Actions of an operator that are not needed at the first sight of the page: each is loaded when it is wanted.
+// Panels for operators that are not part of the first view; each is loaded when it is needed.
 import { panel } from "./panel.js";
 
 const operator = { role: "operator" };

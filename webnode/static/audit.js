@@ -1,4 +1,4 @@
-// The audit: who changed what through this node, for operators; fetched when it is opened and not before.
+// The audit log: changes made through this node, for operators; fetched when it is opened.
 import { element, keyed, words } from "./element.js";
 
 const SHOWN = 50;
@@ -20,13 +20,13 @@ function tell(item, line) {
 export function make(root, { get }) {
   const list = element("ol", { class: "audit" });
   const line = element("p", { role: "status" });
-  const again = element("button", { type: "button" }, "Look again");
-  const box = element("details", {}, element("summary", {}, "Who changed what"), line, list, again);
+  const again = element("button", { type: "button" }, "Refresh");
+  const box = element("details", {}, element("summary", {}, "Audit log"), line, list, again);
   async function look() {
     try {
       const lines = await get(`audit?count=${SHOWN}`);
       keyed(list, lines, (each) => `${each.at} ${each.session} ${each.route} ${each.target}`, row, tell);
-      words(line, lines.length ? "" : "Nobody has changed anything so far.");
+      words(line, lines.length ? "" : "No changes so far.");
     } catch (error) {
       words(line, error.message);
     }

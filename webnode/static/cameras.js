@@ -1,11 +1,11 @@
-// Cameras: one loop each, one picture in flight each; the newest wins, and nothing is fetched that nobody sees.
+// Cameras: one loop and one picture in flight per camera; a camera that is not in view fetches nothing.
 import { at, attribute, element, keyed, words } from "./element.js";
 import { frames } from "./link.js";
 import { panel } from "./panel.js";
 
 const cameras = new Map();
 const figures = new WeakMap();
-// One looks for all: which figures are in sight.
+// One observer for all figures: which of them are in view.
 const sight = new IntersectionObserver((entries) => {
   for (const { target, isIntersecting } of entries) figures.get(target)?.seen(isIntersecting);
 });
@@ -39,7 +39,7 @@ class Camera {
     return this.visible && !this.gone && !this.closed && !document.hidden;
   }
 
-  // Start the loop where it is wanted and does not run; end the question in flight where it is not.
+  // Start the loop if the camera is in view, else abort the request in flight.
   turn() {
     if (!this.wanted) this.flight?.abort();
     else if (!this.flight) this.loop();
@@ -70,7 +70,7 @@ class Camera {
     this.flight = null;
   }
 
-  // Ask the node that serves now; what the last one still owes is of no use.
+  // Request from the node that serves now; a pending answer of the last node is of no use.
   renew() {
     this.seq = "";
     this.moved = this.flight !== null;
@@ -116,7 +116,7 @@ function showCameras(devices) {
     (figure, device) => {
       const camera = cameras.get(device.uuid);
       words(camera.name, device.name);
-      attribute(camera.canvas, "aria-label", `What ${device.name} sees`);
+      attribute(camera.canvas, "aria-label", `Camera of ${device.name}`);
       camera.gone = device.gone !== null;
       camera.turn();
     });

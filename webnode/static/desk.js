@@ -1,4 +1,4 @@
-// The desk: an operator's wishes on their way to the node, and the one line that says what came of them.
+// The desk: sends an operator's requests to the node, and shows the result in the status line.
 import { alike, at, several, words } from "./element.js";
 import { ask } from "./link.js";
 
@@ -6,14 +6,14 @@ export function say(text) {
   words(at("line"), text);
 }
 
-// Who has a message, and who has not, and why.
+// Describe who received a message, and why others did not.
 export function delivery({ delivered = [], failed = {} }) {
-  const no = alike(failed).map(([names, why]) => ` ${several(names)} ${names.length > 1 ? "have" : "has"} it not: ${why}.`).join("");
+  const no = alike(failed).map(([names, why]) => ` Not delivered to ${several(names)}: ${why}.`).join("");
   const yes = delivered.length ? ` to ${several(delivered)}` : "";
-  return no && !yes ? `Nobody has the message.${no}` : `Message sent${yes}.${no}`;
+  return no && !yes ? `Message not delivered.${no}` : `Message sent${yes}.${no}`;
 }
 
-// Ask, and say in a line what happened; true where the wish was taken.
+// Send a request and show its result in a line; true if it was accepted.
 export async function wish(doing, path, { body, method = "POST", done, line = say } = {}) {
   line(`${doing} …`);
   try {

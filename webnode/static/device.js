@@ -1,4 +1,4 @@
-// Device: the dialog with what is known of one, and what it can be told.
+// Device: the dialog with the details of one device, and the orders to it.
 import { at, element, keyed, sojourn, words } from "./element.js";
 import { delivery, wish } from "./desk.js";
 import { back } from "./shell.js";
@@ -30,7 +30,7 @@ function facts(list, entries) {
 function fill() {
   const device = devices.get(open);
   if (!device) {
-    words(at("d-status"), "This device has left the network and is no longer remembered.");
+    words(at("d-status"), "This device has left the network.");
     return;
   }
   words(at("d-name"), device.name);
@@ -66,7 +66,7 @@ function startDevice() {
     event.preventDefault();
     const seconds = Number(at("d-seconds").value);
     wish("Disconnecting", `devices/${open}/disconnect`,
-      { body: { seconds }, line, done: () => `It leaves the network and comes back after ${seconds} s.` });
+      { body: { seconds }, line, done: () => `The device leaves the network and returns after ${seconds} s.` });
   });
 }
 

@@ -1,4 +1,4 @@
-// Devices: the list in the order of joining, and of many of them those that are looked for.
+// Devices: the list in the order of joining, with a filter if it is long.
 import { at, attribute, badge, element, keyed, sojourn, state, words } from "./element.js";
 import { delivery, say, wish } from "./desk.js";
 import { panel } from "./panel.js";
@@ -26,7 +26,7 @@ function showDevices(list) {
   showFound();
 }
 
-// Those that have each word of the filter somewhere.
+// Show the devices that contain each word of the filter.
 function showFound() {
   const asked = at("filter").hidden ? [] : at("filter").value.toLowerCase().split(" ").filter(Boolean);
   const found = asked.length ? devices.filter((device) => asked.every((word) => described(device).includes(word))) : devices;
@@ -36,7 +36,7 @@ function showFound() {
   keyed(at("devices"), found, (device) => device.uuid, row, update);
 }
 
-// Ages are told in seconds, so they are looked at no more often.
+// Ages are shown in seconds, so they are updated once a second.
 function tellTime(moment) {
   now = moment;
   if (Math.abs(now - told) < 1) return;
@@ -51,7 +51,7 @@ function row(device) {
     element("b"), badge(), element("span", { class: "kind" }), age, element("span", { class: "objective" }));
   let pointer = "mouse";
   button.addEventListener("pointerdown", (event) => { pointer = event.pointerType; });
-  // A tap or Enter opens at once; with a mouse one click only marks, as the double click is what opens.
+  // A tap or Enter opens the device; with a mouse a double click does.
   button.addEventListener("click", (event) => { if (event.detail === 0 || pointer !== "mouse") go(`device/${device.uuid}`); });
   button.addEventListener("dblclick", () => go(`device/${device.uuid}`));
   const item = element("li", {}, button);
@@ -59,7 +59,7 @@ function row(device) {
   return item;
 }
 
-// Of a thousand devices few are other than before: the row of one that is the same is left alone.
+// Skip the row of a device that has not changed: of a thousand devices few change at a time.
 function update(item, device) {
   const shown = items.get(device.uuid);
   if (shown.device === device) return;

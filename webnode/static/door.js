@@ -1,7 +1,7 @@
-// The door: asks for the code, or the password, until one is right; fetched by who is not let in yet.
+// The sign-in dialog: asks for the code or password until one is accepted; loaded if the visitor is not signed in.
 import { element, words } from "./element.js";
 
-// Resolves when `signIn` takes what was typed; `trouble` is shown at first.
+// Resolve when `signIn` accepts the input; `trouble` is shown first.
 export function asked(trouble, signIn) {
   return new Promise((done) => {
     const line = element("p", { role: "alert" }, trouble);
@@ -10,7 +10,7 @@ export function asked(trouble, signIn) {
     const enterButton = element("button", { class: "primary" }, "Sign in");
     const form = element("form", {},
       element("h2", { id: "h-signin" }, "Sign in"),
-      element("p", { class: "hint" }, "The code stands where the node was started; there, the command swarm web tells it, too."),
+      element("p", { class: "hint" }, "The node prints the code when it starts; the command swarm web shows it, too."),
       element("label", { for: "signin-code" }, "Code or password"),
       element("div", { class: "row" }, field, show), line, enterButton);
     const dialog = element("dialog", { id: "signin", "aria-labelledby": "h-signin", closedby: "none" }, form);
@@ -20,7 +20,7 @@ export function asked(trouble, signIn) {
       words(show, hidden ? "Hide" : "Show");
       show.setAttribute("aria-pressed", String(hidden));
     };
-    // Nothing is behind it that could be used.
+    // The page behind the dialog cannot be used, so it stays open.
     dialog.oncancel = (event) => event.preventDefault();
     dialog.onclose = () => { if (dialog.isConnected) dialog.showModal(); };
     form.onsubmit = async (event) => {

@@ -1,4 +1,4 @@
-// Elements: making them, and keeping a list of them in step with data without rebuilding what a person is using.
+// Elements: create them, and update lists of them without rebuilding the ones that a person is using.
 const SVG = "http://www.w3.org/2000/svg";
 
 export const at = (id) => document.getElementById(id);
@@ -17,7 +17,7 @@ export function drawn(tag, attributes = {}, ...children) {
   return node;
 }
 
-// Text changes only when the words do: a screen reader hears no repetition.
+// Change a text only if it differs, so that a screen reader does not repeat it.
 export function words(node, text) {
   if (node.textContent !== text) node.textContent = text;
 }
@@ -26,7 +26,7 @@ export function attribute(node, name, value) {
   if (node.getAttribute(name) !== String(value)) node.setAttribute(name, value);
 }
 
-// One child for each item, in order; `make` once for a new key, `update` each time.  Items of one key have one child each.
+// One child per item, in order; `make` is called once for a new key, `update` each time.  Keys may repeat.
 export function keyed(parent, items, key, make, update) {
   const old = new Map();
   for (const child of parent.children) old.set(child.dataset.key, [...(old.get(child.dataset.key) ?? []), child]);
@@ -43,7 +43,7 @@ export function keyed(parent, items, key, make, update) {
   for (const child of [...old.values()].flat()) child.remove();
 }
 
-// A shape for each state, so that no state is told by colour alone.
+// A shape for each state, so that a state does not depend on colour alone.
 const SHAPES = {
   IDLE: "M8 2.5a5.5 5.5 0 1 0 .01 0zM8 5a3 3 0 1 1-.01 0z",
   ASSIGNED: "M8 1.5 14.5 8 8 14.5 1.5 8zM8 5 5 8l3 3 3-3z",
@@ -69,13 +69,13 @@ export function state(node, status) {
   words(node.lastChild, status.toLowerCase());
 }
 
-// The first of them, and how many more there are.
+// The first names, and the number of further ones.
 export function several(names, most = 8) {
   const more = names.length - most;
   return more > 1 ? `${names.slice(0, most).join(", ")} and ${more} more` : names.join(", ");
 }
 
-// Who has the same reasons, with them: [names, reasons] each.
+// Group names by equal reasons: [names, reasons] each.
 export function alike(refused) {
   const found = new Map();
   for (const [name, reasons] of Object.entries(refused)) {
@@ -92,5 +92,5 @@ export function span(seconds) {
   return s < 86400 ? `${Math.floor(s / 3600)} h` : `${Math.floor(s / 86400)} d`;
 }
 
-// How long a device is here, or gone.
+// The time since a device joined or left.
 export const sojourn = ({ gone, since }, now) => (gone === null ? `here ${span(now - since)}` : `gone ${span(now - gone)}`);

@@ -1,4 +1,4 @@
-// Events: what this node saw happen in the team, all of it or of one kind.
+// Events: the changes that this node observed in the team, all or by kind.
 import { at, words } from "./element.js";
 import { listEntries, since } from "./history.js";
 
@@ -12,7 +12,7 @@ const KINDS = {
 export function make(root, { model }) {
   const show = () => {
     const entries = model.events.filter(KINDS[at("event-kind").value]);
-    words(at("events-since"), `${model.node ? `What ${model.node} saw` : "What was seen"} ${since(model.events)}`.trim());
+    words(at("events-since"), `${model.node ? `Observed by ${model.node}` : "Observed"} ${since(model.events)}`.trim());
     listEntries(at("events"), entries);
   };
   at("event-kind").addEventListener("change", show);

@@ -1,4 +1,4 @@
-// The eye: a phone's camera, the picture that the team gets of it, and what the phone measures with each.
+// A phone's camera: the picture for the team, and the values that the phone measures with each picture.
 import { sighted } from "./sight.js";
 
 const SIDE = 208;
@@ -7,17 +7,17 @@ const SIGHT_MS = 200;
 const QUALITY = 0.6;
 const RAD = Math.PI / 180;
 
-// What a browser says, in words for people, and what to do about it.
+// Error names of browsers as text for people, with a remedy.
 const REFUSALS = {
-  NotAllowedError: "The camera was refused. Allow it for this page (beside the address, or in the browser's settings), then try again.",
-  NotFoundError: "No camera was found. Connect one, or take another phone.",
-  NotReadableError: "The camera is used by something else. Close that, then try again.",
-  OverconstrainedError: "The camera gives no such picture. Take another phone.",
+  NotAllowedError: "The camera is not allowed. Allow it for this page (next to the address, or in the browser's settings), then try again.",
+  NotFoundError: "No camera was found. Connect one, or use another phone.",
+  NotReadableError: "Another program uses the camera. Close it, then try again.",
+  OverconstrainedError: "The camera does not support the picture size. Use another phone.",
   AbortError: "The camera did not start. Try again.",
 };
 export const why = ({ name, message }) => REFUSALS[name] ?? `The camera did not start: ${message || name}. Try again.`;
 
-// iOS asks who holds the phone, and only in answer to a tap; others tell without being asked.
+// iOS asks for permission, and only in response to a tap; other browsers do not ask.
 async function orientation() {
   const { requestPermission } = globalThis.DeviceOrientationEvent ?? {};
   if (!requestPermission) return "DeviceOrientationEvent" in globalThis;
@@ -26,10 +26,10 @@ async function orientation() {
 
 const between = (value, least, most) => Math.min(most, Math.max(least, value));
 
-// Open the camera; `canvas` becomes what the team sees; `lost` is called when the camera is taken away.  Throws what the
-// browser throws.
+// Open the camera.  `canvas` shows the picture that the team gets; `lost` is called when the camera stops.  Throws the
+// browser's error.
 export async function opened(canvas, tellsPlace, lost) {
-  // Both in the same tap: a permission that is asked for later is not asked for at all.
+  // Both requests belong to the same tap: iOS ignores a later one.
   const turns = orientation();
   const wanted = { facingMode: "environment", width: { ideal: 640 }, height: { ideal: 480 }, frameRate: { ideal: 15 } };
   const stream = await navigator.mediaDevices.getUserMedia({ video: wanted, audio: false });
@@ -75,7 +75,7 @@ export async function opened(canvas, tellsPlace, lost) {
 
   const eye = {
     has: { orientation: hasOrientation, position: tellsPlace && "geolocation" in navigator },
-    // What is seen now: the picture as bytes, what was measured, and the sighting with its box in shares of the picture.
+    // The current picture as bytes, the measured values, and the detection with its box and picture size in pixels.
     async look() {
       find(performance.now());
       scaled(canvas, SIDE);
@@ -92,7 +92,7 @@ export async function opened(canvas, tellsPlace, lost) {
     },
   };
   try {
-    // Some phones start a video only when it is played, and give its size only then.
+    // Some phones start a video only after play(), and know its size only then.
     await video.play();
   } catch (fault) {
     eye.close();

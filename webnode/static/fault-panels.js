@@ -1,11 +1,11 @@
-// Panels of faults: where operators may let devices fail, the page has two panels for it; elsewhere nothing of them is loaded.
+// Panels of faults: loaded only for operators of a team with fault injection.
 import { get } from "./link.js";
 import { panel } from "./panel.js";
 
 const needs = { role: "operator" };
 let known;
 
-// The node says what can fail; one that causes no faults says nothing.
+// The node lists the kinds of faults; the list is empty if it does not inject faults.
 const faults = async (name) => {
   known ??= get("faults").catch(() => ({ kinds: [] }));
   const { kinds } = await known;

@@ -1,4 +1,4 @@
-// Faults: the buttons that let a device fail, and beside each fault the clock until another takes over.
+// Faults: buttons that inject faults into a device, and for each fault the time until another device takes over.
 import { attribute, element, keyed, words } from "./element.js";
 import { ask, get } from "./link.js";
 
@@ -26,13 +26,13 @@ async function look() {
       heard = performance.now();
       for (const draw of views) draw();
     } catch {
-      // The last that was heard stays; the header says that the node is gone.
+      // The last answer stays on the page; the header shows that the node is lost.
     }
   }
   timer = setTimeout(look, isBusy() ? BUSY : IDLE);
 }
 
-// Between two answers the clocks run by themselves.
+// Between two answers the times run locally.
 setInterval(() => {
   if (isBusy() && !document.hidden) for (const draw of views) draw();
 }, TICK);
@@ -40,10 +40,10 @@ document.addEventListener("visibilitychange", look);
 
 function clock(row, passed) {
   if (row.takeover_s !== null) return [row.takeover_s <= IN_TIME ? "held" : "late", `${row.to} took over after ${row.takeover_s.toFixed(2)} s`];
-  if (!row.task) return ["none", "was at no task"];
+  if (!row.task) return ["none", "had no task"];
   const isLost = told.kinds.find((kind) => kind.kind === row.kind)?.is_lost;
   if (row.watched && isLost) return ["runs", `no takeover yet: ${(row.since_s + passed).toFixed(1)} s`];
-  return isLost ? ["late", "nobody took over"] : ["none", "goes on with its task"];
+  return isLost ? ["late", "no takeover"] : ["none", "continues its task"];
 }
 
 function row() {
@@ -56,17 +56,17 @@ function fill(item, fault) {
   const [state, text] = clock(fault, passed);
   attribute(item, "data-clock", state);
   words(item.children[0], fault.name);
-  const rest = fault.kind === "kill" ? "" : left > 0 ? `, another ${Math.ceil(left)} s` : ", over";
+  const rest = fault.kind === "kill" ? "" : left > 0 ? `, ${Math.ceil(left)} s left` : ", over";
   words(item.children[1], `${label(fault.kind)}${rest}`);
   words(item.children[2], text);
 }
 
 const list = (parent, rows) => keyed(parent, rows, (fault) => fault.n, row, fill);
 
-// What was caused in the team, and who took over.
+// The faults injected in the team, and their takeovers.
 export function takeovers(root) {
   const rows = element("ol", { class: "faults" });
-  const head = element("h3", {}, "Faults on purpose");
+  const head = element("h3", {}, "Injected faults");
   root.append(head, rows);
   const draw = () => {
     root.hidden = told.active.length === 0;
@@ -85,8 +85,8 @@ export function buttons(root) {
   const grid = element("div", { class: "fault-buttons" });
   const line = element("p", { role: "status" });
   const rows = element("ol", { class: "faults" });
-  const none = element("p", { class: "empty" }, "This device allows no faults.");
-  const form = element("form", {}, element("label", { for: "f-seconds" }, "Let it fail on purpose for (seconds)"), seconds, grid);
+  const none = element("p", { class: "empty" }, "This device does not allow fault injection.");
+  const form = element("form", {}, element("label", { for: "f-seconds" }, "Inject a fault for (seconds)"), seconds, grid);
   root.append(element("h3", {}, "Faults"), none, form, line, rows);
 
   async function cause(kind) {
@@ -94,7 +94,7 @@ export function buttons(root) {
     words(line, `${label(kind)} …`);
     try {
       const { seconds: lasts } = await ask("POST", `devices/${uuid}/faults`, { kind, seconds: Number(seconds.value) });
-      words(line, kind === "kill" ? "It is killed; who watches over its process starts it again." : `${label(kind)}: for ${lasts} s, then it heals.`);
+      words(line, kind === "kill" ? "The process is killed; its supervisor restarts it." : `${label(kind)}: for ${lasts} s, then it ends.`);
     } catch (error) {
       words(line, error.message);
     }

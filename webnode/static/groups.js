@@ -1,4 +1,4 @@
-// Groups: what each agent bids for a task, whom it computed as the winner, and whether they agree.
+// Groups: each agent's bid for a task, the winner that it computed, and whether they agree.
 import { at, attribute, element, keyed, words } from "./element.js";
 import { panel } from "./panel.js";
 
@@ -9,7 +9,7 @@ function showGroups(groups) {
 }
 
 function point(group) {
-  if (!group.assigned) return "No consensus yet: nobody has named a winner.";
+  if (!group.assigned) return "No consensus yet: no agent has named a winner.";
   let told = `${group.assigned} – ${group.agree} of ${group.of} agree`;
   if (group.differ.length) told += `; ${group.differ.join(", ")} ${group.differ.length > 1 ? "differ" : "differs"}`;
   if (group.undecided.length) told += `; ${group.undecided.join(", ")} undecided`;
@@ -27,7 +27,7 @@ function update(article, group) {
     words(name, member.name);
     bar.firstChild.style.width = `${100 * (member.share ?? 0)}%`;
     words(cost, member.cost === null ? (member.available ? "no bid" : "not free") : `${member.cost.toFixed(2)} m`);
-    // Those that stand by have their place in its name: WAITING(2).
+    // The state of a standby contains its place: WAITING(2).
     const state = member.state.toLowerCase().replace(/\((\d+)\)$/, " as number $1");
     const detail = [state, member.post === null ? "" : `goes to ${member.post}°`,
       member.progress === null ? "" : `${Math.round(100 * member.progress)} % done`].filter(Boolean).join(", ");

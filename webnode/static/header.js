@@ -1,4 +1,4 @@
-// The header: to which node the page is connected, and in one line what was done and what changed.
+// The header: the node to which the page is connected, and a status line with results and changes.
 import { at, attribute, several, words } from "./element.js";
 import { say } from "./desk.js";
 import { panel } from "./panel.js";
@@ -9,7 +9,7 @@ let link = "wait";
 let node = "";
 
 function tellLink(now) {
-  if (now === "lost") say("Connection lost. What you see is the last that was heard.");
+  if (now === "lost") say("Connection lost. The page shows the last state received.");
   else if (link === "lost") say("Connected again.");
   link = now;
   attribute(at("link"), "data-link", now);
@@ -17,7 +17,7 @@ function tellLink(now) {
   words(at("link"), LINKS[now]);
 }
 
-// What changed since the state before, in words for the status line.
+// Describe the changes since the last state for the status line.
 function tellNews({ devices, tasks }, ...news) {
   for (const device of devices.values()) {
     const before = statuses.get(device.uuid);
@@ -34,7 +34,7 @@ function tellNews({ devices, tasks }, ...news) {
   if (news.length) say(`${several(news)}.`);
 }
 
-// Which node serves, and which others could.
+// Show the serving node and the other web nodes; return the news if the serving node changed.
 function tellNodes(model) {
   const others = model.pages.filter((page) => !page.is_self).map((page) => model.devices.get(page.node)?.name ?? "another");
   words(at("reserve"), others.length ? `, ${[...new Set(others)].join(", ")} in reserve` : "");

@@ -1,4 +1,4 @@
-// History: what happened, or what happened to one device or task, the newest first.
+// History: events of the team, or of one device or task, newest first.
 import { attribute, element, keyed, words } from "./element.js";
 import { get } from "./link.js";
 import { model } from "./model.js";
@@ -6,7 +6,7 @@ import { model } from "./model.js";
 const SHOWN = 100;
 const clock = (at) => new Date(at * 1000).toLocaleTimeString([], { hourCycle: "h23" });
 
-// Entries of the chronicle in a list; one without any says so.
+// List chronicle entries; an empty list gets a placeholder.
 export function listEntries(list, entries) {
   const newest = entries.slice(-SHOWN).reverse();
   const none = { n: 0, at: 0, kind: "none", text: "Nothing so far." };
@@ -18,10 +18,10 @@ export function listEntries(list, entries) {
     });
 }
 
-// From when on is told what is told: a node knows nothing of what was before it looked.
+// The start of the record: a node knows nothing earlier.
 export const since = (entries) => (entries.length ? `since ${clock(entries[0].at)}` : "");
 
-// The history of one device or task: what the node remembers, and then whatever comes.
+// The history of one device or task: the entries that the node keeps, and later ones.
 export class History {
   constructor(list, about) {
     this.list = list;

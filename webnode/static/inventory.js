@@ -1,4 +1,4 @@
-// The inventory: what a device stores, asked of the device itself when somebody looks.
+// The records that a device stores, queried when its dialog is opened.
 import { element } from "./element.js";
 import { get } from "./link.js";
 
@@ -8,19 +8,19 @@ export function make(root) {
   const line = element("p", { class: "note", role: "status" });
   const kinds = element("ul", { class: "plain" });
   const newest = element("table");
-  const again = element("button", {}, "Ask again");
+  const again = element("button", {}, "Refresh");
   let open = "";
   root.append(element("h3", {}, "Stores"), line, kinds, element("div", { class: "wide", tabindex: 0, role: "region", "aria-label": "Newest records" }, newest), again);
 
   async function ask() {
     const asked = open;
-    line.textContent = "Asking the device …";
+    line.textContent = "Querying the device …";
     kinds.replaceChildren();
     newest.replaceChildren();
     try {
       const told = await get(`devices/${asked}/inventory`);
       if (asked !== open) return;
-      line.textContent = `${told.records} records, ${size(told.bytes)} of ${size(told.most_bytes)}${told.deleted ? `; ${told.deleted} deleted are remembered` : ""}.`;
+      line.textContent = `${told.records} records, ${size(told.bytes)} of ${size(told.most_bytes)}${told.deleted ? `; ${told.deleted} tombstones` : ""}.`;
       kinds.replaceChildren(...Object.entries(told.kinds).map(([kind, count]) => element("li", {}, `${count} of ${kind}`)));
       newest.replaceChildren(...told.newest.map(([kind, name, bytes, lifetime]) => element("tr", {},
         element("th", { scope: "row" }, name || "–"), element("td", {}, kind), element("td", {}, size(bytes)), element("td", {}, lifetime))));

@@ -1,9 +1,9 @@
-// Inviting: the page's address as a code for a phone's camera and as text, and what a phone wants before it gives the
-// page its camera; fetched when somebody invites.
+// Invitations: the page's address as QR code and text, and the steps with which a phone trusts the page's certificate.
+// Loaded on demand.
 import { attribute, element, words } from "./element.js";
 import { ask } from "./link.js";
 
-const KINDS = { phone: "Take part with a phone", viewer: "Look at the team" };
+const KINDS = { phone: "Join with a phone", viewer: "View the team" };
 const DRAWINGS = "image/svg+xml";
 
 const STEPS = {
@@ -19,7 +19,7 @@ const STEPS = {
   ],
 };
 
-// A code is shown when it looks as it should, and not before.
+// Load the style sheet before the QR code is shown.
 let styled;
 function style() {
   styled ??= new Promise((done) => {
@@ -30,7 +30,7 @@ function style() {
   return styled;
 }
 
-// A picture out of what the node has drawn; none where it has no library for that.
+// Show the SVG drawn by the node; hidden if the node lacks the library for it.
 function draw(figure, svg, label) {
   figure.hidden = !svg;
   if (!svg) return;
@@ -40,7 +40,7 @@ function draw(figure, svg, label) {
   figure.replaceChildren(drawing);
 }
 
-// Text that is copied by one tap; over http, where a browser gives no page the clipboard, by the older way.
+// A text with a copy button; over http, where browsers offer no clipboard API, with execCommand.
 function copied(label, id, tell) {
   const text = element("input", { id, readonly: "" });
   const button = element("button", { type: "button" }, "Copy");
@@ -75,14 +75,14 @@ function built() {
   const [link, linkRow] = copied("Link", "i-link", tell);
   const [certificate, certificateRow] = copied("Certificate", "i-certificate", tell);
   const trust = element("section", { class: "trust" },
-    element("h3", {}, "The phone warns of the connection"),
-    element("p", {}, "That is right: the node vouches for itself, and the phone does not know it yet. For one visit accept the warning: ",
+    element("h3", {}, "If the phone warns about the connection"),
+    element("p", {}, "The warning is expected: the node signs its own certificate, which the phone does not know. For one visit accept the warning: ",
       element("b", {}, "Advanced, Proceed"), " (Chrome) or ", element("b", {}, "Show Details, visit this website"), " (Safari). ",
-      "To come again, let the phone trust this node, once; to go on when it is lost, let it trust the other web nodes as well:"),
+      "For further visits let the phone trust this node, once; to switch to other web nodes, let it trust those as well:"),
     ...steps(), parts.authority, certificateRow, parts.mark);
   const choices = element("div", { class: "choices" },
-    element("div", {}, element("label", { for: "i-kind" }, "To"), parts.kind),
-    element("div", {}, element("label", { for: "i-page" }, "By the address"), parts.page));
+    element("div", {}, element("label", { for: "i-kind" }, "Purpose"), parts.kind),
+    element("div", {}, element("label", { for: "i-page" }, "Address"), parts.page));
   const dialog = element("dialog", { id: "invite", "aria-labelledby": "h-invite" },
     element("div", { class: "bar" }, element("h2", { id: "h-invite" }, "Invite"), parts.close),
     choices, parts.alone, parts.plain, parts.code, linkRow, parts.hint, line, trust);
@@ -97,20 +97,20 @@ function options(select, entries, chosen) {
 function show(parts, told, role) {
   const isHere = told.reaches === "machine";
   parts.alone.hidden = !isHere;
-  words(parts.alone, isHere ? "Only this machine can open the page, so no phone reaches it. Start the demonstration with make demo WEB_HOST=0.0.0.0, or a node with host = \"0.0.0.0\" below [web]." : "");
-  draw(parts.code, isHere ? "" : told.code, "The link below as a code for the camera of a phone");
+  words(parts.alone, isHere ? "Only this machine can open the page. For phones start the demonstration with make demo WEB_HOST=0.0.0.0, or a node with host = \"0.0.0.0\" below [web]." : "");
+  draw(parts.code, isHere ? "" : told.code, "QR code of the link below");
   parts.link.value = told.link;
   const until = new Date(1000 * told.until).toLocaleString([], { weekday: "long", hour: "2-digit", minute: "2-digit" });
-  const may = role === "phone" ? "take part in the team with a phone" : "look, and give no orders";
-  words(parts.hint, `${isHere ? "The link is for a browser of this machine." : "Scan the code, or send the link."} Whoever has it may ${may}, until ${until}.`);
+  const may = role === "phone" ? "to join the team with a phone" : "to view the team, without orders";
+  words(parts.hint, `${isHere ? "The link is for a browser of this machine." : "Scan the code, or send the link."} It allows its holder ${may}, until ${until}.`);
   parts.plain.hidden = told.is_secure || role !== "phone";
   words(parts.plain, told.certificate
-    ? "Over http no browser gives a page the camera: choose an address that begins with https."
-    : "Over http no browser gives a page the camera, and this node has no https. Say pip install 'swarm-node[tls]', set tls = \"auto\" below [web], and start the node again.");
+    ? "Browsers do not allow the camera over http. Choose an address that begins with https."
+    : "Browsers do not allow the camera over http, and this node has no https. Run pip install 'swarm-node[tls]', set tls = \"auto\" below [web], and restart the node.");
   parts.trust.hidden = !told.is_secure || isHere;
-  draw(parts.authority, told.certificate_code, "The address of the certificate as a code for the camera of a phone");
+  draw(parts.authority, told.certificate_code, "QR code of the certificate's address");
   parts.certificate.value = told.certificate;
-  words(parts.mark, `The phone shows the certificate's SHA-256 fingerprint; it has to be ${told.fingerprint}`);
+  words(parts.mark, `Compare the SHA-256 fingerprint that the phone shows: ${told.fingerprint}`);
 }
 
 export async function open(model) {
@@ -123,7 +123,7 @@ export async function open(model) {
     parts.tell("");
     try {
       const told = await ask("POST", "invitations", { role, draw: true, page: parts.page.value });
-      // A node that does not say where it is has at least been reached by this address.
+      // A node that does not know its URLs was at least reached by this address.
       told.link ??= `${location.origin}/#code=${told.token}${role === "phone" ? "/phone" : ""}`;
       told.pages ??= [location.origin];
       if (!parts.page.options.length) options(parts.page, told.pages.map((url) => [url, url]), told.pages[0]);

@@ -1,9 +1,9 @@
-// Keeping: where the browser allows it (https, or this machine) it keeps the page's files for when the node is gone.
+// Offline cache: in a secure context (https, or this machine) the browser keeps the page's files in case the node fails.
 const SHELL = "swarm.shell";
-// What is asked for later comes in advance, so that it is there when its node is not.
+// Load these modules early, so that they are available without the node.
 for (const name of ["history", "invite", "phone"]) import(`./${name}.js`).catch(() => {});
 
-// All of it or nothing: a page that lacks a part does not open.
+// All files or none: an incomplete page does not start.
 async function keep() {
   await navigator.serviceWorker.register("/sw.js");
   await navigator.serviceWorker.ready;
@@ -11,5 +11,5 @@ async function keep() {
   await (await caches.open(SHELL)).addAll(["/", ...files]);
 }
 
-// A page that is not kept works as long as its node, which is what it did before.
+// Without a cache the page works while its node does.
 if (navigator.serviceWorker && isSecureContext) keep().catch(() => {});

@@ -1,5 +1,5 @@
-// The link: the one line from the page to its team; nobody else fetches anything.  When the node that serves is lost
-// it goes on with another one, and what was asked meanwhile is asked there.
+// The link: the only module that sends requests to the team.  When the serving node is lost it connects to another one,
+// and repeats pending requests there.
 import { race, remember } from "./reserve.js";
 import { keep, ticket, token } from "./session.js";
 import { stream } from "./stream.js";
@@ -8,7 +8,7 @@ const API = "/api/v1/";
 const PATIENCE = 5000;
 const PAUSE = 300;
 const RENEWED = 4 * 3600_000;
-// What takes the page to another node lasts ten minutes.
+// Tokens for other nodes are valid for ten minutes.
 const PASSES = 4 * 60_000;
 const VIEWER = Math.random().toString(36).slice(2, 12);
 const NAMES = ["state", "change", "yard", "event", "pages", "ticket", "beat"];
@@ -19,14 +19,14 @@ let orders = 0;
 let left = null;
 let pages = [];
 
-// Where the page is served from now: the origin of every address.
+// The origin of all requests: the node that serves now.
 export const base = () => here;
 
 export const where = (path, at = here) => at + API + path;
 
 const pause = (ms) => new Promise((done) => setTimeout(done, ms));
 
-// Look for a node that answers until there is one; whoever calls meanwhile waits for the same.
+// Search for a node that answers until one is found; concurrent callers share the search.
 function find() {
   finding ??= (async () => {
     for (;;) {
@@ -43,7 +43,7 @@ function find() {
   return finding;
 }
 
-// One question, once; whoever asks it knows what to make of no answer.
+// Send one request, without retries; the caller handles failures.
 export async function fly(address, options) {
   if (left) return left;
   const flight = new AbortController();
@@ -57,12 +57,12 @@ export async function fly(address, options) {
   }
 }
 
-// A node does once what has one id, so that it can be asked again; the id of a new task is made of it, so that a task
-// that is asked for again at another node is the same one.
+// A node carries out a request once per id, so requests can be repeated; the id of a new task is derived from it, so a
+// task that is requested again at another node is the same one.
 async function call(method, path, body) {
   const order = method !== "GET";
   const marks = order ? { "Content-Type": "application/json", "X-Swarm": "1", "Idempotency-Key": `${VIEWER}-${++orders}` } : {};
-  // Each node is shown its own token, and none where there is none for it.
+  // Each node gets only its own token.
   const options = () => ({
     method,
     headers: token(here) ? { ...marks, Authorization: `Bearer ${token(here)}` } : marks,
@@ -78,7 +78,7 @@ async function call(method, path, body) {
     } catch {
       await Promise.race([find(), pause(Math.max(0, end - performance.now()))]);
       if (performance.now() >= end) {
-        throw new Error(`The node does not answer. ${order ? "Nothing may have been done; look" : "Look"} at the state, then try again.`);
+        throw new Error(`The node does not answer. ${order ? "The order may not have been carried out; check" : "Check"} the state, then try again.`);
       }
       await pause(50);
     }
@@ -89,23 +89,23 @@ async function call(method, path, body) {
   throw Object.assign(new Error(`${field}: ${problem}; ${remedy}.`), { status: answer.status, field });
 }
 
-// Both give what the node answers, or throw an Error whose message is for people (with status and field, if it refused).
+// Both return the node's answer, or throw an Error with a message for people (with status and field, if refused).
 export const get = async (path) => (await call("GET", path)).told;
 export const ask = async (method, path, body = {}) => (await call(method, path, body)).told;
 
-// A session of the node that answers, kept for that one.
+// Get a session of the node that answers, and store it for that node.
 export async function signed(method, proof = {}) {
   const { told, at } = await call(method, "session", proof);
   keep(at, told);
 }
 
-// Has tokens ready for the team's other nodes, as the one that serves can be asked for none when it is lost.
+// Fetch tokens for the team's other nodes in advance, as a lost node cannot issue them.
 async function provide(told) {
   const passes = await call("GET", "session/passes").catch(() => null);
   if (passes) remember(told, passes.told, passes.at);
 }
 
-// Says goodbye: the last thing that a page asks.  What is under way is dropped, or it would come without a session.
+// End the session: the last request of a page.  Pending requests are aborted, as they would fail without a session.
 export async function leave() {
   flying.forEach((flight) => flight.abort());
   const last = ask("DELETE", "session").catch(() => {});
@@ -113,11 +113,11 @@ export async function leave() {
   await Promise.race([last, pause(PATIENCE)]);
 }
 
-// The next picture of a camera, as a Response: 200, 204 where there is no newer one, or a refusal.
+// The next picture of a camera, as a Response: 200, 204 if there is no newer one, or a refusal.
 export const frames = (uuid, after, signal) => fetch(`${here}/shot/${uuid}?after=${after}&viewer=${VIEWER}&ticket=${ticket(here)}`, { signal });
 
-// Everything that comes, as onEvent(name, data); "link" says whether anything does: live, lost.  A page that nobody
-// sees hears nothing, and is told what it missed when somebody looks again.
+// Receive all events, as onEvent(name, data); "link" reports the connection: live, lost.  A hidden page receives nothing,
+// and gets the missed changes when it is shown again.
 export function open({ onEvent }) {
   let last = "";
   let served = here;
@@ -133,7 +133,7 @@ export function open({ onEvent }) {
       last = id;
       losses = 0;
       onEvent("link", "live");
-      // Another node stands in reserve when there is a token for it.
+      // Another node is a reserve only with a token for it.
       if (name === "pages") provide(pages = data).then(() => onEvent(name, data));
       else onEvent(name, data);
       if (name === "ticket") renew();
@@ -146,7 +146,7 @@ export function open({ onEvent }) {
     },
   });
 
-  // A page that is left open for days stays signed in; the stream is opened anew, as its address holds the old ticket.
+  // A page that is open for days stays signed in; the stream is reopened, as its URL contains the old ticket.
   const renew = () => token(here) && signed("PUT").then(look, () => {});
 
   function look() {
@@ -155,7 +155,7 @@ export function open({ onEvent }) {
   }
 
   document.addEventListener("visibilitychange", look);
-  // One that is not looked at hears nothing, and cannot be told that it is time.
+  // A hidden page receives no event that tells it to renew its session.
   setInterval(() => { if (document.hidden) renew(); }, RENEWED);
   setInterval(() => provide(pages), PASSES);
   look();

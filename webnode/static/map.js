@@ -1,4 +1,4 @@
-// The map: the yard from above, in centimetres with y upwards; the target follows a finger, a mouse or the arrow keys.
+// The map of the simulator, in centimetres with y upwards; the target follows a finger, a mouse or the arrow keys.
 import { at, attribute, drawn, keyed, words } from "./element.js";
 import { wish } from "./desk.js";
 import { panel } from "./panel.js";
@@ -37,7 +37,7 @@ function showYard(snapshot) {
   placeTarget(snapshot.target);
 }
 
-// A dog seen from above, looking along x, with as many yellow stripes on the head as its number.
+// A robot from above, facing x, with as many yellow stripes on its head as its number.
 function dogShape(dog) {
   const stripes = Array.from({ length: dog.stripes ?? 0 }, (_, n) => drawn("rect", { class: "stripe", x: 5.2 + 2.7 * n, y: -4.6, width: 1.5, height: 9.2 }));
   return drawn("g", { class: "dog" },
@@ -54,7 +54,7 @@ function placeTarget(spot) {
   if (!spot) target.removeAttribute("tabindex");
   else attribute(target, "tabindex", 0);
   at("clear").disabled = !spot;
-  words(at("place"), spot ? `Target at ${spot.x.toFixed(2)}, ${spot.y.toFixed(2)} m. Tap, drag or use the arrow keys.` : "No target. Tap the yard to place it.");
+  words(at("place"), spot ? `Target at ${spot.x.toFixed(2)}, ${spot.y.toFixed(2)} m. Tap, drag or use the arrow keys.` : "No target. Tap the map to place it.");
   if (!spot) return;
   attribute(target, "transform", `translate(${(spot.x * 100).toFixed(1)} ${((yard.walls[1] - spot.y) * 100).toFixed(1)})`);
   attribute(target, "aria-label", `Target at ${spot.x.toFixed(1)}, ${spot.y.toFixed(1)} metres; arrow keys move it`);
@@ -70,7 +70,7 @@ function inside(x, y) {
   return { x: within(x, yard.walls[0]), y: within(y, yard.walls[1]) };
 }
 
-// One wish in flight; the newest waits and those between are dropped, so the last one said is the last one done.
+// One request in flight; of the waiting ones only the newest is kept, so the last one is carried out last.
 async function send(doing) {
   next = doing;
   if (sending) return;
@@ -83,14 +83,14 @@ async function send(doing) {
   sending = false;
 }
 
-// Show what is wanted at once; snapshots from before must not pull it back while the wish is on its way.
+// Show the new position at once; earlier snapshots must not reset it while the request is in flight.
 function want(spot) {
   settleAt = performance.now() + 700;
   yard = { ...yard, target: spot && { ...yard.target, ...spot } };
   placeTarget(yard.target);
   send(spot
     ? () => wish("Moving the target", "target", { body: spot, done: () => `Target moved to ${spot.x.toFixed(2)}, ${spot.y.toFixed(2)} m.` })
-    : () => wish("Taking the target away", "target", { method: "DELETE", done: () => "The target is taken away." }));
+    : () => wish("Removing the target", "target", { method: "DELETE", done: () => "Target removed." }));
 }
 
 function startMap() {
@@ -119,7 +119,7 @@ function startMap() {
 
 panel({
   place: "map",
-  title: "Yard",
+  title: "Simulator",
   make() {
     startMap();
     return {

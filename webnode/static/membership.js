@@ -1,4 +1,4 @@
-// Membership: what team this is; of a closed one who is in it, as what, and until when.
+// The team: open or closed; the members of a closed team with their roles and the expiry of their certificates.
 import { at, attribute, element, keyed, span, words } from "./element.js";
 import { get } from "./link.js";
 import { watch } from "./watch.js";
@@ -10,7 +10,7 @@ const grouped = (digits) => digits.replace(/(.{4})(?=.)/g, "$1 ");
 const renewal = ({ is_renewable }) => (is_renewable ? "renewed automatically" : "not renewed");
 
 function ending({ until, name }, now) {
-  return `ends in ${span(until - now)}; to renew it: swarm renew ${name}`;
+  return `expires in ${span(until - now)}; renew it with: swarm renew ${name}`;
 }
 
 function update(item, member, { model, me }) {
@@ -27,10 +27,10 @@ function show(told, model) {
   const isOpen = told.kind === "open";
   words(at("team-kind"), isOpen ? "Open team" : `Closed team ${told.name}`);
   attribute(at("team-kind"), "data-kind", told.kind);
-  words(at("team-about"), isOpen ? `Not protected: ${told.unprotected}. A closed team is made by swarm init.`
-    : `Fingerprint ${grouped(told.fingerprint)}. This node is certified until ${day(told.until)}, ${renewal(told)}${told.is_ending ? `: that is in ${span(told.until - model.now)}` : ""}.`);
+  words(at("team-about"), isOpen ? `Not protected: ${told.unprotected}. Create a closed team with: swarm init.`
+    : `Fingerprint ${grouped(told.fingerprint)}. The certificate of this node is valid until ${day(told.until)}, ${renewal(told)}${told.is_ending ? `: expires in ${span(told.until - model.now)}` : ""}.`);
   const members = told.members ?? [];
-  words(at("members-line"), isOpen ? "" : `${told.known} members${model.me.role === "operator" ? "; the commands are for the machine that has the operator's key, which no node has" : ""}`);
+  words(at("members-line"), isOpen ? "" : `${told.known} members${model.me.role === "operator" ? "; run the commands on the machine with the operator's key, not on a node" : ""}`);
   keyed(at("members"), members, ({ uuid }) => uuid,
     () => element("li", {}, element("b"), element("span", { class: "roles" }), element("span", { class: "until" }), element("code")),
     (item, member) => update(item, member, { model, me: told.me }));

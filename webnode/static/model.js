@@ -1,4 +1,4 @@
-// The model: what the page knows, as it came last; the panels read it and never write it.
+// The model: the newest data of the page; panels read it and never write it.
 export const model = {
   node: "",
   api: 1,
@@ -21,10 +21,10 @@ const inOrder = (map, compare) => new Map([...map].sort(([, a], [, b]) => compar
 const KEYS = { devices: "uuid", tasks: "id", groups: "task" };
 const ENTRIES = 2000;
 
-// Take what the stream says; maps keep the order of the node's lists.
+// Apply an event of the stream; maps keep the order of the node's lists.
 const TAKERS = {
   state(state) {
-    // Another node counts what happened from its own start.
+    // Another node numbers its events from its own start.
     if (state.node !== model.node) model.events = [];
     model.node = state.node || model.node;
     model.devices = byKey(state.devices, "uuid");
@@ -33,7 +33,7 @@ const TAKERS = {
     model.halted = state.halted ?? false;
     model.halt = state.halt ?? null;
   },
-  // Rows that are other or new, and the keys of those that are gone; the order is that of the node's lists.
+  // New and changed rows, and the keys of removed rows; the order is the same as in the node's lists.
   change({ without = {}, ...told }) {
     for (const [name, key] of Object.entries(KEYS)) {
       if (!told[name] && !without[name]) continue;

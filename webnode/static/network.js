@@ -1,4 +1,4 @@
-// The network: who knows whom and how far they are, asked of the devices while somebody looks.
+// The network: the contacts of each device and their round-trip times, queried while the panel is in view.
 import { at, attribute, drawn, element, keyed, words } from "./element.js";
 import { get } from "./link.js";
 import { watch } from "./watch.js";
@@ -9,7 +9,7 @@ const SIDE = 300;
 
 const ms = (value) => (value === null ? "–" : value < 10 ? value.toFixed(1) : String(Math.round(value)));
 
-// Those that were asked, and those that others know but nobody asked.
+// The devices that were queried, and further ones among their contacts.
 function nodesOf({ devices, silent }, known) {
   const names = new Map(Object.keys(devices).map((uuid) => [uuid, known.get(uuid)?.name ?? uuid.slice(0, 8)]));
   for (const uuid of silent) names.set(uuid, known.get(uuid)?.name ?? uuid.slice(0, 8));
@@ -51,17 +51,17 @@ function show(told, known) {
       words(item.lastChild, `knows ${view.known}${traffic}, ${view.lost} dropped`);
     });
   const lookups = Object.entries(told.devices).flatMap(([uuid, view]) => view.lookups.map((each) => ({ ...each, by: known.get(uuid)?.name ?? "" })));
-  words(at("no-lookups"), lookups.length ? "Newest lookups" : "No lookups: everybody knows everybody.");
+  words(at("no-lookups"), lookups.length ? "Newest lookups" : "No lookups: each node knows all others.");
   keyed(at("lookups"), lookups.slice(0, 24), (each) => `${each.by} ${each.key} ${each.ms}`, () => element("li"),
-    (item, each) => words(item, `${each.by} sought ${each.key.slice(0, 8)}: ${each.asked} asked in ${each.hops} ${each.hops === 1 ? "hop" : "hops"}, ${each.found} found, ${ms(each.ms)} ms`));
+    (item, each) => words(item, `${each.by} looked up ${each.key.slice(0, 8)}: ${each.asked} asked in ${each.hops} ${each.hops === 1 ? "hop" : "hops"}, ${each.found} found, ${ms(each.ms)} ms`));
   const silent = told.silent.map((uuid) => known.get(uuid)?.name ?? uuid.slice(0, 8));
-  words(at("network-line"), silent.length ? `${silent.join(", ")} did not answer.` : "All of them answered.");
+  words(at("network-line"), silent.length ? `${silent.join(", ")} did not answer.` : "All devices answered.");
 }
 
 export function make(root, { model }) {
   root.append(
     element("p", { class: "hint", id: "network-line", role: "status" }),
-    drawn("svg", { id: "graph", viewBox: `0 0 ${SIDE} ${SIDE}`, role: "img", "aria-label": "Who knows whom; the table has the same in numbers" }),
+    drawn("svg", { id: "graph", viewBox: `0 0 ${SIDE} ${SIDE}`, role: "img", "aria-label": "Graph of contacts; the table shows the same data" }),
     element("div", { class: "wide", tabindex: 0, role: "region", "aria-label": "Round trips" }, element("table", { id: "ties" })),
     element("ul", { id: "traffic" }), element("h3", { id: "no-lookups" }, "Newest lookups"), element("ol", { id: "lookups", class: "plain" }));
   const close = watch(root, EVERY, async () => {

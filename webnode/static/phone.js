@@ -1,4 +1,4 @@
-// This phone: takes part in the team as a device, for as long as its visitor holds it and looks at the page.
+// This phone: takes part in the team as a device while the page is visible.
 import { attribute, badge, drawn, element, state, words } from "./element.js";
 import { opened, why } from "./eye.js";
 import { ask, base, fly, where } from "./link.js";
@@ -7,16 +7,16 @@ const KEPT = "swarm.phone";
 const AGAIN = 300;
 const LATER = 2000;
 const READ = 8000;
-const NONE = "Nothing can be seen.";
-const REMEDY = "Browsers give the camera to https pages alone, and to pages of this machine.";
+const NONE = "No target in view.";
+const REMEDY = "Browsers allow the camera on https pages, and on pages of this machine.";
 
-// Its secret makes it the same device after a reload, and at each web node of the team.
+// The secret identifies the device, after a reload and at each web node of the team.
 function kept() {
   try {
     const found = JSON.parse(localStorage.getItem(KEPT)) ?? {};
     if (/^[0-9a-f]{64}$/.test(found.secret)) return found;
   } catch {
-    // What cannot be read is not there.
+    // Unreadable data is replaced.
   }
   const bytes = crypto.getRandomValues(new Uint8Array(32));
   const secret = [...bytes].map((byte) => byte.toString(16).padStart(2, "0")).join("");
@@ -27,24 +27,24 @@ function keep(phone) {
   try {
     localStorage.setItem(KEPT, JSON.stringify(phone));
   } catch {
-    // Where nothing may be kept, it is another device after a reload.
+    // Without storage it is another device after a reload.
   }
 }
 
-// By a ticket, and bare of headers: so no browser asks another node first whether it may ask.
+// Authorized by ticket and without headers, so a browser sends no CORS preflight request.
 const of = (path, query, at) => where(`${path}?${new URLSearchParams(query)}`, at);
 
 const pause = (ms) => new Promise((done) => setTimeout(done, Math.max(0, ms)));
 const asName = (text) => text.normalize("NFKD").replace(/[^\w-]+/g, "-").replace(/^-+|-+$/g, "").slice(0, 40);
 
-// What stands in the way of the camera, whoever asks; "" where nothing does.
+// The reason why the camera cannot be used; "" if it can.
 function hindrance({ me, pages }) {
   if (!isSecureContext) {
     const secure = pages.find((page) => page.is_secure)?.url;
-    return `${REMEDY} ${secure ? `Open ${secure} and take part there.` : "This node serves no https page: set tls = \"auto\" below [web] of its settings."}`;
+    return `${REMEDY} ${secure ? `Open ${secure} and join there.` : "This node serves no https page: set tls = \"auto\" below [web] in its settings."}`;
   }
-  if (!navigator.mediaDevices?.getUserMedia) return `This browser has no camera to offer. ${REMEDY}`;
-  if (me.role === "viewer") return "You are signed in to look. Ask an operator for an invitation with which a phone may take part.";
+  if (!navigator.mediaDevices?.getUserMedia) return `This browser has no camera. ${REMEDY}`;
+  if (me.role === "viewer") return "You are signed in as viewer. Ask an operator for an invitation for phones.";
   return "";
 }
 
@@ -71,11 +71,11 @@ export function make(root, { model, go }) {
   const start = element("button", { class: "primary" }, "Take part");
   const no = element("button", { type: "button" }, "Not now");
   const form = element("form", {},
-    element("p", {}, "Your phone becomes a device of the team. It sees with its camera, bids for tasks that need no legs, and is asked to point at things."),
-    element("label", { for: "phone-name" }, "What it is called"), name,
-    element("label", { class: "choice", for: "phone-place" }, place, " Tell the team where it is"), element("div", { class: "row" }, start, no),
-    element("p", { class: "hint" }, "Pictures go to the team while this page is in sight, and are kept by nobody."));
-  const canvas = element("canvas", { width: 208, height: 156, role: "img", "aria-label": "What this phone shows the team" });
+    element("p", {}, "Your phone becomes a device of the team. Its camera sees the target, it bids for tasks that need no motors, and it may ask you to point it at things."),
+    element("label", { for: "phone-name" }, "Name"), name,
+    element("label", { class: "choice", for: "phone-place" }, place, " Send the position"), element("div", { class: "row" }, start, no),
+    element("p", { class: "hint" }, "Pictures are sent to the team while this page is visible, and are not stored."));
+  const canvas = element("canvas", { width: 208, height: 156, role: "img", "aria-label": "Picture that this phone sends" });
   const ring = drawn("rect", { rx: 3 });
   const overlay = drawn("svg", { "aria-hidden": "true" }, ring);
   const said = element("p", { class: "said", role: "status" });
@@ -99,7 +99,7 @@ export function make(root, { model, go }) {
     words(trouble, line || (stage === "off" ? hindrance(model) : ""));
   }
 
-  // What the phone is in the team's eyes.
+  // Show the phone's state as the team sees it.
   function tell() {
     const device = model.devices.get(ticket?.uuid);
     words(as, device?.name ?? phone.name);
@@ -127,13 +127,13 @@ export function make(root, { model, go }) {
     const { secret } = phone;
     const at = base();
     const told = await ask("POST", "phones", { secret, name: phone.name, width: canvas.width, height: canvas.height, ...eye.has });
-    // A ticket is good at the node that gave it; while the page went on to another one it is not known which that was.
+    // A ticket is valid at the node that issued it; after a switch during the request that node is unknown.
     if (at !== base()) return;
     if (run === mine) ticket = { ...told, at };
     else goodbye({ ...told, at });
   }
 
-  // One picture in flight, never a queue; a node that is lost is waited for, and another takes the phone as it is.
+  // One picture in flight; if the node is lost, the phone joins at the next one.
   async function looks(mine) {
     let fps = 10;
     let failing = false;
@@ -160,8 +160,8 @@ export function make(root, { model, go }) {
       } catch (error) {
         if (run !== mine) return;
         failing = true;
-        // What the node said is for people; what the network said is not.
-        words(trouble, error.status ? `${error.message} It is tried again.` : "The node does not answer. It is tried again.");
+        // Errors of the node are for people; errors of the network are not.
+        words(trouble, error.status ? `${error.message} Trying again.` : "The node does not answer. Trying again.");
         await pause(error.status ? LATER : AGAIN);
       }
       tell();
@@ -169,7 +169,7 @@ export function make(root, { model, go }) {
     }
   }
 
-  // Its node is told in the very last moment, too: then another takes the task over at once.
+  // Tell the node also when the page closes, so that another device takes over at once.
   function leave(next, line = "") {
     run += 1;
     if (ticket) goodbye(ticket);
@@ -186,7 +186,7 @@ export function make(root, { model, go }) {
     show("asking", "Allow the camera, if the browser asks.");
     try {
       const found = await opened(canvas, place.checked, () => {
-        if (run === mine) leave("off", "The camera stopped: something else took it, or it was taken away. Take part again.");
+        if (run === mine) leave("off", "The camera stopped: another program took it, or it was disconnected. Join again.");
       });
       if (run !== mine) return found.close();
       eye = found;
@@ -210,14 +210,14 @@ export function make(root, { model, go }) {
     begin();
   });
   no.addEventListener("click", () => go(""));
-  stop.addEventListener("click", () => leave("off", "This phone takes no part any more."));
-  // A page that nobody sees has no camera worth the name: it leaves, and comes back by itself.
+  stop.addEventListener("click", () => leave("off", "This phone has left the team."));
+  // A hidden page gets no usable camera pictures: the phone leaves, and returns when the page is visible.
   const hidden = () => {
-    if (stage === "on") leave("away", "Left, as this page was out of sight.");
+    if (stage === "on") leave("away", "Left the team, as this page was hidden.");
   };
   const turned = () => {
     if (document.hidden) hidden();
-    else if (stage === "away") begin("It left while this page was out of sight, and is back.");
+    else if (stage === "away") begin("The phone left while this page was hidden, and has returned.");
   };
   document.addEventListener("visibilitychange", turned);
   addEventListener("pagehide", hidden);
@@ -226,7 +226,7 @@ export function make(root, { model, go }) {
 
   return {
     show: () => { root.hidden = false; },
-    // Who goes to look at something else still takes part.
+    // The phone still takes part while another view is shown.
     hide: () => { root.hidden = on.hidden; },
     update(_, event) {
       if (stage === "off" && event !== "beat") show("off", trouble.textContent && !hindrance(model) ? trouble.textContent : "");

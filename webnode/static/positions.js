@@ -1,4 +1,4 @@
-// Positions: where there is no yard, the devices that say where they are, drawn to the scale of the room that they take.
+// Positions: without a simulator, a map of the devices that report their positions, scaled to fit them.
 import { at, attribute, drawn, element, keyed, words } from "./element.js";
 import { panel } from "./panel.js";
 import { go } from "./shell.js";
@@ -12,8 +12,8 @@ const NAMED = 40;
 const METRES = 111_320;
 const isMetres = ({ position }) => "x" in position;
 
-// Metres of each that can be drawn with the others: a yard's own frame, or east and north of the first by the globe.
-// What more devices use is drawn; x of the globe shrinks towards the poles.
+// Coordinates in metres for devices that share a frame: the local frame, or east and north of the first device on the
+// globe.  The frame that more devices use is drawn.  A degree of longitude shrinks towards the poles.
 function frame(placed) {
   const local = placed.filter(isMetres);
   if (2 * local.length >= placed.length) return local.map((device) => ({ device, ...device.position }));
@@ -27,7 +27,7 @@ function frame(placed) {
   });
 }
 
-// The whole of 1, 2 or 5 times a power of ten that is not longer than that.
+// The largest of 1, 2 or 5 times a power of ten that is not longer than `metres`.
 function round(metres) {
   const power = 10 ** Math.floor(Math.log10(metres));
   return [5, 2, 1].find((n) => n * power <= metres) * power;
@@ -65,7 +65,7 @@ panel({
     let placed = [];
     let known = "";
     let due = 0;
-    // Drawn in pixels, so that words are as large as elsewhere: anew where it is wider, or is seen at last.
+    // Drawn in pixels, so that the text has its usual size: redrawn when the width changes.
     const size = new ResizeObserver(() => refresh());
     size.observe(root);
 
@@ -74,7 +74,7 @@ panel({
       if (!placed.length || !root.clientWidth || now === known || due) return;
       known = now;
       draw();
-      // Many of them are drawn now and then: somebody may be typing.
+      // A large map is redrawn at most once a second, as a person may be typing.
       if (placed.length > NAMED) due = setTimeout(() => { due = 0; refresh(); }, PAUSE);
     }
 
@@ -85,11 +85,11 @@ panel({
         const seen = found.map((each) => [each[key], Math.min(each.accuracy ?? 0, room)]);
         return [Math.min(...seen.map(([at, blur]) => at - blur)), Math.max(...seen.map(([at, blur]) => at + blur))];
       };
-      // A place that is hardly known must not make all others one dot.
+      // One inaccurate position must not shrink all others to a dot.
       const room = Math.max(LEAST, ...["x", "y"].map((key) => range(key, 0)).map(([from, to]) => to - from));
       const [west, east] = range("x", room);
       const [south, north] = range("y", room);
-      // As high as it takes, not higher than wide.
+      // As high as needed, but not higher than wide.
       const scale = Math.min((width - 2 * MARGIN) / Math.max(east - west, LEAST), (width - 2 * MARGIN) / Math.max(north - south, LEAST));
       const height = Math.max((north - south) * scale, 120) + 2 * MARGIN + FOOT;
       const place = ({ x, y }) => [width / 2 + (x - (west + east) / 2) * scale, (height - FOOT) / 2 - (y - (south + north) / 2) * scale];
@@ -128,8 +128,8 @@ panel({
         const section = at("place-map");
         section.classList.toggle("reported", !model.yard);
         root.hidden = !placed.length;
-        words(at("h-yard"), model.yard ? "Yard" : "Map");
-        words(document.querySelector("#views [href='#map']"), model.yard ? "Yard" : "Map");
+        words(at("h-yard"), model.yard ? "Simulator" : "Map");
+        words(document.querySelector("#views [href='#map']"), model.yard ? "Simulator" : "Map");
         if (!model.yard) section.hidden = !placed.length;
         refresh();
       },

@@ -1,4 +1,4 @@
-// Preview: below the choice of a task, who could take it and who not, and why, before anything is assigned.
+// Preview: shows, before a task is assigned, which devices can take it and why others cannot.
 import { alike, at, element, keyed, several } from "./element.js";
 import { ask } from "./link.js";
 
@@ -7,17 +7,17 @@ const NOBODY = { able: [], refused: {}, likely: null, together: [] };
 
 function lines({ able, refused, likely, together }, group) {
   const could = several(able.map(({ name, busy }) => (busy ? `${name} (now: ${busy})` : name)));
-  const who = likely ? `${likely} is the nearest by what is reported now.` : "Which of them is decided once they have looked.";
+  const who = likely ? `${likely} is the nearest by present reports.` : "The nearest is chosen when they have reported.";
   const yes = able.length ? [["can", `${could}. ${able.length > 1 ? who : ""}`.trim()]] : [["nobody", "No device here can take it."]];
   const others = together.map(({ title }) => title).join(", ");
-  const divided = group ? [["with", others ? `${others}.` : `nothing yet; it begins the group ${group}.`]] : [];
+  const divided = group ? [["with", others ? `${others}.` : `no other task yet; this is the first of group ${group}.`]] : [];
   return [...yes, ...divided, ...alike(refused).map(([names, why]) => ["cannot", `${several(names)}: ${why}`])];
 }
 
 const SAID = { can: "Can take it: ", cannot: "Cannot: ", nobody: "", with: "Divided together with: " };
 
 export function make(root, { model }) {
-  const list = element("ul", { class: "preview", "aria-label": "Who could take this task" });
+  const list = element("ul", { class: "preview", "aria-label": "Devices that can take this task" });
   let told = "";
   let due = 0;
   root.append(list);
@@ -30,7 +30,7 @@ export function make(root, { model }) {
     list.replaceChildren(...rows.map(([kind, text]) => element("li", { "data-can": kind }, element("b", {}, SAID[kind]), text)));
   }
 
-  // What is known of the devices changes in bursts: it is asked once after each.
+  // Changes of devices come in bursts: request once after each burst.
   function later() {
     clearTimeout(due);
     due = setTimeout(async () => {

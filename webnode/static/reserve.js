@@ -1,4 +1,4 @@
-// The reserve: where else the team serves the page, and which of its nodes answers now.
+// The reserve: the URLs of the team's other web nodes, and which of the nodes answers now.
 import { has, sort } from "./session.js";
 
 const VERSION = 1;
@@ -9,7 +9,7 @@ const isLoopback = (url) => /^https?:\/\/(127\.|localhost[:/]|localhost$|\[::1\]
 const isSecure = (url) => url.startsWith("https:");
 let pages = kept();
 
-// What was heard before counts for a page that the browser kept while its own node is gone.
+// The stored list serves a page that was opened from the cache while its node is gone.
 function kept() {
   try {
     return JSON.parse(localStorage.getItem(KEPT)) ?? [];
@@ -18,7 +18,7 @@ function kept() {
   }
 }
 
-// `passes` are the tokens for the other nodes, by uuid; the node that made them knows which are gateways of the team.
+// `passes` are the tokens for the other nodes, by uuid; the node issues them only for gateways of the team.
 export function remember(told, passes, here) {
   pages = told;
   const more = told.filter((page) => passes[page.node]).map((page) => [page.url, passes[page.node]]);
@@ -26,19 +26,19 @@ export function remember(told, passes, here) {
   try {
     localStorage.setItem(KEPT, JSON.stringify(told));
   } catch {
-    // A browser that keeps nothing goes on without.
+    // Without storage the list is lost with the page.
   }
 }
 
-// Where there is no token for nothing is asked.  No page over TLS goes on with one without, and a page of this machine is
-// meant for this machine alone.
+// A node without a token is not asked.  A page over TLS does not switch to one without, and loopback URLs are used only
+// by a page of this machine.
 function reachable({ url }) {
   if (!has(url)) return false;
   if (isSecure(location.origin) && !isSecure(url)) return false;
   return !isLoopback(url) || isLoopback(location.origin);
 }
 
-// A node that is frozen still takes connections: only a full answer counts.
+// A frozen node still accepts connections, so only a complete answer counts.
 async function present(url, node) {
   const answer = await fetch(`${url}/api/v1/node`, { cache: "no-store", signal: AbortSignal.timeout(PATIENCE) });
   const told = await answer.json();
@@ -46,7 +46,7 @@ async function present(url, node) {
   return url;
 }
 
-// The first that answers; `first` is asked first, each other a little later, or as soon as the one before has failed.
+// Return the first node that answers; `first` is asked first, each other one a little later or when the one before fails.
 export async function race(first) {
   const known = new Map([[first, ""], [location.origin, ""]]);
   for (const page of pages.filter(reachable)) if (!known.has(page.url)) known.set(page.url, page.node);

@@ -1,16 +1,16 @@
-// The session: what each web node gave when one signed in, or when it let the page go on at another; kept for the next
-// visit.  A token is good at one node alone, so it is sent to the origin that it is kept for and nowhere else.
+// The session: tokens from sign-in and for other web nodes, stored for the next visit.  A token is valid at one node, so
+// it is sent to that origin only.
 const KEY = "swarm.sessions";
 let held = {};
 
 try {
   held = JSON.parse(localStorage.getItem(KEY)) ?? {};
 } catch {
-  // What cannot be read is not there: one signs in again.
+  // Unreadable data is dropped; the visitor signs in again.
 }
 
 export const token = (origin) => held[origin]?.token ?? "";
-// Stands for the session in an address; lets look only.
+// Stands for the session in a URL; read only.
 export const ticket = (origin) => held[origin]?.ticket ?? "";
 export const has = (origin) => origin in held;
 
@@ -19,13 +19,13 @@ function put(sessions) {
   try {
     localStorage.setItem(KEY, JSON.stringify(held));
   } catch {
-    // Where nothing may be kept, it lasts as long as the page.
+    // Without storage the session is lost with the page.
   }
 }
 
 export const keep = (origin, session) => put({ ...held, [origin]: session });
 
-// What is held for `origins` alone, with `more` beside it.
+// Keep the sessions of `origins` only, and add `more`.
 export function sort(origins, more) {
   put({ ...Object.fromEntries(Object.entries(held).filter(([origin]) => origins.includes(origin))), ...more });
 }

@@ -1,11 +1,11 @@
-// Settings of the device that is looked at: a field for each that it tells of, and a button that has it check and take them.
+// Settings of a device: a field for each one that the device reports, and a button that sends the changes.
 import { element, words } from "./element.js";
 import { wish } from "./desk.js";
 import { get } from "./link.js";
 
 let number = 0;
 
-// A field for one setting: how it looks at first, what stands in it now, and whether that was changed.
+// A field for one setting: its row, its present value, and whether it was changed.
 function field({ key, value, about, unit, least, most }) {
   const id = `setting-${++number}`;
   const isTable = typeof value === "object" && value !== null;
@@ -37,13 +37,13 @@ export function make(root, { model }) {
     const may = model.me.role === "operator";
     form.replaceChildren(...fields.map(({ row }) => row), ...(may && fields.length ? [save] : []));
     for (const input of form.querySelectorAll("input, textarea")) input.readOnly = !may;
-    if (!knobs.length) words(line, "It has no settings that can be changed.");
+    if (!knobs.length) words(line, "This device has no settings that can be changed.");
   }
 
   async function load() {
     const asked = uuid;
     form.replaceChildren();
-    words(line, "Asking the device …");
+    words(line, "Querying the device …");
     try {
       const knobs = await get(`devices/${asked}/settings`);
       if (asked !== uuid) return;
@@ -61,13 +61,13 @@ export function make(root, { model }) {
       try {
         body[each.key] = each.value();
       } catch {
-        return words(line, `${each.key}: it is no table; write something like {"gripper": {"width": 0.1}}.`);
+        return words(line, `${each.key}: not a table; write for example {"gripper": {"width": 0.1}}.`);
       }
     }
-    if (!Object.keys(body).length) return words(line, "Nothing was changed.");
+    if (!Object.keys(body).length) return words(line, "No changes to save.");
     const done = (knobs) => {
       fill(knobs);
-      return "The device has taken it.";
+      return "Settings saved.";
     };
     wish("Saving", `devices/${uuid}/settings`, { method: "PUT", body, line: (text) => words(line, text), done });
   });

@@ -1,19 +1,19 @@
-// The shell: gives each panel its place, tells it what came, and which place is looked at.
+// The shell: opens panels at their places, passes events to them, and switches views.
 import { at } from "./element.js";
 import { panels } from "./panel.js";
 
 const AGAIN = 3000;
-// A phone looks as a viewer does.
+// A phone sees the same as a viewer.
 const RANKS = { anyone: 0, viewer: 1, phone: 2, operator: 3 };
 const shown = new Map();
 let shared = {};
 let looked = "";
-// On a phone one of these is looked at at a time, and the bar below leads to them; on a wall ?view=cameras is all.
+// A narrow screen shows one of these views at a time, with a navigation bar; ?view=cameras shows one view alone.
 const VIEWS = ["devices", "tasks", "cameras", "map", "groups", "network", "events", "phone", "more"];
 const NARROW = matchMedia("(max-width: 43.99rem)");
 const only = new URLSearchParams(location.search).get("view");
 
-// Look at a place: go("device/UUID"); go("") is the first view, and back() the one that was looked at before a device.
+// Show a view: go("device/UUID"); go("") shows the first view, and back() the view before a device was opened.
 export function go(view) {
   if (view) location.hash = view;
   else if (location.hash) {
@@ -26,7 +26,7 @@ export const back = () => go(view() === VIEWS[0] ? "" : view());
 
 const view = () => document.body.dataset.view ?? VIEWS[0];
 
-// What is not looked at is there for other screens: the style sheet says on which.
+// Mark the views that are not shown; the style sheet decides on which screens they are hidden.
 function lookAt(name) {
   document.body.dataset.view = name;
   document.body.toggleAttribute("data-only", VIEWS.includes(only));
@@ -60,7 +60,7 @@ async function open(panel) {
   try {
     make ??= (await panel.load()).make;
   } catch {
-    // Its node is gone, or too busy to send it: it is tried again.
+    // The node is gone, or too busy to send the module: try again later.
     setTimeout(() => shown.get(panel) === entry && close(entry), AGAIN);
     return;
   }
@@ -96,7 +96,7 @@ function look() {
   looked = name;
 }
 
-// Open the panels that are wanted now, and close those that are not.
+// Open the panels that the visitor may see, and close the others.
 function sort() {
   for (const panel of panels) {
     const entry = shown.get(panel);
@@ -112,7 +112,7 @@ export function start(tools) {
   look();
 }
 
-// Something came: all panels are told, each by itself, so that the fault of one is not that of all.
+// Pass an event to all panels; an error in one panel does not affect the others.
 export function tell(event) {
   sort();
   for (const { acts } of [...shown.values()]) {

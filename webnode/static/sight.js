@@ -1,5 +1,5 @@
-// Sight: where the red target is in a picture, as agents/vision.py finds it for robots; pure.
-// Red is one corner of YCrCb.  A pixel of the largest red blob counts by how red it is, so that soft edges cost nothing.
+// Detection: finds the red target in a picture like agents/vision.py, without side effects.
+// Red is one corner of YCrCb.  Pixels of the largest red blob are weighted by redness, so soft edges do not matter.
 const LOW = [20, 165, 40];
 const HIGH = [240, 255, 135];
 const GREY = 128;
@@ -8,7 +8,7 @@ const LEAST_AREA = 8;
 const SAME_SHAPE = 0.2;
 const MOST = 100;
 
-// No browser says how wide a lens is; those of phones are from 60 to 75 degrees across the longer side.
+// Browsers do not report the angle of a lens; phones have 60 to 75 degrees across the longer side.
 export const LENS = 65 * Math.PI / 180;
 export const TARGET = { radius: 0.08, height: 0.22 };
 
@@ -25,7 +25,7 @@ function colours(pixels, count) {
   return { isRed, redness };
 }
 
-// The largest blob of neighbours: how many pixels, where their middle is, and the box that they fill.
+// The largest blob of neighbours: its area in pixels, its centre, and its bounding box.
 function largest(isRed, columns, rows) {
   let best = { area: 0 };
   const waiting = [];
@@ -60,7 +60,7 @@ function percentile(values, share) {
   return sorted[below] + (sorted[Math.min(below + 1, sorted.length - 1)] - sorted[below]) * (at - below);
 }
 
-// How many pixels the blob measures across and up, to a fraction of one.
+// The width and height of the blob in pixels, with fractions.
 function extent(redness, columns, rows, { left, top, right, bottom }) {
   const [x0, x1] = [Math.max(0, left - BLUR), Math.min(columns - 1, right + BLUR)];
   const [y0, y1] = [Math.max(0, top - BLUR), Math.min(rows - 1, bottom + BLUR)];
@@ -89,7 +89,7 @@ export function sighted(pixels, columns, rows, size = TARGET, lens = LENS) {
   const byWidth = focal * 2 * size.radius / across;
   const byHeight = focal * size.height / up;
   const isWhole = blob.left > 0 && blob.right < columns - 1 && Math.abs(byWidth / byHeight - 1) < SAME_SHAPE;
-  // What hides a part of it makes it look smaller, never larger: the nearer of the two is the better witness.
+  // An occluded target looks smaller, never larger, so the smaller estimate is used.
   const distance = (isWhole ? byWidth : Math.min(byWidth, byHeight)) / Math.max(Math.cos(bearing), 0.5);
   const { left, top, right, bottom } = blob;
   return { bearing, distance: Math.min(distance, MOST), isWhole, box: { left, top, width: right - left + 1, height: bottom - top + 1 } };

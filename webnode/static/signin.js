@@ -1,4 +1,4 @@
-// Signing in and out: by the code that the node printed, which a link may carry, or by the password.
+// Sign in and out: by the code that the node printed, which a link may contain, or by the password.
 import { element, words } from "./element.js";
 import { base, get, leave, signed } from "./link.js";
 import { panel } from "./panel.js";
@@ -8,8 +8,8 @@ const PAUSE = 3000;
 let checking = false;
 let told = () => {};
 
-// The code of a link is used once and taken out of the address, so that it is in no bookmark and no screenshot; what
-// stands behind it is the view that the link leads to.
+// The code of a link is used once and removed from the address, so that no bookmark or screenshot contains it.  The part
+// behind it is the view to show.
 function codeOfLink() {
   const [, code, view] = /^#code=([^/]+)(?:\/(.+))?$/.exec(location.hash) ?? [];
   if (code) history.replaceState(null, "", location.pathname + location.search);
@@ -19,7 +19,7 @@ function codeOfLink() {
 
 const signIn = (code) => signed("POST", { code });
 
-// Resolves when the visitor is let in, as often as it has to; `onMe` gets { name, role } each time.
+// Resolve when the visitor is signed in; `onMe` gets { name, role } at each sign-in.
 export async function enter(onMe) {
   told = onMe;
   const code = codeOfLink();
@@ -59,13 +59,13 @@ panel({
       forget();
       location.reload();
     };
-    // What an invitation is made of is fetched when somebody invites.
+    // The dialog is loaded on demand.
     more.onclick = () => {
       words(trouble, "");
       import("./invite.js").then(({ open }) => open(model)).catch((error) => words(trouble, error.message));
     };
     let link = "wait";
-    // A stream that ends may have ended because the session did.
+    // A stream may have ended because the session did.
     const timer = setInterval(() => { if (link === "lost" && !checking) check(); }, PAUSE);
     root.className = "session";
     root.append(who, element("div", { class: "row" }, more, out), trouble);
@@ -84,7 +84,7 @@ panel({
 panel({
   place: "more",
   order: 95,
-  title: "Audit",
+  title: "Audit log",
   needs: { role: "operator" },
   load: () => import("./audit.js"),
 });

@@ -1,5 +1,5 @@
-// The stream of events: held for lost when it breaks, or when nothing is heard for a while.
-// url() gives its address anew each time; heard(name, data, id) is told each event, lost() once that it is over.
+// The stream of events: regarded as lost when it breaks, or when it is silent for some time.
+// url() returns its URL for each connection; heard(name, data, id) is called per event, lost() once at its end.
 const PATIENCE = 1500;
 
 export function stream({ url, names, heard, lost }) {

@@ -1,5 +1,5 @@
-// The service worker: keeps the page's own files, so that it opens while its node is gone and finds another by itself.
-// What the team says is never kept: no API, no stream, no picture.
+// The service worker: caches the page's files, so that the page opens while its node is gone and connects to another.
+// Data of the team is never cached: no API, no stream, no picture.
 const SHELL = "swarm.shell";
 const PATIENCE = 1000;
 const isShell = ({ pathname }) => pathname === "/" || pathname.startsWith("/static/");
@@ -13,8 +13,8 @@ addEventListener("fetch", (event) => {
   event.respondWith(answer(event.request, url));
 });
 
-// The node's file where it comes in time, so that an update shows at once; else the one that is kept.  What is not
-// kept yet is not kept here: the page keeps its files all at once, and half of them would open as half a page.
+// Return the node's file if it arrives in time, so that an update shows at once; else the cached one.  A file that is
+// not cached yet is not added here, as the page caches all files at once, and a partial page does not start.
 async function answer(request, url) {
   const shell = await caches.open(SHELL);
   const kept = await shell.match(url.pathname);

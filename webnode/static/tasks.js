@@ -1,4 +1,4 @@
-// Tasks: choosing a predefined one, seeing what became of each, and taking it back.
+// Tasks: assign a predefined one, show the state of each, and cancel, pause or resume it.
 import { alike, at, attribute, badge, element, keyed, several, state, words } from "./element.js";
 import { say, wish } from "./desk.js";
 import { ask, get } from "./link.js";
@@ -36,7 +36,7 @@ function row(task) {
     element("details", { class: "why" }, element("summary"), element("div")), history(task), button, rest);
 }
 
-// What became of a task so far, read when somebody wants to know.
+// The history of a task, loaded when it is opened.
 function history(task) {
   const list = element("ol", { class: "story", tabindex: 0, "aria-label": `History of ${task.title}, the newest first` });
   const box = element("details", { class: "history" }, element("summary", {}, "History"), list);
@@ -48,7 +48,7 @@ function history(task) {
   return box;
 }
 
-// Why: the newest decision in one line; opened, each with its rule and who reported what.
+// The decisions on a task: the newest in one line; opened, each with its rule and the reports.
 function why(box, epochs) {
   box.hidden = !epochs.length;
   const told = JSON.stringify(epochs);
@@ -64,12 +64,12 @@ function why(box, epochs) {
 }
 
 function outcome({ able = [], refused = {} }) {
-  const no = alike(refused).map(([names, why]) => `${several(names)} cannot: ${why}`);
-  const yes = able.length ? [`Assigned to ${several(able)}`] : no.length ? ["Nobody can take it"] : ["Assigned"];
+  const no = alike(refused).map(([names, why]) => `Not possible for ${several(names)}: ${why}`);
+  const yes = able.length ? [`Assigned to ${several(able)}`] : no.length ? ["No device can take it"] : ["Assigned"];
   return `${[...yes, ...no].join(". ")}.`;
 }
 
-// The catalogue is read when the page connects, and again after each loss.
+// The catalogue is read when the page connects or reconnects.
 async function readCatalogue() {
   const catalogue = await get("catalogue").catch(() => null);
   if (!catalogue) return;

@@ -1,4 +1,4 @@
-// The theme: light or dark against the system's choice, where somebody chose one here.
+// The theme: light or dark if the visitor chose one, else the system's choice.
 export const KEPT = "swarm.theme";
 
 export function theme() {
@@ -9,5 +9,5 @@ export function theme() {
   }
 }
 
-// Before anything is drawn that would change its colours then.
+// Set before the first drawing, to avoid a change of colours.
 document.documentElement.style.colorScheme = theme();

@@ -1,4 +1,4 @@
-// Views: what leads to the further ones, and the panels that are loaded only where the node can fill them.
+// Views: the navigation to further views, and the panels that are loaded only if the node can fill them.
 import { element } from "./element.js";
 import { panel } from "./panel.js";
 import { KEPT, theme } from "./theme.js";
@@ -11,11 +11,11 @@ function choose(theme) {
   try {
     localStorage.setItem(KEPT, theme);
   } catch {
-    // A browser that keeps nothing asks the system again.
+    // Without storage the choice is lost with the page.
   }
 }
 
-// What is looked at less often, and how the page looks.
+// Links to views that are used less often, and the choice of colours.
 function more(root) {
   const choice = element("select", { id: "theme" }, ...Object.entries(THEMES).map(([value, name]) => element("option", { value }, name)));
   choice.value = theme();
@@ -26,7 +26,7 @@ function more(root) {
     element("div", { class: "row" }, element("label", { for: "theme" }, "Colours"), choice));
 }
 
-// What a phone needs to take part comes when its visitor asks for it.
+// The module for phones is loaded when the visitor opens its view.
 function phone(root, tools) {
   const acts = {
     async show() {
@@ -53,4 +53,4 @@ panel({ place: "events", title: "Events", load: () => import("./events.js") });
 panel({ place: "network", order: 5, title: "Links", needs: { role: "viewer", has: "survey" }, load: () => import("./ways.js") });
 panel({ place: "network", order: 7, title: "Team", needs: { role: "viewer", has: "survey" }, load: () => import("./membership.js") });
 panel({ place: "network", order: 10, title: "Network", needs: { has: "survey" }, load: () => import("./network.js") });
-panel({ place: "device", order: 10, title: "Stores", needs: { has: "survey" }, load: () => import("./inventory.js") });
+panel({ place: "device", order: 10, title: "Records", needs: { has: "survey" }, load: () => import("./inventory.js") });

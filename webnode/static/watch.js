@@ -1,6 +1,6 @@
-// Watching: what is asked again and again, but only while somebody looks at where it is shown.
+// Polling: repeat a query only while its panel is in view.
 
-// Calls `work` every so many milliseconds while `root` is in sight; call what it returns to end that.
+// Call `work` every `every` milliseconds while `root` is in view; the returned function ends that.
 export function watch(root, every, work) {
   let inSight = false;
   let timer = null;

@@ -1,11 +1,11 @@
-// Ways: how the node that serves this page reaches each device, and how well; the same of the others; who was turned away.
+// Links: path and quality from the serving node to each device, and between the others; rejected nodes.
 import { at, attribute, drawn, element, keyed, several, span, words } from "./element.js";
 import { get } from "./link.js";
 import { watch } from "./watch.js";
 
 const EVERY = 2500;
 const SHOWN = 40;
-const WAYS = { none: "no way yet", machine: "on one machine", lan: "LAN", direct: "direct", punched: "punched through routers", tunnel: "tunnel over TLS" };
+const WAYS = { none: "no path yet", machine: "on one machine", lan: "LAN", direct: "direct", punched: "hole punched", tunnel: "tunnel over TLS" };
 const GRADES = { well: "well", fair: "fair", poor: "poor", silent: "no answer", measuring: "measuring" };
 const BARS = { well: 4, fair: 3, poor: 2, silent: 0, measuring: 0 };
 
@@ -14,13 +14,13 @@ const ms = (value) => (value < 10 ? value.toFixed(1) : String(Math.round(value))
 const pace = ({ score }) => score ?? 101;
 
 function named(link) {
-  const way = link.way === "carried" ? `carried by ${link.by || "nobody now"}` : WAYS[link.way];
+  const way = link.way === "carried" ? `relayed by ${link.by || "no node now"}` : WAYS[link.way];
   return link.for_s === null ? way : `${way}, for ${span(link.for_s)}`;
 }
 
 function figures({ loss, rtt_ms: trip, jitter_ms: jitter }) {
   if (loss === null) return "";
-  return trip === null ? "it answers nothing" : `${ms(trip)} ms, jitter ${ms(jitter)} ms, ${Math.round(100 * loss)} % lost`;
+  return trip === null ? "no answer" : `${ms(trip)} ms, jitter ${ms(jitter)} ms, ${Math.round(100 * loss)} % lost`;
 }
 
 function row() {
@@ -41,7 +41,7 @@ function fill(item, { label, link }) {
   words(told, figures(link));
 }
 
-// Of both directions the worse one, the worst pair first.
+// The worse direction of each pair, worst pair first.
 function pairs(told, name) {
   const found = new Map();
   for (const [uuid, view] of Object.entries(told.devices)) {
@@ -55,7 +55,7 @@ function pairs(told, name) {
   return [...found.values()].sort((a, b) => pace(a.link) - pace(b.link) || (a.key < b.key ? -1 : 1));
 }
 
-// One line for each who was turned away and why, whoever of the team says so.
+// One line for each rejected node, combined from the reports of all devices.
 function refusals(told, name) {
   const found = new Map();
   for (const [uuid, view] of Object.entries(told.devices)) {
@@ -73,11 +73,11 @@ function refusals(told, name) {
 function refused(item, each) {
   const [who, why, remedy] = item.children;
   const times = each.count > 1 ? `, ${each.count} times` : "";
-  const what = each.side === "call" ? `may not do what it asked of ${several(each.by, 3)}` : `is not let in by ${several(each.by, 3)}`;
+  const what = each.side === "call" ? `is not authorized for a request to ${several(each.by, 3)}` : `is rejected by ${several(each.by, 3)}`;
   words(who.firstChild, each.who);
   words(who.lastChild, ` ${what}; ${span(each.ago_s)} ago${times}`);
   words(why, `${each.code}: ${each.why}`);
-  words(remedy, each.remedy ? `Do: ${each.remedy}` : "");
+  words(remedy, each.remedy ? `Remedy: ${each.remedy}` : "");
 }
 
 function summary(told, own, others) {
@@ -94,12 +94,12 @@ function show(told, model) {
   const others = pairs(told, name);
   const turned = refusals(told, name);
   words(at("ways-line"), summary(told, own, others));
-  words(at("ways-from"), `How ${name(told.here)} reaches the others, 0 to 100`);
+  words(at("ways-from"), `Links of ${name(told.here)}, score 0 to 100`);
   keyed(at("ways"), own, ({ key }) => key, row, fill);
   at("ways-others").hidden = others.length === 0;
-  words(at("ways-others").firstChild, `Between the others: ${others.length}, the worst first`);
+  words(at("ways-others").firstChild, `Between the others: ${others.length}, worst first`);
   keyed(at("ways-between"), others.slice(0, SHOWN), ({ key }) => key, row, fill);
-  words(at("ways-refused"), turned.length ? "Not let in, in the last hour" : "Nobody was turned away in the last hour.");
+  words(at("ways-refused"), turned.length ? "Rejected nodes of the last hour" : "No node was rejected in the last hour.");
   keyed(at("refusals"), turned, ({ key }) => key,
     () => element("li", {}, element("span", {}, element("b"), element("span")), element("span", { class: "why" }), element("span", { class: "remedy" })), refused);
 }
@@ -108,7 +108,7 @@ if (!document.querySelector("link[href='/static/ways.css']")) document.head.appe
 
 export function make(root, { model }) {
   root.append(
-    element("h3", {}, "Links"), element("p", { class: "hint", id: "ways-line", role: "status" }, "Asking the devices …"),
+    element("h3", {}, "Links"), element("p", { class: "hint", id: "ways-line", role: "status" }, "Querying the devices …"),
     element("p", { class: "hint", id: "ways-from" }), element("ul", { id: "ways" }),
     element("details", { id: "ways-others", hidden: "" }, element("summary"), element("ul", { id: "ways-between" })),
     element("p", { class: "hint", id: "ways-refused" }), element("ul", { id: "refusals" }));

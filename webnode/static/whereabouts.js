@@ -1,9 +1,9 @@
-// Whereabouts: where a device says that it is, in words.
+// The reported position of a device as text.
 export function whereabouts(position) {
   if (!position) return "";
   if ("x" in position) {
     const { x, y, heading } = position;
-    const turned = heading === null ? "" : `, looking along ${Math.round((heading * 180) / Math.PI)}°`;
+    const turned = heading === null ? "" : `, heading ${Math.round((heading * 180) / Math.PI)}°`;
     return `${x.toFixed(2)}, ${y.toFixed(2)} m${turned}`;
   }
   const { lat, lon, accuracy } = position;

@@ -1,4 +1,4 @@
-// Robots of the yard: each is lifted by finger, mouse or arrow keys and set down elsewhere; a tap or Enter turns it.
+// Robots of the simulator: move one by finger, mouse or arrow keys; a tap or Enter turns it.
 import { at, attribute, drawn } from "./element.js";
 import { wish } from "./desk.js";
 
@@ -14,7 +14,7 @@ export function make(root, { model }) {
   const hint = document.createElement("p");
   let lifted = null;
   hint.className = "hint";
-  hint.textContent = "Drag a robot to set it down elsewhere, tap it to turn it; or choose it and use the arrow keys and Enter.";
+  hint.textContent = "Drag a robot to move it, tap it to turn it; or select it and use the arrow keys and Enter.";
   root.append(hint);
   at("place")?.after(root);
 
@@ -37,7 +37,7 @@ export function make(root, { model }) {
   }
 
   function put(name, place) {
-    const done = ({ x, y }) => `${name} stands at ${x.toFixed(2)}, ${y.toFixed(2)} m.`;
+    const done = ({ x, y }) => `${name} moved to ${x.toFixed(2)}, ${y.toFixed(2)} m.`;
     return wish(`Moving ${name}`, `yard/robots/${encodeURIComponent(name)}`, { method: "PUT", body: place, done });
   }
 
@@ -68,12 +68,12 @@ export function make(root, { model }) {
     show(null);
   }
 
-  // A tap on a robot is meant for it: the target must not come there.
+  // A tap on a robot must not also place the target.
   function click(event) {
     if (shapeOf(event)) event.stopPropagation();
   }
 
-  // A finger on what can be dragged scrolls nothing; the style alone does not see to it inside of a drawing.
+  // Dragging must not scroll the page; inside an SVG the CSS property is not enough.
   function touch(event) {
     if (event.target.closest?.("#map .dog, #map .target")) event.preventDefault();
   }

@@ -1,4 +1,4 @@
-"""Barrier: what keeps datagrams from passing between some nodes of a board (``switchboard.Barrier``)."""
+"""Block datagrams between some nodes of a switchboard (``switchboard.Barrier``)."""
 
 from __future__ import annotations
 
@@ -9,30 +9,30 @@ from middleware.entangled.network.network import Address
 
 
 def cut(hosts: Iterable[str]) -> Callable[[Address, Address], bool]:
-    """Nothing passes between ``hosts`` and all others; among themselves they are connected."""
+    """Block all datagrams between ``hosts`` and other nodes; ``hosts`` reach each other."""
     inside = frozenset(hosts)
     return lambda source, to: (source.host in inside) != (to.host in inside)
 
 
 def deaf(hosts: Iterable[str]) -> Callable[[Address, Address], bool]:
-    """Nothing from others comes in to ``hosts``, though they are heard."""
+    """Block datagrams from other nodes to ``hosts``."""
     inside = frozenset(hosts)
     return lambda source, to: to.host in inside and source.host not in inside
 
 
 def mute(hosts: Iterable[str]) -> Callable[[Address, Address], bool]:
-    """Nothing of ``hosts`` gets out to others, though they hear."""
+    """Block datagrams from ``hosts`` to other nodes."""
     inside = frozenset(hosts)
     return lambda source, to: source.host in inside and to.host not in inside
 
 
 def clog(host: str) -> Callable[[Address, Address], bool]:
-    """One host is alone."""
+    """Block all datagrams from and to one host."""
     return lambda source, to: source.host == host or to.host == host
 
 
 def pairs(share: float, salt: str) -> Callable[[Address, Address], bool]:
-    """A ``share`` of all pairs cannot talk, which ones follows from ``salt``; both may well talk to a third."""
+    """Block the share ``share`` of all pairs, selected by ``salt``; both nodes of a pair may reach a third one."""
     bound = int(share * 2**32)
 
     def stands(source: Address, to: Address) -> bool:

@@ -1,4 +1,4 @@
-"""Carry out the faults and sessions of a scenario in a simulated team."""
+"""Apply the faults and sessions of a scenario to a simulated team."""
 
 from __future__ import annotations
 
@@ -12,32 +12,32 @@ from sim.team.faults.settings import Fault
 from sim.team.team import Node, Team
 
 FEW = 2
-"""So many nodes stay, whatever the sessions say: who is alone has no network to come back to."""
+"""Number of nodes that always stay, as a single node would have no network to return to."""
 
 
 class TeamFaults:
-    """The faults and sessions of a team from ``begin`` to ``end``.
+    """The faults and sessions of a team between ``begin`` and ``end``.
 
-    Whom a fault befalls is drawn when it comes, from those that are in the network then.
+    The affected nodes are drawn when a fault occurs, from the nodes in the network at that time.
     """
 
     def __init__(self, team: Team) -> None:
         self._team = team
         self._sessions = team.scenario.sessions
-        self._dice = team.generator("trouble")
-        self._session_dice = team.generator("sessions")
+        self._rng = team.generator("trouble")
+        self._session_rng = team.generator("sessions")
         self._is_on = False
         self._undo: dict[int, Callable[[], None]] = {}
         self._number = 0
         self._away: dict[int, int] = {}
-        """Places whose node is to come back, each with the number of the life that ended there."""
-        self._befall: dict[str, Callable[[Fault], None]] = {
+        """Places whose nodes will restart, each with the number of the life that ended."""
+        self._handlers: dict[str, Callable[[Fault], None]] = {
             "crash": partial(self._end_lives, kill=True),
             "leave": partial(self._end_lives, kill=False),
             "freeze": self._freeze,
-            "cut": partial(self._bar, barrier.cut),
-            "deaf": partial(self._bar, barrier.deaf),
-            "mute": partial(self._bar, barrier.mute),
+            "cut": partial(self._add_barrier, barrier.cut),
+            "deaf": partial(self._add_barrier, barrier.deaf),
+            "mute": partial(self._add_barrier, barrier.mute),
             "clog": self._clog,
             "pairs": self._pairs,
             "step": self._step,
@@ -49,22 +49,22 @@ class TeamFaults:
         }
 
     def begin(self) -> None:
-        """The team stands: sessions run from now on, and faults come at their time."""
+        """Start the sessions of a complete team, and schedule the faults."""
         team, stays = self._team, self._sessions.stays
         self._is_on = True
         if stays is not None:
             for place in team.alive():
-                self._plan_end(place, stays.left(self._session_dice))
-            team.on_birth.append(self._born)
+                self._plan_end(place, stays.left(self._session_rng))
+            team.on_birth.append(self._on_birth)
         for number, fault in enumerate(team.scenario.faults, 1):
-            team.at(fault.at, partial(self._strike, fault, number))
+            team.at(fault.at, partial(self._start_fault, fault, number))
 
     def end(self) -> None:
-        """Take back every fault, and let those come back that are to; nothing happens any more."""
+        """End every fault, restart the nodes that are due, and stop."""
         team = self._team
         self._is_on = False
         for number in list(self._undo):
-            self._take_back(number)
+            self._undo_fault(number)
         team.board.barriers.clear()
         for place, life in sorted(self._away.items()):
             self._return(place, life)
@@ -72,27 +72,27 @@ class TeamFaults:
 
     # -- sessions ---------------------------------------------------------------------------------------------------
 
-    def _born(self, place: int, node: Node) -> None:
+    def _on_birth(self, place: int, node: Node) -> None:
         stays = self._sessions.stays
         if self._is_on and stays is not None:
-            self._plan_end(place, stays.drawn(self._session_dice))
+            self._plan_end(place, stays.drawn(self._session_rng))
 
     def _plan_end(self, place: int, seconds: float) -> None:
         self._team.at(seconds, partial(self._session_over, place, self._team.life[place]))
 
     def _session_over(self, place: int, life: int) -> None:
-        team, sessions, dice = self._team, self._sessions, self._session_dice
+        team, sessions, rng = self._team, self._sessions, self._session_rng
         if not self._is_on or not self._lives(place, life):
             return
         if len(team.living) <= FEW:
-            self._plan_end(place, sessions.breaks.drawn(dice))
+            self._plan_end(place, sessions.breaks.drawn(rng))
             return
-        if dice.random() < sessions.goodbye:
+        if rng.random() < sessions.goodbye:
             team.leave(place)
         else:
             team.kill(place)
         self._away[place] = life
-        team.at(sessions.breaks.drawn(dice), partial(self._return, place, life))
+        team.at(sessions.breaks.drawn(rng), partial(self._return, place, life))
 
     def _return(self, place: int, life: int) -> None:
         if self._away.get(place) != life:
@@ -107,21 +107,21 @@ class TeamFaults:
 
     # -- faults -----------------------------------------------------------------------------------------------------
 
-    def _strike(self, fault: Fault, number: int) -> None:
+    def _start_fault(self, fault: Fault, number: int) -> None:
         if self._is_on:
             self._team.tell("fault", -1, f"{number}: {fault}")
-            self._befall[fault.kind](fault)
+            self._handlers[fault.kind](fault)
 
-    def _whom(self, fault: Fault) -> list[int]:
-        """Those that a fault befalls, in the order in which it comes to them."""
+    def _draw_places(self, fault: Fault) -> list[int]:
+        """Draw the nodes that a fault affects, in the order of its spread."""
         here = sorted(self._team.inside())
         if fault.places:
             return [place for place in fault.places if place in self._team.living]
         count = fault.count or round(fault.share * len(here))
-        return self._dice.sample(here, min(count, len(here)))
+        return self._rng.sample(here, min(count, len(here)))
 
     def _spread(self, fault: Fault, work: list[Callable[[], None]]) -> None:
-        """Do all of it, over the time over which the fault spreads."""
+        """Run all of ``work``, spread over the duration ``fault.over``."""
         for turn, each in enumerate(work):
             if fault.over:
                 self._team.at(turn * fault.over / len(work), partial(self._if_on, each))
@@ -132,24 +132,24 @@ class TeamFaults:
         if self._is_on:
             work()
 
-    def _for_a_while(self, seconds: float, undo: Callable[[], None]) -> None:
-        """Have something taken back after ``seconds``, or when all is."""
+    def _undo_after(self, seconds: float, undo: Callable[[], None]) -> None:
+        """Call ``undo`` after ``seconds``, or earlier by ``end``."""
         self._number += 1
         self._undo[self._number] = undo
-        self._team.at(seconds, partial(self._take_back, self._number))
+        self._team.at(seconds, partial(self._undo_fault, self._number))
 
-    def _take_back(self, number: int) -> None:
+    def _undo_fault(self, number: int) -> None:
         undo = self._undo.pop(number, None)
         if undo is not None:
             undo()
 
     def _hosts(self, places: list[int]) -> list[str]:
-        """Where those places are seen by others."""
+        """Return the addresses at which other nodes see these places."""
         here = [self._team.place(place) for place in places]
         return [place.address.host if place.home is None else place.home.host for place in here]
 
     def _end_lives(self, fault: Fault, kill: bool) -> None:
-        self._spread(fault, [partial(self._end_life, place, fault.lasts, kill) for place in self._whom(fault)])
+        self._spread(fault, [partial(self._end_life, place, fault.lasts, kill) for place in self._draw_places(fault)])
 
     def _end_life(self, place: int, lasts: float, kill: bool) -> None:
         team = self._team
@@ -170,7 +170,7 @@ class TeamFaults:
             self._team.start(place)
 
     def _freeze(self, fault: Fault) -> None:
-        self._spread(fault, [partial(self._freeze_one, place, fault.lasts) for place in self._whom(fault)])
+        self._spread(fault, [partial(self._freeze_one, place, fault.lasts) for place in self._draw_places(fault)])
 
     def _freeze_one(self, place: int, lasts: float) -> None:
         team = self._team
@@ -179,55 +179,55 @@ class TeamFaults:
             return
         life = team.life[place]
         team.freeze(place)
-        self._for_a_while(lasts, lambda: team.thaw(place) if self._lives(place, life) else None)
+        self._undo_after(lasts, lambda: team.thaw(place) if self._lives(place, life) else None)
 
-    def _bar(self, made: Callable[[list[str]], Barrier], fault: Fault) -> None:
-        self._stand(made(self._hosts(self._whom(fault))), fault.lasts)
+    def _add_barrier(self, make_barrier: Callable[[list[str]], Barrier], fault: Fault) -> None:
+        self._block(make_barrier(self._hosts(self._draw_places(fault))), fault.lasts)
 
     def _clog(self, fault: Fault) -> None:
-        hosts = self._hosts(self._whom(fault))
-        self._spread(fault, [partial(self._stand, barrier.clog(host), fault.lasts) for host in hosts])
+        hosts = self._hosts(self._draw_places(fault))
+        self._spread(fault, [partial(self._block, barrier.clog(host), fault.lasts) for host in hosts])
 
     def _pairs(self, fault: Fault) -> None:
-        self._stand(barrier.pairs(fault.share, str(self._dice.random())), fault.lasts)
+        self._block(barrier.pairs(fault.share, str(self._rng.random())), fault.lasts)
 
-    def _stand(self, stands: Barrier, lasts: float) -> None:
+    def _block(self, rule: Barrier, lasts: float) -> None:
         barriers = self._team.board.barriers
-        barriers.append(stands)
-        self._for_a_while(lasts, lambda: barriers.remove(stands))
+        barriers.append(rule)
+        self._undo_after(lasts, lambda: barriers.remove(rule))
 
     def _step(self, fault: Fault) -> None:
         def step(seconds: float) -> None:
-            for place in whom:
+            for place in affected:
                 self._team.place(place).step += seconds
 
-        whom = self._whom(fault)
+        affected = self._draw_places(fault)
         step(fault.amount)
         if fault.lasts:
-            self._for_a_while(fault.lasts, partial(step, -fault.amount))
+            self._undo_after(fault.lasts, partial(step, -fault.amount))
 
     def _rate(self, fault: Fault) -> None:
         def run(factor: float) -> None:
-            for place in whom:
+            for place in affected:
                 here = self._team.place(place)
                 here.rate *= factor
                 if here.machine is not None:
                     here.machine.set_rate(here.rate)
 
-        whom = self._whom(fault)
+        affected = self._draw_places(fault)
         run(fault.amount)
-        self._for_a_while(fault.lasts, partial(run, 1 / fault.amount))
+        self._undo_after(fault.lasts, partial(run, 1 / fault.amount))
 
     def _full(self, fault: Fault) -> None:
         def fill(is_full: bool) -> None:
-            for place in whom:
+            for place in affected:
                 store = self._team.place(place).store
                 if isinstance(store, Disk):
                     store.is_full = is_full
 
-        whom = self._whom(fault)
+        affected = self._draw_places(fault)
         fill(True)
-        self._for_a_while(fault.lasts, lambda: fill(False))
+        self._undo_after(fault.lasts, lambda: fill(False))
 
     def _crowd(self, fault: Fault) -> None:
         def come() -> None:
@@ -248,10 +248,10 @@ class TeamFaults:
         def clear() -> None:
             link.worse -= fault.amount
 
-        self._for_a_while(fault.lasts, clear)
+        self._undo_after(fault.lasts, clear)
 
     def _rebind(self, fault: Fault) -> None:
-        for place in self._whom(fault):
+        for place in self._draw_places(fault):
             home = self._team.place(place).home
             if home is not None:
                 home.rebind()

@@ -1,4 +1,4 @@
-"""The faults of a scenario: what happens to the team at a moment, and for how long."""
+"""Define the faults of a scenario: kind, time, duration, and affected nodes."""
 
 from __future__ import annotations
 
@@ -26,50 +26,49 @@ TAKES: dict[str, tuple[str, ...]] = {
     "weather": ("lasts", "amount"),
     "rebind": _WHOM,
 }
-"""The kinds, and what else each of them needs or may be told."""
+"""The kinds of faults, with the further keys that each accepts."""
 KINDS = tuple(TAKES)
 LASTING = ("cut", "deaf", "mute", "clog", "pairs", "freeze", "rate", "full", "weather")
-"""Those that mean something only for a while."""
+"""The kinds that require a duration."""
 WHOM = tuple(kind for kind, taken in TAKES.items() if "places" in taken)
-"""Those that befall chosen nodes."""
+"""The kinds that affect selected nodes."""
 
 
 @dataclass(frozen=True)
 class Fault:
-    """``[[fault]]``: one of them.
+    """``[[fault]]``: one fault.
 
-    Whom it befalls is drawn from the seed: so many (``count``) or that ``share`` of those that live; or ``places``
-    names them by their number, from 0 on.
+    Affected nodes are drawn by the seed: a number (``count``) or ``share`` of living nodes; or they are listed by
+    number in ``places``, from 0 on.
     """
 
     kind: Annotated[str, one_of(KINDS)]
-    """``crash``: the power fails.  ``leave``: with a goodbye.  ``freeze``: as after SIGSTOP.  ``cut``: away from all
-    others, among themselves connected; ``deaf``: only nothing comes in; ``mute``: only nothing gets out; ``clog``: each
-    of them alone.  ``pairs``: that ``share`` of all pairs of nodes is cut.  ``step``: wall clocks are set ``amount``
-    seconds on or back.  ``rate``: clocks run ``amount`` times as fast.  ``full``: disks are full.  ``crowd``: ``count``
-    newcomers.  ``weather``: the share ``amount`` of all datagrams is lost besides.  ``rebind``: routers forget their
-    mappings."""
+    """``crash``: loss of power.  ``leave``: graceful leave.  ``freeze``: like SIGSTOP.  ``cut``: partition of the nodes
+    from all others; ``deaf``: no datagrams to them; ``mute``: no datagrams from them; ``clog``: each of them alone.
+    ``pairs``: a share of all pairs is cut.  ``step``: wall clocks are set by ``amount`` seconds.  ``rate``: clocks
+    run ``amount`` times as fast.  ``full``: disks are full.  ``crowd``: ``count`` newcomers.  ``weather``: the share
+    ``amount`` of all datagrams is lost in addition.  ``rebind``: routers drop their mappings."""
 
     at: Annotated[float, Meta(ge=0.0, le=1e7), Unit("seconds")]
-    """When, in seconds after the team stands."""
+    """Start in seconds after the team has settled."""
 
     lasts: Annotated[float, Meta(ge=0.0, le=1e7), Unit("seconds")] = 0.0
-    """For how long; after that it is taken back: who crashed or left starts again from its disk.  0: for good."""
+    """Duration in seconds; afterwards the fault ends, and crashed nodes restart from disk.  0: permanent."""
 
     count: Annotated[int, Meta(ge=0, le=100_000)] = 0
-    """How many."""
+    """Number of affected nodes."""
 
     share: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0
-    """Which share of them."""
+    """Share of affected nodes."""
 
     places: Annotated[tuple[Annotated[int, Meta(ge=0)], ...], UNIQUE] = ()
-    """Who, by number."""
+    """Affected nodes by number."""
 
     amount: Annotated[float, Meta(ge=-1e7, le=1e7)] = 0.0
-    """How much."""
+    """Strength of the fault; its meaning depends on the kind."""
 
     over: Annotated[float, Meta(ge=0.0, le=1e6), Unit("seconds")] = 0.0
-    """Seconds over which it spreads, one after the other; 0: all at once."""
+    """Seconds over which the fault spreads from node to node; 0: all at once."""
 
     def __str__(self) -> str:
         whom = ",".join(map(str, self.places)) or (f"{self.share:.0%}" if self.share else str(self.count or ""))
@@ -81,32 +80,32 @@ Problem = tuple[str, str, str]
 
 
 def fault_problem(fault: Fault, nodes: int, seconds: float) -> Problem | None:
-    """What is impossible about a fault in such a team: the key, the problem and the remedy."""
+    """Return the error of a fault in such a team, as key, problem and remedy; None if it is valid."""
     chosen = sum(map(bool, (fault.count, fault.share, fault.places)))
     kind = fault.kind
     for key in (*_WHOM, "lasts", "over", "amount"):
         if getattr(fault, key) and key not in TAKES[kind]:
-            return key, f"means nothing for {kind}", f"leave it out; {kind} goes by {', '.join(TAKES[kind])}"
+            return key, f"is not valid for {kind}", f"leave it out; {kind} takes {', '.join(TAKES[kind])}"
     if fault.at > seconds:
-        return "at", f"is after the end, {seconds:g} s", "let the scenario last longer, or let it happen earlier"
+        return "at", f"is after the end, {seconds:g} s", "increase seconds, or decrease at"
     if kind in LASTING and not fault.lasts:
-        return "lasts", f"is needed: {kind} ends some time", "write lasts = 10"
+        return "lasts", f"is required for {kind}", "write lasts = 10"
     if kind in WHOM and chosen != 1:
         return "kind", f"{kind} needs one of count, share and places", "write share = 0.5, or count = 1"
     if kind == "pairs" and not 0 < fault.share < 1:
-        return "share", "must say which share of the pairs is cut", "write share = 0.05"
+        return "share", "must be the share of blocked pairs", "write share = 0.05"
     if kind == "crowd" and not fault.count:
-        return "count", "must say how many come", "write count = 100"
+        return "count", "must be the number of newcomers", "write count = 100"
     if any(place >= nodes for place in fault.places):
-        return "places", f"names {max(fault.places)}, and there are 0 to {nodes - 1}", "leave it out"
+        return "places", f"names {max(fault.places)}, but there are 0 to {nodes - 1}", "leave it out"
     if kind in WHOM and fault.count > nodes:
-        return "count", f"is more than the {nodes} nodes", "take fewer"
+        return "count", f"is more than the {nodes} nodes", "use a smaller number"
     if kind == "crash" and not fault.lasts and (fault.count == nodes or fault.share == 1.0):
-        return "share", "leaves nobody", "take fewer, or let them come back: lasts = 10"
+        return "share", "leaves no node", "use a smaller number, or restart the nodes: lasts = 10"
     if kind == "rate" and not 0.5 <= fault.amount <= 2:
         return "amount", "must be 0.5 to 2 times as fast", "write amount = 1.05"
     if kind == "step" and not fault.amount:
-        return "amount", "must say how far the clock is set", "write amount = -60"
+        return "amount", "must be the step of the clock in seconds", "write amount = -60"
     if kind == "weather" and not 0 < fault.amount < 1:
-        return "amount", "must be the share that is lost", "write amount = 0.1"
+        return "amount", "must be the share of lost datagrams", "write amount = 0.1"
     return None

@@ -1,4 +1,4 @@
-"""Faults with a beginning and an end, in the order in which they are due."""
+"""Order faults with a start and an end by the times at which they are due."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from sim.team.shrink import Trim
 
 @dataclass(frozen=True)
 class TimedFault:
-    """A fault of ``kind`` that befalls ``places`` from ``at`` to ``until``, in seconds of its schedule."""
+    """A fault of ``kind`` that affects ``places`` from ``at`` to ``until``, in seconds of its schedule."""
 
     at: float
     until: float
@@ -22,7 +22,7 @@ class TimedFault:
 
 
 class Timeline:
-    """The beginnings and ends of ``faults`` that ``trim`` keeps; at one moment beginnings come first."""
+    """The starts and ends of the ``faults`` that ``trim`` keeps; at equal times starts come first."""
 
     def __init__(self, faults: Sequence[TimedFault], trim: Trim) -> None:
         kept = [(number, fault) for number, fault in enumerate(faults) if trim.keeps(number)]
@@ -32,7 +32,7 @@ class Timeline:
         )
 
     def due(self, now: float) -> Iterator[tuple[TimedFault, bool]]:
-        """Each fault that begins (False) or ends (True) until ``now``, once."""
+        """Yield each fault that starts (False) or ends (True) until ``now``, once."""
         while self._ahead and self._ahead[0][0] <= now:
             _, is_end, _, fault = self._ahead.pop(0)
             yield fault, is_end

@@ -1,1 +1,1 @@
-"""The invariants: each is a function of what happened, and gives its violations, a line each."""
+"""The invariants: functions that yield the violations in a history, one line each."""

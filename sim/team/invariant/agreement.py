@@ -1,4 +1,4 @@
-"""Execution, the half of tasks and decisions: E4, E5, E6 and E7."""
+"""Invariants of execution, for tasks and decisions: E4, E5, E6 and E7."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from collections.abc import Hashable, Iterable, Iterator
 from sim.team.event import Asked, Born, Calm, Concluded, Decided, Engaged, Event, Expired, Open
 
 KINDS = Asked, Born, Calm, Engaged, Concluded, Expired, Open, Decided
-"""What these invariants look at."""
+"""The events that these invariants use."""
 RECENT = 1.0
-"""E7: seconds between two decisions of an agent within which no report that it used may have grown older."""
+"""E7: seconds between two decisions of an agent within which it must not use an older report of the same agent."""
 
 
 def e4(events: Iterable[Event]) -> Iterator[str]:
-    """No task lost: each that was submitted comes to an end which everybody hears of, and is not begun again."""
+    """No lost task: each submitted task ends, all agents learn of its end, and none starts it again."""
     submitted: dict[Hashable, None] = {}
     over: set[Hashable] = set()
     states: dict[str, dict[int, str]] = {}
@@ -38,7 +38,7 @@ def e4(events: Iterable[Event]) -> Iterator[str]:
 
 
 def e5(events: Iterable[Event]) -> Iterator[str]:
-    """No ghost, of agents: in calm nobody goes on with a task when its end must have been heard."""
+    """No ghost among agents: in a calm network no agent continues a task after it must have learned of its end."""
     within: float | None = None
     ended: dict[str, Concluded] = {}
     for event in events:
@@ -54,7 +54,7 @@ def e5(events: Iterable[Event]) -> Iterator[str]:
 
 
 def e6(events: Iterable[Event]) -> Iterator[str]:
-    """No flapping: whoever acts gives way only to a bid that is better by the hysteresis."""
+    """No flapping: a holder yields only to a bid that is better by the hysteresis."""
     for event in events:
         if not isinstance(event, Decided) or event.assigned is None or event.holder in (None, event.assigned):
             continue
@@ -65,7 +65,7 @@ def e6(events: Iterable[Event]) -> Iterator[str]:
 
 
 def e7(events: Iterable[Event]) -> Iterator[str]:
-    """Agreement: of the same reports all name the same, and nobody goes back to an older report."""
+    """Agreement: equal reports lead to equal decisions, and no agent goes back to an older report."""
     agreed: dict[Hashable, str] = {}
     used: dict[tuple[int, str], tuple[float, dict[str, tuple[int, int]]]] = {}
     for event in events:

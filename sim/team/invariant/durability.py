@@ -1,7 +1,7 @@
-"""Durability: D1 to D7, over what clients wrote and read, what stores hold, and whom nodes know.
+"""Invariants of durability, D1 to D7: clients' writes and reads, contents of stores, and contacts of nodes.
 
-A client numbers its writes of a slot 1, 2, 3 ...; a removal is a write of nothing.  A write that was not acknowledged
-may have happened, so a read may show it; nothing may be shown that is older than what was acknowledged before, or read.
+A client numbers its writes of a slot 1, 2, 3 ...; a removal is a write without a value.  An unacknowledged write may
+have happened, so a read may show it; no read may show a value older than one acknowledged or read before.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from typing import Any, NamedTuple
 from sim.team.event import Answered, Asked, Born, Counted, Died, Event, Met, Settled, Stored, Unanswered
 
 KINDS = Asked, Answered, Unanswered, Born, Died, Settled, Stored, Met, Counted
-"""What these invariants look at."""
+"""The events that these invariants use."""
 MAJORITY = "majority"
 
 
 class Slot(NamedTuple):
-    """Where a record lives."""
+    """The location of a record."""
 
     key: bytes
     owner: bytes
@@ -27,7 +27,7 @@ class Slot(NamedTuple):
 
 @dataclass
 class _Known:
-    """Of a slot: the last write that was begun, the highest that is acknowledged, and what each reader saw."""
+    """The state of a slot: the last write started, the highest acknowledged one, and the last read of each client."""
 
     begun: int = 0
     floor: int = 0
@@ -37,14 +37,14 @@ class _Known:
 
 @dataclass
 class _Reading:
-    """A read under way, and what each slot had to show when it began."""
+    """A pending read, with the minimum number for each slot at its start."""
 
     asked: Asked
     floors: dict[Slot, int]
 
 
 def _reads(events: Iterable[Event]) -> Iterator[tuple[str, str]]:
-    """D1 to D4 of every read, each with its invariant: they look at the same."""
+    """Yield the violations of D1 to D4 in all reads, each with its invariant."""
     slots: dict[Slot, _Known] = {}
     by_key: dict[Hashable, list[Slot]] = {}
     writing: dict[int, tuple[_Known, int]] = {}
@@ -76,7 +76,7 @@ def _reads(events: Iterable[Event]) -> Iterator[tuple[str, str]]:
 def _judged(
     reading: _Reading, shown: dict[Slot, int], slots: dict[Slot, _Known], is_over: bool
 ) -> Iterator[tuple[str, str]]:
-    """Hold what a read gave against what was acknowledged before it began."""
+    """Compare the result of a read with the writes acknowledged before it started."""
     asked = reading.asked
     for place, number in shown.items():
         if place not in slots or number not in slots[place].values:
@@ -86,10 +86,10 @@ def _judged(
         slot, there = slots[place], shown.get(place)
         where = f"{asked.argument} read of {place.key.hex()[:6]} {place.owner.hex()[:4]}/{place.name} at {asked.at:.1f}"
         if there is None:
-            # Absent is right only where a removal may be the newest, or nothing was acknowledged yet.
+            # Absence is correct only if a removal may be the newest write, or nothing was acknowledged yet.
             is_removed = any(number not in slot.values for number in range(max(floor, 1), slot.begun + 1))
             if floor and not is_removed and (is_sure or not shown):
-                yield "D1", f"{where}: {floor} was acknowledged or read, nothing is found"
+                yield "D1", f"{where}: {floor} was acknowledged or read, but nothing is found"
         elif is_sure and there < floor:
             yield "D2" if floor in slot.values else "D3", f"{where}: shows {there} after {floor}"
         elif asked.argument == MAJORITY:
@@ -101,24 +101,24 @@ def _only(invariant: str, events: Iterable[Event]) -> Iterator[str]:
 
 
 def d1(events: Iterable[Event]) -> Iterator[str]:
-    """Durability: what was acknowledged is found, or its absence is called unavailable."""
+    """Durability: an acknowledged value is found, or the read reports that it is unavailable."""
     return _only("D1", events)
 
 
 def d2(events: Iterable[Event]) -> Iterator[str]:
-    """Freshness: a read of a majority shows nothing older than what was acknowledged or read before it began."""
+    """Freshness: a majority read shows nothing older than the values acknowledged or read before it started."""
     return _only("D2", events)
 
 
 def d3(events: Iterable[Event]) -> Iterator[str]:
-    """No resurrection: nothing older comes back after a removal was acknowledged."""
+    """No resurrection: no older value returns after a removal was acknowledged."""
     return _only("D3", events)
 
 
 def d4(events: Iterable[Event]) -> Iterator[str]:
-    """Owner only: reads and stores hold what its owner signed, and go up in number.
+    """Owner only: reads and stores contain what the owner signed, with growing sequence numbers.
 
-    No owner gives a number twice, in none of its lives; but one that has lost what it stored knows no better.
+    An owner never uses a number twice, in any of its lives, unless it has lost its store.
     """
     yield from _only("D4", events)
     held: dict[tuple[int, int, Hashable], tuple[int, bytes]] = {}
@@ -148,7 +148,7 @@ def d4(events: Iterable[Event]) -> Iterator[str]:
 
 
 def d5(events: Iterable[Event]) -> Iterator[str]:
-    """Table hygiene: a contact is another node of this world, at its address."""
+    """Table hygiene: a contact is another node of this team, at its address."""
     places: dict[bytes, tuple[int, str]] = {}
     for event in events:
         if isinstance(event, Born):
@@ -160,7 +160,7 @@ def d5(events: Iterable[Event]) -> Iterator[str]:
 
 
 def d6(events: Iterable[Event]) -> Iterator[str]:
-    """Exact lookup: when all is settled a lookup finds the k live nodes that are closest, the closest first."""
+    """Exact lookup: after the repair interval a lookup finds the k closest live nodes, closest first."""
     living: dict[int, bytes] = {}
     looking: dict[int, Asked] = {}
     for event in events:
@@ -196,7 +196,7 @@ def _lost(asked: Asked, found: object) -> str:
 
 
 def d7(events: Iterable[Event]) -> Iterator[str]:
-    """Healing: when all is settled every node knows all that live, and every read is answered."""
+    """Healing: after the repair interval every node knows all living nodes, and every read is answered."""
     living: dict[int, bytes] = {}
     reading: dict[int, Asked] = {}
     is_over = False

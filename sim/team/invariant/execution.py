@@ -1,4 +1,4 @@
-"""Execution, the half of leases and devices: E1, E2, E3, E5, E8 and E9."""
+"""Invariants of execution, for leases and devices: E1, E2, E3, E5, E8 and E9."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from sim.team.event import (
 )
 
 KINDS = Asked, Answered, Unanswered, Terms, Died, Won, Held, Issued, Commanded, Halted, Reached, Awaited, Engaged
-"""What these invariants look at."""
+"""The events that these invariants use."""
 ROUGH = 0.06
-"""E1: by this share of the ttl a device's count of a duration may differ from a clock that is 5 % off."""
+"""E1: tolerance as a share of the ttl for durations measured by a device's clock that is 5 % off."""
 BOUNDED = 0.01
-"""E2 and E5 rest on clocks that are not further off than this share; E1 does not."""
+"""Maximum clock drift for which E2 and E5 must hold; E1 holds for any drift."""
 A_MOMENT = 1e-6
 
 
 def e1(events: Iterable[Event]) -> Iterator[str]:
-    """Fenced effects: tokens never fall, neither of leases nor of accepted commands, and none is taken after its end.
+    """Fenced effects: tokens of leases and of accepted commands never fall, and no command is accepted after its lease.
 
-    Where members lose their stores, the tokens of leases may fall back: what devices take may not even then.
+    If members lose their stores, tokens of leases may fall, but still not those of accepted commands.
     """
     granted: dict[str, int] = {}
     taken: dict[str, int] = {}
@@ -58,9 +58,9 @@ def e1(events: Iterable[Event]) -> Iterator[str]:
 
 
 def e2(events: Iterable[Event]) -> Iterator[str]:
-    """One lease: whenever one is won or renewed nobody else holds it by his own clock, and no other robot moves.
+    """One lease: when a lease is won or renewed, no other agent holds it by its own clock, and no other robot moves.
 
-    Looked at then, for whatever overlaps, overlaps then.
+    Checking at these times suffices, as every overlap includes one of them.
     """
     still: dict[tuple[str, int], float] = {}
     is_bounded, stop_time = True, 0.0
@@ -81,7 +81,7 @@ def e2(events: Iterable[Event]) -> Iterator[str]:
 
 
 def e3(events: Iterable[Event]) -> Iterator[str]:
-    """Takeover: where one is gone and the rest is well, a command with a higher token is taken in time."""
+    """Takeover: after a failure that leaves the rest intact, a command with a higher token is accepted in time."""
     waited: list[Awaited] = []
     for event in events:
         if isinstance(event, Awaited):
@@ -97,10 +97,10 @@ def e3(events: Iterable[Event]) -> Iterator[str]:
 
 
 def e5(events: Iterable[Event]) -> Iterator[str]:
-    """No ghost, at the device: it obeys nobody after the end of a task was acknowledged; and the end is recorded.
+    """No ghost at the device: after the end of a task was acknowledged its device obeys no agent; the end is recorded.
 
-    Who ends the task of another waits for the end of that lease by clocks: where these are not bounded, a device may
-    obey for as long as a fast and a slow clock differ in a ttl.
+    An agent that ends another agent's task waits for the end of that lease by its clock: with unbounded clocks a device
+    may obey for the difference of a fast and a slow clock over a ttl.
     """
     closing: dict[int, str] = {}
     over: dict[str, float] = {}
@@ -122,7 +122,7 @@ def e5(events: Iterable[Event]) -> Iterator[str]:
 
 
 def e8(events: Iterable[Event]) -> Iterator[str]:
-    """Zombie: nobody commands under a lease that is over, nor acts or may act on two tasks at once."""
+    """No zombie: no agent sends a command under an expired lease, or acts on or holds two tasks at once."""
     terms = Terms(0.0, 0.0, 0.0, 0.0, 0.0)
     for event in events:
         match event:
@@ -137,7 +137,7 @@ def e8(events: Iterable[Event]) -> Iterator[str]:
 
 
 def e9(events: Iterable[Event]) -> Iterator[str]:
-    """Minority: who is cut from the majority wins nothing more, and stops by the end of its lease."""
+    """Minority: an agent without a connection to the majority wins no lease, and stops by the end of its lease."""
     cut: dict[tuple[str, int], float] = {}
     terms = Terms(0.0, 0.0, 0.0, 0.0, 0.0)
     for event in events:

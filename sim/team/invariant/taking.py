@@ -1,4 +1,4 @@
-"""Taking: T1 to T6, over tuples that were put, taken, read and waited for."""
+"""Invariants of the tuple space, T1 to T6: tuples that were put, taken, read and waited for."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from collections.abc import Hashable, Iterable, Iterator
 from sim.team.event import Answered, Asked, Event, Posted, Repeated, Seated, Settled, Unanswered, Voted
 
 KINDS = Asked, Answered, Unanswered, Settled, Posted, Voted, Seated, Repeated
-"""What these invariants look at."""
+"""The events that these invariants use."""
 WAKE = 1.0
-"""T6: seconds within which whoever waits is woken."""
+"""T6: seconds within which a waiting client is notified."""
 PUT, TAKE, SURVEY, WAIT, RING = "put", "take", "survey", "wait", "ring"
-"""What clients do: put one, take some, read all that there are, wait for the bell, ring it."""
+"""Client operations: put a tuple, take some, read all, wait for the bell tuple, put the bell tuple."""
 
 
 class _Space:
-    """What is known of all tuples, as far as the history has been read."""
+    """The state of all tuples in the part of the history read so far."""
 
     def __init__(self) -> None:
         self.posted: dict[Hashable, Posted] = {}
@@ -24,7 +24,7 @@ class _Space:
         self.votes: dict[Hashable, dict[tuple[Hashable, bytes], set[bytes]]] = defaultdict(lambda: defaultdict(set))
 
     def read(self, event: Event) -> None:
-        """Take in what an event says."""
+        """Apply an event."""
         match event:
             case Posted(_, mark):
                 self.posted[mark] = event
@@ -34,20 +34,20 @@ class _Space:
                 self.members = dict(members)
 
     def takers(self, mark: Hashable) -> set[bytes]:
-        """Everybody for whom a majority of the council ever accepted a take, under one ballot."""
+        """Return all takers that a majority of the council ever accepted under one ballot."""
         quorum = len(self.posted[mark].council) // 2 + 1
         return {taker for (_, taker), members in self.votes[mark].items() if len(members) >= quorum}
 
     def can_decide(self, posted: Posted) -> bool:
-        """Whether a majority of its council lives, and remembers."""
+        """Return whether a majority of its council lives and has not lost its votes."""
         seats = zip(posted.council, posted.incarnations, strict=True)
         able = [member for member, incarnation in seats if self.members.get(member) == incarnation]
         return 2 * len(able) > len(posted.council)
 
 
 def t1(events: Iterable[Event]) -> Iterator[str]:
-    """One taker: no tuple is confirmed to two, neither by two majorities nor in what clients were told."""
-    space, told = _Space(), defaultdict[Hashable, list[str]](list)
+    """One taker: no tuple is confirmed to two takers, neither by two majorities nor in answers to clients."""
+    space, confirmed = _Space(), defaultdict[Hashable, list[str]](list)
     taking: dict[int, Asked] = {}
     for event in events:
         space.read(event)
@@ -56,17 +56,17 @@ def t1(events: Iterable[Event]) -> Iterator[str]:
                 taking[number] = event
             case Answered(at, number, tuple() as taken) if number in taking:
                 for fields in taken:
-                    told[fields].append(f"node {taking[number].client} at {at:.1f}")
+                    confirmed[fields].append(f"node {taking[number].client} at {at:.1f}")
     for mark, posted in space.posted.items():
         if len(space.takers(mark)) > 1:
             yield f"{posted.fields} was accepted for two"
-    for fields, ways in told.items():
+    for fields, ways in confirmed.items():
         if len(ways) > 1:
             yield f"{fields} was confirmed to {' and '.join(ways)}"
 
 
 def t2(events: Iterable[Event]) -> Iterator[str]:
-    """Durability: an acknowledged tuple that nobody took is seen by all; and when all is settled, asking works."""
+    """Durability: readers see acknowledged tuples that were not taken; after the repair interval requests succeed."""
     space = _Space()
     asked: dict[int, Asked] = {}
     acknowledged: dict[Hashable, None] = {}
@@ -105,10 +105,10 @@ def _unseen(space: _Space, acknowledged: Iterable[Hashable], seen: set[Hashable]
 
 
 def t3(events: Iterable[Event]) -> Iterator[str]:
-    """Finality: what was confirmed to a taker is seen by no survey that begins later."""
+    """Finality: a confirmed take is visible in every survey that starts later."""
     space = _Space()
     asked: dict[int, Asked] = {}
-    told: dict[Hashable, str] = {}
+    confirmed: dict[Hashable, str] = {}
     over: dict[int, dict[Hashable, str]] = {}
     for event in events:
         space.read(event)
@@ -116,12 +116,12 @@ def t3(events: Iterable[Event]) -> Iterator[str]:
             case Asked(_, number, _, what):
                 asked[number] = event
                 if what == SURVEY:
-                    over[number] = dict(told)
+                    over[number] = dict(confirmed)
             case Answered(at, number, tuple() as result) if number in asked:
                 client = asked[number].client
                 if asked[number].what == TAKE:
                     for fields in result:
-                        told.setdefault(fields, f"node {client} at {at:.1f}")
+                        confirmed.setdefault(fields, f"node {client} at {at:.1f}")
                 elif asked[number].what == SURVEY:
                     before, known = over.pop(number), {posted.fields: posted for posted in space.posted.values()}
                     for fields in result:
@@ -130,15 +130,15 @@ def t3(events: Iterable[Event]) -> Iterator[str]:
 
 
 def t4(events: Iterable[Event]) -> Iterator[str]:
-    """The same answer: a member that accepted what was decided says so again, whenever it is asked."""
+    """Same answer: a member that accepted the decided value repeats it whenever it is asked."""
     for event in events:
         if isinstance(event, Repeated) and event.said != event.taker:
-            said = event.said.hex()[:6] if event.said else event.said
-            yield f"a member does not stand by what it said about {event.fields}: {said}"
+            value = event.said.hex()[:6] if event.said else event.said
+            yield f"a member changed its answer about {event.fields}: {value}"
 
 
 def t5(events: Iterable[Event]) -> Iterator[str]:
-    """Given back: at the end no acknowledged tuple is held by one who died, where its council can decide."""
+    """Given back: at the end no acknowledged tuple is held by a dead taker if its council can decide."""
     space = _Space()
     putting: dict[int, Hashable] = {}
     acknowledged: set[Hashable] = set()
@@ -154,11 +154,11 @@ def t5(events: Iterable[Event]) -> Iterator[str]:
                 acknowledged.add(putting.pop(number))
     for mark, posted in space.posted.items() if is_over else ():
         if posted.fields in acknowledged and not space.takers(mark) and space.can_decide(posted):
-            yield f"{posted.fields} is held by nobody who lives, and cannot be taken"
+            yield f"{posted.fields} is not held by a living taker, and cannot be taken"
 
 
 def t6(events: Iterable[Event]) -> Iterator[str]:
-    """Wake: whoever waits when the bell has rung hears it within a second.  Who died meanwhile waits no more."""
+    """Wake: a client that waits when the bell tuple is put is notified within a second, unless it dies meanwhile."""
     waiting: dict[int, Asked] = {}
     heard: dict[int, float] = {}
     ringing: dict[int, float | None] = {}

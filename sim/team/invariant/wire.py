@@ -1,4 +1,4 @@
-"""Wire: R1 to R4, over datagrams that must change nothing, questions that may run once, bytes, and tables."""
+"""Invariants of the wire, R1 to R4: invalid datagrams, requests that may run once, bytes, and tables."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from collections.abc import Iterable, Iterator
 from sim.team.event import Answered, Asked, Event, Ran, Shot, Size, Strange
 
 KINDS = Asked, Answered, Shot, Ran, Strange, Size
-"""What these invariants look at."""
+"""The events that these invariants use."""
 
 
 def r1(events: Iterable[Event]) -> Iterator[str]:
-    """Nothing but counters: an unlawful datagram leaves all that a node remembers as it was, and is no event."""
+    """Counters only: an invalid datagram changes no other state of a node, and causes no log entry or error."""
     for event in events:
         if not isinstance(event, Shot):
             continue
@@ -25,7 +25,7 @@ def r1(events: Iterable[Event]) -> Iterator[str]:
 
 
 def r2(events: Iterable[Event]) -> Iterator[str]:
-    """Once: a question that changes something runs at most once, and whoever is answered knows that it ran."""
+    """At most once: a request that changes something runs at most once, and an answer implies that it ran."""
     runs: Counter[tuple[int, int, int]] = Counter()
     lives: dict[int, int] = {}
     asked: dict[int, Asked] = {}
@@ -46,7 +46,7 @@ def r2(events: Iterable[Event]) -> Iterator[str]:
 
 
 def r3(events: Iterable[Event]) -> Iterator[str]:
-    """No amplification: whoever proved nothing gets no more bytes than he sent, and nobody else any."""
+    """No amplification: an unvalidated address gets no more bytes than it sent, and other addresses get none."""
     for event in events:
         if isinstance(event, Shot):
             size = len(event.datagram)
@@ -54,11 +54,11 @@ def r3(events: Iterable[Event]) -> Iterator[str]:
             if is_elsewhere or sum(answer for _, answer in event.answers) > size:
                 yield f"a {event.kind} datagram of {size} bytes is answered with {list(event.answers)}"
         elif isinstance(event, Strange) and event.sent > event.got:
-            yield f"{event.sent} bytes to a stranger who sent {event.got}"
+            yield f"{event.sent} bytes to an unvalidated address that sent {event.got}"
 
 
 def r4(events: Iterable[Event]) -> Iterator[str]:
-    """Caps: no table grows beyond its cap."""
+    """Caps: no table exceeds its limit."""
     for event in events:
         if isinstance(event, Size) and event.size > event.cap:
             yield f"node {event.place} remembers {event.size} {event.what}, {event.cap} are allowed"

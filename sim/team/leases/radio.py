@@ -1,4 +1,4 @@
-"""Radio: a link on which datagrams are lost, late, doubled, and overtake each other (``switchboard.Link``)."""
+"""A radio link with losses, delays, duplicates and reordering (``switchboard.Link``)."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from sim.team.world import PORT
 
 @dataclass(frozen=True)
 class Air:
-    """How datagrams fare: one-way ``delay`` plus an exponential ``jitter``, in seconds; shares lost and doubled.
+    """The quality of a radio link: one-way ``delay`` plus exponential ``jitter`` in seconds; shares lost and doubled.
 
-    With ``burst`` the losses come in bursts of that mean length (Gilbert and Elliott), in the same number.
+    With ``burst`` the losses have the same rate and occur in bursts of that mean length (Gilbert-Elliott).
     """
 
     delay: float = 0.002
@@ -28,9 +28,9 @@ CALM = Air()
 
 
 class Radio:
-    """The link between all places; ``cut`` holds the directed pairs of places that do not hear each other.
+    """The link between all places; ``cut`` has the directed pairs of places that are disconnected.
 
-    What is on its way when a pair is cut arrives.
+    Datagrams in flight when a pair is cut arrive.
     """
 
     def __init__(self, air: Air = CALM) -> None:
@@ -40,7 +40,7 @@ class Radio:
 
     @property
     def air(self) -> Air:
-        """How datagrams fare now."""
+        """The present quality."""
         return self._air
 
     @air.setter
@@ -50,11 +50,11 @@ class Radio:
 
     @property
     def longest_way(self) -> float:
-        """Seconds within which a datagram arrives, but for one in twenty thousand."""
+        """The delay in seconds within which all but one in twenty thousand datagrams arrive."""
         return self._slowest.delay + 10 * self._slowest.jitter
 
     def delays(self, source: Address, to: Address, size: int, now: float, rng: random.Random) -> Sequence[float]:
-        """The seconds that each copy of a datagram takes; none where it is lost."""
+        """Return the delay of each copy of a datagram in seconds; empty if it is lost."""
         air, is_cut = self._air, (source.port - PORT, to.port - PORT) in self.cut
         copies = 2 if air.double and rng.random() < air.double else 1
         return [

@@ -1,7 +1,7 @@
-"""Takeover: trials of one executor and its stand-bys on a link of one-way 20 ms + Exp(10 ms), clocks off by 1 %.
+"""Takeover trials: one lease holder and its standbys on a link of one-way 20 ms + Exp(10 ms), with clocks off by 1 %.
 
-``python -m sim.team.leases.takeover [--trials 500] [--hours 24]`` prints what leases alone promise; what whole teams
-make of it prints ``make bench-takeover``.
+``python -m sim.team.leases.takeover [--trials 500] [--hours 24]`` prints the results of leases alone; ``make
+bench-takeover`` prints the results of whole teams.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ NEVER = 1e12
 
 
 def standing(seed: int, loss: float, ttl: float, stand_bys: int = 2) -> LeaseTeam:
-    """A team of three council members and of agents, the first of which holds the lease."""
-    dice = random.Random(f"takeover/{seed}")
+    """Return a team of three council members and of agents, the first of which holds the lease."""
+    rng = random.Random(f"takeover/{seed}")
     agents = 1 + stand_bys
-    rates = [1.0 + dice.uniform(-DRIFT, DRIFT) for _ in range(agents + 3)]
+    rates = [1.0 + rng.uniform(-DRIFT, DRIFT) for _ in range(agents + 3)]
     team = LeaseTeam(f"takeover/{seed}", rates, agents, ttl, tick=NEVER)
     team.radio.air = Air(DELAY, JITTER, loss)
     team.add_task(TASK, range(agents, agents + 3))
@@ -33,12 +33,12 @@ def standing(seed: int, loss: float, ttl: float, stand_bys: int = 2) -> LeaseTea
         team.clock.advance(0.05)
     for rank in range(1, agents):
         team.bidders[rank].lessee(TASK).stand_by(rank)
-    team.clock.advance(ttl + dice.uniform(0.0, ttl))
+    team.clock.advance(ttl + rng.uniform(0.0, ttl))
     return team
 
 
 def holder_of(team: LeaseTeam) -> int | None:
-    """Who holds the lease, by its own clock, among those that live."""
+    """Return the living holder of the lease by its own clock."""
     for place in team.agents:
         if team.bidders[place].machine.is_alive and team.bidders[place].lessee(TASK).lease is not None:
             return place
@@ -46,7 +46,7 @@ def holder_of(team: LeaseTeam) -> int | None:
 
 
 def takeover(seed: int, loss: float = 0.1, ttl: float = 1.5, is_polite: bool = False) -> float:
-    """Seconds from the executor's death (or leave) until another holds the lease; virtual, replayed from ``seed``."""
+    """Return the virtual seconds from the holder's death (or leave) until another agent holds the lease."""
     team = standing(seed, loss, ttl)
     gone = holder_of(team) or 0
     began = team.clock.seconds()
@@ -62,7 +62,7 @@ def takeover(seed: int, loss: float = 0.1, ttl: float = 1.5, is_polite: bool = F
 
 
 def false_takeovers(seed: int, hours: float, loss: float = 0.2, ttl: float = 1.5) -> tuple[int, float]:
-    """How often a healthy executor lost its lease in ``hours``, and the datagrams a second meanwhile."""
+    """Return how often a healthy holder lost its lease in ``hours``, and the datagrams per second."""
     team = standing(seed, loss, ttl)
     before, sent = team.referee.wins, team.board.counters["sent"]
     team.clock.advance(3600.0 * hours)
@@ -70,7 +70,7 @@ def false_takeovers(seed: int, hours: float, loss: float = 0.2, ttl: float = 1.5
 
 
 def upkeep(ttl: float = 1.5) -> float:
-    """Datagrams a second, questions and answers, of an executor alone on a link that loses nothing."""
+    """Return the datagrams per second, requests and answers, of a single holder on a link without losses."""
     team = standing(1, 0.0, ttl, stand_bys=0)
     sent = team.board.counters["sent"]
     team.clock.advance(60.0)
@@ -84,15 +84,15 @@ CASES = (
     ("executor leaves, no loss", 0.0, 1.5, True, (0.2, 0.2)),
     ("executor leaves, loss 10 %", 0.1, 1.5, True, (0.2, math.inf)),
 )
-"""What is tried: loss, ttl, whether it leaves in order, and the targets of p50 and p99 in seconds."""
+"""The cases: loss, ttl, whether the holder leaves gracefully, and the targets of p50 and p99 in seconds."""
 MOST_MESSAGES = 12.0
 
 
 def main(arguments: list[str]) -> int:
-    """Print the table; 1 where a target is missed."""
+    """Print the table; returns 1 if a target is missed."""
     parser = argparse.ArgumentParser(prog="python -m sim.team.leases.takeover")
-    parser.add_argument("--trials", type=int, default=500, help="of each case (default %(default)s)")
-    parser.add_argument("--hours", type=int, default=24, help="of a healthy executor, virtual (default %(default)s)")
+    parser.add_argument("--trials", type=int, default=500, help="trials of each case (default %(default)s)")
+    parser.add_argument("--hours", type=int, default=24, help="virtual hours of a healthy holder (default %(default)s)")
     given = parser.parse_args(arguments)
     missed = 0
     for case, loss, ttl, is_polite, (most50, most99) in CASES:

@@ -1,6 +1,6 @@
 """Places with machines, acceptors, agents and devices on a simulated link, for schedules and trials of leases.
 
-``Bidder`` is one life of a place, ``LeaseTeam`` all places, ``Referee`` what is written down of them (E1 to E9).
+``Bidder`` is one life of a place, ``LeaseTeam`` all places, ``Referee`` records the events for the checker (E1 to E9).
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ from sim.team.world import World
 
 TICK = 0.1
 ACT = 0.002
-"""Seconds between an agent's look at its lease and the command on the wire."""
+"""Seconds from an agent's check of its lease until its command is sent."""
 WIRE = 0.001
 
 
 class Bidder:
-    """One life of a place: its acceptor, its claims, its robot."""
+    """One life of a place: its acceptor, its lease clients, its robot."""
 
     def __init__(self, world: LeaseTeam, place: int, machine: Machine, store: Store, rng: random.Random) -> None:
         self.world = world
@@ -55,7 +55,7 @@ class Bidder:
     # -- the agent --------------------------------------------------------------------------------------------------
 
     def lessee(self, task_id: str) -> Lessee:
-        """This agent's claim on a task."""
+        """Return this agent's lease client for a task."""
         if task_id not in self.lessees:
             charter = self.world.council_for(self.place, task_id)
             council = Council(
@@ -79,12 +79,12 @@ class Bidder:
         return self.lessees[task_id]
 
     def holds(self, task_id: str) -> bool:
-        """Whether this agent lives and believes to hold a lease."""
+        """Return whether this agent lives and believes that it holds the lease."""
         lessee = self.lessees.get(task_id)
         return lessee is not None and lessee.lease is not None and self.machine.is_alive
 
     def leave(self, task_id: str, heirs: Sequence[int] = ()) -> None:
-        """Stop the robot, then give the lease back."""
+        """Stop the robot, then release the lease."""
         self.world.referee.stop(self.place, task_id)
         lessee = self.lessees.get(task_id)
         if lessee is not None:
@@ -96,12 +96,12 @@ class Bidder:
             if lease is not None:
                 now = self.machine.seconds()
                 permit = Permit(lease.token, lease.deadline)
-                # As a driver does: the device's time as it was told lately, and how long the lease lasts from then on.
-                told = self.world.clock.seconds() - self._rng.random() * 0.02
-                self.machine.callLater(ACT, self._act, task_id, permit, told, lease.deadline - now)
+                # As in a driver: the device's last known time, and the remaining duration of the lease.
+                device_time = self.world.clock.seconds() - self._rng.random() * 0.02
+                self.machine.callLater(ACT, self._act, task_id, permit, device_time, lease.deadline - now)
         self.machine.callLater(self.world.tick, self._tick)
 
-    def _act(self, task_id: str, permit: Permit, told: float, remaining: float) -> None:
+    def _act(self, task_id: str, permit: Permit, device_time: float, remaining: float) -> None:
         lessee = self.lessees[task_id]
         gate = self._gates[task_id]
         try:
@@ -109,9 +109,9 @@ class Bidder:
         except StaleCommand:
             return
         if lessee.lease is None and not lessee.token:
-            return  # it was given back meanwhile
+            return  # the lease was released meanwhile
         self.world.referee.on_issue(self, task_id, permit)
-        self.world.clock.callLater(WIRE, self.world.referee.on_command, self, task_id, permit, told, remaining)
+        self.world.clock.callLater(WIRE, self.world.referee.on_command, self, task_id, permit, device_time, remaining)
 
     # -- the wire ---------------------------------------------------------------------------------------------------
 
@@ -135,11 +135,11 @@ class Bidder:
         return answered
 
     def tell(self, contact: Contact, method: str, *arguments: Any) -> None:
-        """Tell a peer something, as an ``Endpoint`` does."""
+        """Send a notification to a peer, like ``Endpoint``."""
         self.world.tell(self.place, contact, method, arguments)
 
     def answer(self, source: int, method: str, arguments: tuple[Any, ...]) -> object:
-        """Do what a peer asks; an answer that is not there yet is a Deferred, one that is refused None."""
+        """Answer a peer's request; a pending answer is a Deferred, a refused one None."""
         try:
             reply = self._desk.answer(method, self.world.contacts[source], arguments)
         except Refused:
@@ -148,7 +148,7 @@ class Bidder:
 
 
 class Referee:
-    """The history of a team, and of each task its device's gate, what that accepted, and who won."""
+    """The history of a team, and for each task its device's gate, the accepted commands, and the number of wins."""
 
     def __init__(self, world: LeaseTeam) -> None:
         self.history = world.history
@@ -161,27 +161,27 @@ class Referee:
 
     @property
     def found(self) -> list[str]:
-        """Every violation so far, a line each."""
+        """All violations so far, one line each."""
         return check(self.history)
 
     def agree(self) -> None:
-        """Write down what is assumed from now on."""
+        """Record the assumptions that apply from now on."""
         world = self._world
         self.history.note(Terms, world.ttl, world.drift, world.stop_time, world.radio.longest_way)
 
     def add(self, task_id: str) -> None:
-        """Watch one more task."""
+        """Add a task."""
         self.gates[task_id] = Gate()
         self.accepted[task_id] = []
 
     def on_change(self, bidder: Bidder, task_id: str) -> None:
-        """A lease was won or renewed: write down who else holds it by his own clock."""
+        """Record a won or renewed lease, with the other agents that hold it by their own clocks."""
         lease = bidder.lessees[task_id].lease
         if lease is None:
             return
-        mine = (task_id, bidder.place)
-        is_new = self._won.get(mine) != (lease.token, id(bidder))
-        self._won[mine] = lease.token, id(bidder)
+        key = (task_id, bidder.place)
+        is_new = self._won.get(key) != (lease.token, id(bidder))
+        self._won[key] = lease.token, id(bidder)
         others = [other.place for other in self._world.bidders if other is not bidder and other.holds(task_id)]
         self.history.note(Held, task_id, bidder.place, tuple(others))
         if is_new:
@@ -189,14 +189,14 @@ class Referee:
             self.history.note(Won, task_id, bidder.place, lease.token)
 
     def on_issue(self, bidder: Bidder, task_id: str, permit: Permit) -> None:
-        """An agent sends a command under its lease, perhaps when it has just been thawed."""
+        """Record a command that an agent sends under its lease, possibly just after it was frozen."""
         truly = bidder.machine.unstopped_at(permit.deadline)
         self.history.note(Issued, task_id, bidder.place, bidder.machine.at(permit.deadline), truly)
 
-    def on_command(self, bidder: Bidder, task_id: str, permit: Permit, told: float, remaining: float) -> None:
-        """The device, shared by all, takes a command or refuses it."""
+    def on_command(self, bidder: Bidder, task_id: str, permit: Permit, device_time: float, remaining: float) -> None:
+        """Let the device, which all agents share, accept or refuse a command."""
         now, gate = self._world.clock.seconds(), self.gates[task_id]
-        deadline = min(told, now) + remaining
+        deadline = min(device_time, now) + remaining
         truly, is_accepted = bidder.machine.unstopped_at(permit.deadline), True
         try:
             gate.admit(Permit(permit.token, deadline), now)
@@ -209,30 +209,30 @@ class Referee:
         self.history.note(Commanded, task_id, bidder.place, permit.token, is_accepted, deadline, truly)
 
     def floor(self, place: int, task_id: str) -> int:
-        """The highest token that the robot of a place has obeyed, and tells its agent."""
+        """Return the highest token that the robot of a place has obeyed, as it reports to its agent."""
         return max((token for _, token, one in self.accepted[task_id] if one == place), default=0)
 
     def stop(self, place: int, task_id: str) -> None:
-        """The agent stops its robot, which comes to rest; on the wire a stop does not overtake a command."""
+        """Stop the robot of an agent; a stop does not overtake a command on the link."""
         self._world.clock.callLater(WIRE, self._stop, place, task_id)
 
     def _stop(self, place: int, task_id: str) -> None:
         self.history.note(Halted, task_id, place, self._world.clock.seconds() + self._world.stop_time)
 
     def look_at_cuts(self) -> None:
-        """Note who no longer reaches a majority of the council, both ways, and who does again."""
+        """Record which agents lost or regained the connection to a majority of the council, in both directions."""
         for task_id, charter in self._world.councils.items():
             places = [self._world.place_of(member) for member in charter.members]
             for agent in self._world.agents:
                 near = [p for p in places if not {(agent, p), (p, agent)} & self._world.radio.cut]
-                is_reached, mine = len(near) >= majority(len(places)), (task_id, agent)
-                if is_reached == (mine in self._is_cut):
-                    self._is_cut ^= {mine}
-                    self.history.note(Reached, *mine, is_reached)
+                is_reached, key = len(near) >= majority(len(places)), (task_id, agent)
+                if is_reached == (key in self._is_cut):
+                    self._is_cut ^= {key}
+                    self.history.note(Reached, *key, is_reached)
 
 
 class _Call(bytes):
-    """A datagram that stands for a call at the other end."""
+    """A datagram that carries a call for the receiver."""
 
     def __new__(cls, call: Callable[[], object]) -> _Call:
         made = super().__new__(cls)
@@ -243,9 +243,9 @@ class _Call(bytes):
 
 
 class LeaseTeam(World):
-    """Places whose clocks run at ``rates``; the first ``agents`` of them have agents.  ``seed`` names its dice.
+    """Places whose clocks run at ``rates``; the first ``agents`` of them have agents.  ``seed`` seeds all generators.
 
-    ``stop_time`` is how long a robot takes to come to rest, ``drift`` the largest error of a clock.
+    ``stop_time`` is the time that a robot needs to stand still, ``drift`` the maximum error of a clock.
     """
 
     def __init__(
@@ -286,35 +286,35 @@ class LeaseTeam(World):
         self.bidders = [self.born(place) for place in range(self.n)]
 
     def add_task(self, task_id: str, council: Sequence[int]) -> None:
-        """One more task, with its council pinned."""
+        """Add a task with a pinned council."""
         members = tuple(self.contacts[place] for place in council)
         self.councils[task_id] = pin(self.operator, task_id, members)
         self.referee.add(task_id)
 
-    # -- what bidders need ------------------------------------------------------------------------------------------
+    # -- services for bidders ---------------------------------------------------------------------------------------
 
     def place_of(self, contact: Contact) -> int:
-        """Where a contact is."""
+        """Return the place of a contact."""
         return self._places[contact.public]
 
     def council_for(self, place: int, task_id: str) -> Charter:
-        """The council as the records of the task prove it."""
+        """Return the council that the task's records prove."""
         return self.councils[task_id]
 
     def moved(self, task_id: str, council: Council) -> None:
-        """Let the record name a newer council."""
+        """Record a newer council of a task."""
         if council.charter is not None and council.configuration > self.councils[task_id].configuration:
             self.councils[task_id] = council.charter
             self.referee.look_at_cuts()
 
     def send(self, source: int, to: int, call: Callable[[], object]) -> None:
-        """Have a call made at the other end, if the link lets it."""
+        """Make a call at the receiver, if the link delivers it."""
         self._ports[source].send(_Call(call), self.address(to))
 
     def ask(
         self, me: Bidder, to: int, method: str, arguments: tuple[Any, ...], answered: Callable[[object], object]
     ) -> None:
-        """Carry a question and its answer."""
+        """Carry a request and its answer."""
 
         def arrive() -> None:
             peer = self.bidders[to]
@@ -335,7 +335,7 @@ class LeaseTeam(World):
         self.send(me.place, to, arrive)
 
     def tell(self, source: int, contact: Contact, method: str, arguments: tuple[Any, ...]) -> None:
-        """Carry what nobody answers."""
+        """Carry a notification."""
         to = self.place_of(contact)
 
         def arrive() -> None:
@@ -346,18 +346,18 @@ class LeaseTeam(World):
     # -- lives ------------------------------------------------------------------------------------------------------
 
     def is_up(self, place: int) -> bool:
-        """Whether a machine runs."""
+        """Return whether a machine runs."""
         return self.bidders[place].machine.is_alive and not self.bidders[place].machine.is_still
 
     def kill(self, place: int) -> None:
-        """End a machine as a loss of power does; what it has in a store stays."""
+        """Kill a machine like a loss of power; its store remains."""
         self.bidders[place].machine.die()
         if not self.has_stores:
             self.stores.pop(place, None)
         self.history.note(Died, place, not self.has_stores)
 
     def born(self, place: int) -> Bidder:
-        """The next life at a place."""
+        """Return the next life at a place."""
         rng = self.rng(place)
         self.history.note(Born, place, self.lives)
         machine = Machine(self.clock, self._rates[place], rng.uniform(0.0, 1e4))

@@ -1,1 +1,1 @@
-"""Load: what the clients of a team do in a simulation, and the figures that it comes to."""
+"""Workloads of clients in a simulated team, with their figures."""

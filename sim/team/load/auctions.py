@@ -1,6 +1,6 @@
-"""Auctions: one task at a time, for which everybody bids; how soon who agrees, and what it costs.
+"""Workload: auctions of one task at a time among all agents; measures time to agreement, and messages.
 
-The seconds count from the end of the waiting period, which begins with the first bid: until then everybody waits.
+Times count from the end of the waiting period, which starts with the first bid.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from sim.team.team import Team
 
 @dataclass(frozen=True)
 class AuctionSettings:
-    """``[load.auctions]``: one task after the other, for all."""
+    """``[load.auctions]``: successive tasks for which all agents bid."""
 
     count: Annotated[int, Meta(ge=1, le=10_000)] = 3
-    """Auctions in all."""
+    """Total number of auctions."""
 
     every: Annotated[float, Meta(ge=2.0, le=3600.0), Unit("seconds")] = 10.0
-    """Seconds from one to the next."""
+    """Seconds between the starts of two auctions."""
 
     waiting: Annotated[float, Meta(ge=0.0, le=60.0), Unit("seconds")] = 0.5
-    """Seconds that the agents wait for each other's bids after the first one."""
+    """Waiting period for bids after the first one, in seconds."""
 
     spread: Annotated[float, Meta(ge=0.0, le=60.0), Unit("seconds")] = 0.1
-    """Seconds within which all of them bid."""
+    """Interval in seconds within which all agents bid."""
 
 
 class Auctions(Load):
@@ -58,24 +58,24 @@ class Auctions(Load):
         self.trouble: list[str] = []
 
     def step(self) -> None:
-        """Read an auction when its time is over, and begin the next one."""
+        """Evaluate an auction at its end, and start the next one."""
         now = self._clock.seconds()
         if now >= self._next_at:
-            self._end()
+            self._evaluate_auction()
             if self._begun < self._settings.count:
-                self._begin()
+                self._start_auction()
             self._next_at = now + self._settings.every
 
     def settled(self) -> None:
-        """Read the last one."""
-        self._end()
+        """Evaluate the last auction."""
+        self._evaluate_auction()
 
     def verdict(self) -> list[str]:
-        """Auctions that could not begin."""
+        """Return the auctions that could not start."""
         return self.trouble
 
     def figures(self) -> list[Figure]:
-        """Who is right, the seconds until they are, and the messages that it took."""
+        """Return the share of agents that are right, the time until then, and the number of messages."""
         n = len(self.right)
         return [
             Figure("auctions.right", mean(self.right), "share", n=n),
@@ -89,18 +89,18 @@ class Auctions(Load):
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
-    def _begin(self) -> None:
+    def _start_auction(self) -> None:
         self._begun += 1
         self._before = {deputy.place: _counts(deputy) for deputy in self._deputies.present()}
         task = Task(f"auction {self._begun}", "none", "nothing", waiting_period=self._settings.waiting)
-        dice = self._team.generator(f"auction/{self._begun}")
+        rng = self._team.generator(f"auction/{self._begun}")
         places = self._residents.places()
-        dice.shuffle(places)  # who is first asks for the council
-        contest = Contest(task, self._deputies, places, self._clock, dice, self._settings.spread)
+        rng.shuffle(places)  # the first one requests the council
+        contest = Contest(task, self._deputies, places, self._clock, rng, self._settings.spread)
         self._contest = contest
         Deferred.fromCoroutine(contest.begin())
 
-    def _end(self) -> None:
+    def _evaluate_auction(self) -> None:
         contest, self._contest = self._contest, None
         if contest is None:
             return
@@ -108,20 +108,20 @@ class Auctions(Load):
             self.trouble.append(f"{contest.task.task_id} did not begin: {contest.trouble}")
             return
         present, best = contest.present(), contest.best()
-        passed = [self._passed(deputy) for deputy in self._deputies.present()]
+        traffic = [self._traffic_since_start(deputy) for deputy in self._deputies.present()]
         n = max(1, len(present))
-        self.messages.append(sum(sent for sent, _, _ in passed) / n)
-        self.busiest.append(max((handled for _, handled, _ in passed), default=0))
-        self.bytes.append(sum(volume for _, _, volume in passed) / n)
+        self.messages.append(sum(sent for sent, _, _ in traffic) / n)
+        self.busiest.append(max((handled for _, handled, _ in traffic), default=0))
+        self.bytes.append(sum(volume for _, _, volume in traffic) / n)
         right = [bidder for bidder in present if bidder.assigned == best]
-        took = [max(0.0, bidder.changed_at - contest.over_at) for bidder in right]
+        delays = [max(0.0, bidder.changed_at - contest.over_at) for bidder in right]
         self.right.append(len(right) / n)
-        self.agreed += took
-        self.last.append(max(took) if len(right) == len(present) and took else math.inf)
+        self.agreed += delays
+        self.last.append(max(delays) if len(right) == len(present) and delays else math.inf)
         contest.end()
 
-    def _passed(self, deputy: Deputy) -> tuple[int, int, int]:
-        """The datagrams that it sent since the auction began, those that it had to do with, and bytes of questions."""
+    def _traffic_since_start(self, deputy: Deputy) -> tuple[int, int, int]:
+        """Return a node's datagrams sent and handled since the auction started, and its bytes of requests."""
         sent, handled, volume = self._before.get(deputy.place, (0, 0, 0))
         now_sent, now_handled, now_volume = _counts(deputy)
         if now_handled < handled:  # another life

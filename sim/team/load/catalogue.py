@@ -1,4 +1,4 @@
-"""Catalogue: the sorts of workloads that scenarios can name."""
+"""Collect the workloads that scenarios can name."""
 
 from __future__ import annotations
 

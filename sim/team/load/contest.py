@@ -1,7 +1,7 @@
-"""Contest: one task, those that bid for it, what each of them takes for decided, and who holds its lease.
+"""Run the contest for one task: its bidders, their decisions, and the holder of its lease.
 
-It does what an agent does (``agents.engagement``) with a body that never moves: whom the announced bids name claims the
-lease, the next two stand by, and who is named no more gives it back.
+Bidders act like agents (``agents.engagement``) with robots that never move: the agent named by the announced bids
+claims the lease, the next two are standbys, and an agent that is no longer named releases the lease.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from middleware.tasks.task import Task
 from sim.team.load.deputies import Deputies, Deputy
 
 HEIRS = 2
-"""So many stand by, as in a team of agents."""
+"""Number of standbys, as in a team of agents."""
 FARTHEST = 100.0
 _NEAREST = Nearest()
 
 
 @dataclass
 class Bidder:
-    """One that bids: its cost, whom it takes for the one that should act, and since when."""
+    """A bidder: its cost, the agent that it regards as assigned, and the time of its last change."""
 
     deputy: Deputy
     cost: float
@@ -43,9 +43,9 @@ class Bidder:
 class Contest:
     """One task among the agents of ``places``, each at a random distance from its target.
 
-    All bid within ``spread`` seconds; with ``claims`` they go on to the lease, else it ends with what is decided.
-    ``began_at`` is when the first bid was made, ``held_at`` when somebody held the lease first; ``overlaps`` counts how
-    often one won it while another held it; ``trouble`` says why it did not begin.
+    All bid within ``spread`` seconds; with ``claims`` they also claim the lease, otherwise the contest ends with the
+    decision.  ``began_at`` is the time of the first bid, ``held_at`` the time at which the lease was first held;
+    ``overlaps`` counts leases won while another agent held the lease; ``trouble`` says why the contest did not start.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class Contest:
         self.bidders = {deputy.uuid: Bidder(deputy, rng.uniform(1.0, FARTHEST)) for deputy in known}
 
     async def begin(self) -> None:
-        """Have a council, and let everybody bid."""
+        """Pin a council, and let all agents bid."""
         try:
             self.task = task = await next(iter(self.bidders.values())).deputy.pinned(self.task)
         except EntangledError as error:
@@ -84,23 +84,23 @@ class Contest:
 
     @property
     def over_at(self) -> float:
-        """When the waiting period ended."""
+        """The end of the waiting period."""
         return self.began_at + self.task.waiting_period
 
     def present(self) -> list[Bidder]:
-        """The bidders whose nodes live."""
+        """Return the bidders whose nodes live."""
         return [bidder for bidder in self.bidders.values() if self._deputies.lives(bidder.deputy)]
 
     def best(self) -> str | None:
-        """Who should act, of those that live."""
+        """Return the living agent with the lowest cost."""
         return min(((b.cost, b.deputy.uuid) for b in self.present()), default=(0.0, None))[1]
 
     def holders(self) -> list[Bidder]:
-        """Who holds the lease now, by the own clock; more than one is a violation (E2)."""
+        """Return the living agents that hold the lease by their own clocks; more than one is a violation (E2)."""
         return [b for b in self.present() if b.lessee is not None and b.lessee.lease is not None]
 
     def end(self) -> None:
-        """Nobody claims, listens or bids any more."""
+        """Stop all bidding and release all leases."""
         for bidder in self.present():
             if bidder.bidding is not None:
                 bidder.bidding.leave()
@@ -114,17 +114,17 @@ class Contest:
         if not self._deputies.lives(bidder.deputy):
             return
         self.began_at = min(self.began_at, self._clock.seconds())
-        bidder.bidding = bidder.deputy.bidding(auction, lambda reports: self._heard(bidder, reports))
+        bidder.bidding = bidder.deputy.bidding(auction, lambda reports: self._on_reports(bidder, reports))
         bidder.bidding.report(Report(bidder.deputy.uuid, bidder.cost))
 
-    def _heard(self, bidder: Bidder, reports: tuple[Report, ...]) -> None:
+    def _on_reports(self, bidder: Bidder, reports: tuple[Report, ...]) -> None:
         consensus = _NEAREST.find(reports)
         if consensus.assigned_agent != bidder.assigned:
             bidder.assigned, bidder.changed_at = consensus.assigned_agent, self._clock.seconds()
         if self._claims:
-            self._line_up(bidder, (consensus.assigned_agent, *consensus.standby))
+            self._claim_or_wait(bidder, (consensus.assigned_agent, *consensus.standby))
 
-    def _line_up(self, bidder: Bidder, order: Sequence[str | None]) -> None:
+    def _claim_or_wait(self, bidder: Bidder, order: Sequence[str | None]) -> None:
         uuid = bidder.deputy.uuid
         rank = order.index(uuid) if uuid in order else HEIRS + 1
         if rank > HEIRS:
@@ -132,7 +132,7 @@ class Contest:
                 bidder.lessee.release()
             return
         if bidder.lessee is None:
-            bidder.lessee = bidder.deputy.lessee(self.task, lambda: self._changed(bidder))
+            bidder.lessee = bidder.deputy.lessee(self.task, lambda: self._on_lease_change(bidder))
         if rank == 0:
             bidder.lessee.want()
         elif bidder.lessee.lease is not None:
@@ -140,7 +140,7 @@ class Contest:
         else:
             bidder.lessee.stand_by(rank)
 
-    def _changed(self, bidder: Bidder) -> None:
+    def _on_lease_change(self, bidder: Bidder) -> None:
         if bidder.lessee is None or bidder.lessee.lease is None:
             return
         others = [one for one in self.holders() if one is not bidder]

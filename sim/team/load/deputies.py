@@ -1,7 +1,7 @@
-"""Deputies: what bids for the agent of each place and claims in its name, whichever kind its node is.
+"""Bid and claim for the agent of each place, whatever the kind of its node.
 
-A swarm node has these rooms; beside a bare node of the library they are the same ones, wired in the same way.  So an
-auction among ten thousand can be measured with what surrounds it in a team, or without.
+A swarm node contains the services for bidding and leases; a bare node of the library gets the same ones, connected in
+the same way.  So an auction among ten thousand nodes can be measured with the rest of a swarm node or without it.
 """
 
 from __future__ import annotations
@@ -32,41 +32,41 @@ from middleware.tasks.task import Task
 from sim.team.team import Node, Team, core
 
 MARK, HEAD = b"bid.", 64
-"""What the name of a method that carries bids begins with, and in how many bytes of a message it stands."""
+"""The start of the names of methods that carry bids, and the bytes of a message that are searched for it."""
 
 
 class Tally:
-    """A ``dissemination.Wire`` over ``endpoint`` that counts what passes; ``sent`` and ``received`` are datagrams.
+    """An ``auctions.Wire`` over ``endpoint`` that counts the datagrams of bidding, ``sent`` and ``received``.
 
-    Nodes beat, ping and answer all the time, often in step, so what an auction costs does not show in what is sent in
-    all.
+    Nodes also send heartbeats, pings and answers, often in step, so the total traffic does not show the cost of an
+    auction.
     """
 
     def __init__(self, endpoint: Endpoint) -> None:
         self._endpoint = endpoint
         self.sent = self.received = self.bytes = 0
-        # A question goes out as often as it takes; how often only the asker below knows.
+        # Only the request table below knows the number of retransmissions.
         asker = endpoint._asker
         asker._send = self._counted(asker._send)
 
     @property
     def handled(self) -> int:
-        """Datagrams sent and received."""
+        """The number of datagrams sent and received."""
         return self.sent + self.received
 
     def ask(
         self, contact: Contact, method: str, *arguments: object, timeout: float | None = None, changes: bool = False
     ) -> Deferred[Any]:
-        """Ask a peer; its answer is one more datagram."""
+        """Send a request; its answer counts as a datagram."""
         asked = self._endpoint.ask(contact, method, *arguments, timeout=timeout, changes=changes)
         return asked.addCallbacks(self._answered, self._refused)
 
     def tell(self, contact: Contact, method: str, *arguments: object) -> None:
-        """Tell a peer."""
+        """Send a notification."""
         self._endpoint.tell(contact, method, *arguments)
 
     def asked(self, is_answered: bool = True) -> None:
-        """Take note of a question, which comes as often as it arrives, and of its answer."""
+        """Count a received request, once per arrival, and its answer."""
         self.received += 1
         self.sent += is_answered
 
@@ -89,7 +89,7 @@ class Tally:
 
 
 class Rooms:
-    """The rooms beside a bare node that let it bid, carry bids, and sit in councils."""
+    """The services that let a bare node bid, relay bids, and be a council member."""
 
     def __init__(self, node: EntangledNode, tally: Tally, clock: IReactorTime, rng: random.Random) -> None:
         self._node = node
@@ -104,13 +104,13 @@ class Rooms:
 
     @cached_property
     def councils(self) -> Councils:
-        """The councils of tasks, as ``SwarmNode.councils``; nobody writes down where one moves to."""
+        """The councils of tasks, as ``SwarmNode.councils``; a reconfiguration is not recorded."""
         seen = self._node.store, self._clock, self._rng, self._born_at
         return Councils(self._node, *seen, moved=lambda task: None, may_sit=lambda public: True)
 
     @cached_property
     def dissemination(self) -> Dissemination:
-        """How bids travel through the node, as ``SwarmNode.dissemination``."""
+        """The dissemination of bids, as ``SwarmNode.dissemination``."""
         node = self._node
 
         def size() -> int:
@@ -122,7 +122,7 @@ class Rooms:
         return dissemination
 
     def stop(self) -> None:
-        """The node is gone."""
+        """Stop the services after the node's end."""
         for end in self._ends:
             end()
 
@@ -131,7 +131,7 @@ class Rooms:
 
 
 class Deputy:
-    """One place's agent, as far as bidding and claiming goes, for one life of its ``node``; ``tally`` counts."""
+    """The bidding and claiming part of the agent of one place, for one life of its ``node``; ``tally`` counts."""
 
     def __init__(self, place: int, node: Node, clock: IReactorTime, rng: random.Random) -> None:
         self.place = place
@@ -140,7 +140,7 @@ class Deputy:
         self.uuid = bare.identity.node_id.hex()
         self.tally = Tally(bare.endpoint)
         self._rooms: Rooms | SwarmNode = node if isinstance(node, SwarmNode) else Rooms(node, self.tally, clock, rng)
-        # As a swarm node exposes them, and counted; each of them may run again, so each that comes is answered.
+        # Exposed as by a swarm node, but counted; all are idempotent, so each arrival is answered.
         expose = bare.endpoint.expose
         expose("bid.offer", self._answer_offer, changes=True, idempotent=True)
         expose("bid.announce", self._answer_announcement, changes=True, idempotent=True)
@@ -151,15 +151,15 @@ class Deputy:
         return self._dissemination.enter(auction, on_summary)
 
     def lessee(self, task: Task, changed: Callable[[], None]) -> Lessee:
-        """The claimant of the right to act on ``task``."""
+        """Return the lease client for ``task``."""
         return self._rooms.councils.lessee(task, changed, 0)
 
     async def pinned(self, task: Task) -> Task:
-        """A new ``task`` with its council."""
+        """Return the new ``task`` with a pinned council."""
         return await self._rooms.councils.pinned(task)
 
     def stop(self) -> None:
-        """Its node is gone; a swarm node has stopped its rooms itself."""
+        """Stop the services of a bare node after its end; a swarm node stops its own."""
         if isinstance(self._rooms, Rooms):
             self._rooms.stop()
 
@@ -185,33 +185,33 @@ class Deputy:
 
 
 class Deputies:
-    """Made once a team (``deputies_of``): bare nodes are given the rooms in which bids are carried as they are born."""
+    """The deputies of a team (``deputies_of``), made as nodes are born."""
 
     def __init__(self, team: Team) -> None:
         self._clock = team.clock
         self._rng = team.generator
         self._present: dict[int, Deputy] = {}
         self._lives = 0
-        team.attend(self._born, self._died)
+        team.attend(self._on_birth, self._on_death)
 
     def of(self, place: int) -> Deputy | None:
-        """The deputy of a place; None where its node does not live."""
+        """Return the deputy of a place; None if its node does not live."""
         return self._present.get(place)
 
     def present(self) -> list[Deputy]:
-        """Those whose nodes live, by place."""
+        """Return the deputies of living nodes, by place."""
         return [self._present[place] for place in sorted(self._present)]
 
     def lives(self, deputy: Deputy) -> bool:
-        """Whether its node goes on."""
+        """Return whether the deputy's node still lives."""
         return self._present.get(deputy.place) is deputy
 
-    def _born(self, place: int, node: Node) -> None:
+    def _on_birth(self, place: int, node: Node) -> None:
         self._lives += 1
         dice = self._rng(f"rooms/{place}/{self._lives}")
         self._present[place] = Deputy(place, node, self._clock, dice)
 
-    def _died(self, place: int, node: Node) -> None:
+    def _on_death(self, place: int, node: Node) -> None:
         deputy = self._present.get(place)
         if deputy is not None and deputy.node is node:
             del self._present[place]
@@ -222,7 +222,7 @@ _KNOWN: WeakKeyDictionary[Team, Deputies] = WeakKeyDictionary()
 
 
 def deputies_of(team: Team) -> Deputies:
-    """The deputies of ``team``, the same for all workloads: a node has one place for bids only."""
+    """Return the deputies of ``team``, shared by all workloads, as a node has one handler for bids."""
     known = _KNOWN.get(team)
     if known is None:
         known = _KNOWN[team] = Deputies(team)

@@ -1,6 +1,6 @@
-"""Directory: how the devices of a team are announced: who holds how many of them, and how soon somebody lists all.
+"""Workload: readers list all devices; measures the time, and the distribution of device records over nodes.
 
-It goes by what stands in the stores, so it says the same whatever keys the directory is kept under.
+It examines the stores, so it does not depend on the keys of the directory.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from sim.team.team import Team
 
 @dataclass(frozen=True)
 class DirectorySettings:
-    """``[load.directory]``: who lists the devices; of nodes of kind ``swarm`` only."""
+    """``[load.directory]``: listing of devices; for nodes of kind ``swarm`` only."""
 
     readers: Annotated[int, Meta(ge=0, le=10_000)] = 3
-    """Nodes that list all devices, one after the other."""
+    """Number of nodes that list all devices, one after the other."""
 
     every: Annotated[float, Meta(ge=0.5, le=3600.0), Unit("seconds")] = 5.0
-    """Seconds that each of them is given."""
+    """Time limit of each reader in seconds."""
 
 
 class Directory(Load):
@@ -46,7 +46,7 @@ class Directory(Load):
         self._most = 0
 
     def step(self) -> None:
-        """Let the next one list all devices, when it is time."""
+        """Let the next reader list all devices, if it is time."""
         now = self._clock.seconds()
         if now < self._next_at:
             return
@@ -60,11 +60,11 @@ class Directory(Load):
         self._list(chosen[0])
 
     def settled(self) -> None:
-        """The last one has had its time."""
+        """End the last reader."""
         self._end()
 
     def figures(self) -> list[Figure]:
-        """How many devices a node holds, the share of the busiest, and how soon and how wholly they are listed."""
+        """Return the devices per node, the share of the busiest node, and the readers' times and completeness."""
         held = []
         for place in self._team.alive():
             store = self._team.entangled(place).store

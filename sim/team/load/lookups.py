@@ -1,14 +1,14 @@
-"""Lookups: somebody looks for somebody else, over and over; how many are found, in how many hops and seconds.
+"""Workload: random nodes look up other nodes; measures success, hops and time.
 
-As in the studies that the targets come from (Li et al., INFOCOM 2005), the target is the id of a random node that lives
-and has entered, and a lookup succeeds where that node is the first of its answer within the limit.  Where the one that
-looks or the one that is looked for dies meanwhile, nobody could have succeeded, and the trial is void.
+As in the studies with which results are compared (Li et al., INFOCOM 2005), the target is the id of a random node that
+lives and has joined, and a lookup succeeds if that node is the first of the result within the time limit.  If the
+searching node or the target dies meanwhile, the trial is void.
 
-``seconds`` count until the whole answer is there, the k closest; ``reached`` until the one that is looked for has
-answered itself, which is what those studies time.
+``seconds`` count until the whole result is available, the k closest; ``reached`` until the target itself has answered,
+as in those studies.
 
-In quiet a number of random keys are looked up besides: the answer is exact where it has the k closest of all that
-live, in their order (invariant D6).
+In a quiet network, random keys are looked up in addition: the result is exact if it has the k closest of all living
+nodes in their order (invariant D6).
 """
 
 from __future__ import annotations
@@ -31,26 +31,26 @@ from sim.team.load.residents import Load, Pace
 from sim.team.team import Team
 
 LISTED = 20
-"""Violations that are told one by one."""
+"""Maximum number of violations listed individually."""
 
 
 @dataclass(frozen=True)
 class LookupSettings:
-    """``[load.lookups]``: how often somebody looks for somebody."""
+    """``[load.lookups]``: the rate of lookups."""
 
     rate: Annotated[float, Meta(ge=0.0, le=10_000.0)] = 10.0
-    """Lookups a second, of all nodes together."""
+    """Lookups per second of all nodes together."""
 
     limit: Annotated[float, Meta(ge=0.1, le=60.0), Unit("seconds")] = 4.0
-    """Seconds after which a lookup is late, and has failed."""
+    """Time limit of a lookup in seconds."""
 
     exact: Annotated[int, Meta(ge=0, le=100_000)] = 100
-    """Random keys that are looked up in quiet at the end, where the answer has to be exact."""
+    """Number of random keys looked up at the end in a quiet network, with exact results required."""
 
 
 @dataclass
 class Trial:
-    """One lookup: who looks (its life), for whom, and since when."""
+    """One lookup: the searching node, its life, the target, and the start time."""
 
     place: int
     life: EntangledNode
@@ -77,16 +77,16 @@ class Lookups(Load):
         self._is_settled = False
 
     def step(self) -> None:
-        """The lookups that are due."""
-        self._drop_late()
+        """Start the lookups that are due."""
+        self._count_late()
         for _ in range(self._pace.due()):
             pair = self._residents.any(self._rng, 2)
             if len(pair) == 2:
-                self._look(*pair)
+                self._start_lookup(*pair)
 
     def settled(self) -> None:
-        """Look up random keys, which in quiet has to be exact."""
-        self._drop_late()
+        """Look up random keys, with exact results required."""
+        self._count_late()
         self._is_settled = True
         for _ in range(self._settings.exact if len(self._residents) > 1 else 0):
             place = self._residents.any(self._rng)[0]
@@ -96,15 +96,15 @@ class Lookups(Load):
             life.find_node(key).addCallbacks(self._compared, self._not_compared, (place, key, truth), {}, (place,))
 
     def verdict(self) -> list[str]:
-        """Lookups that were not exact in quiet."""
+        """Return the inexact lookups in a quiet network."""
         more = self.inexact - len(self._violations)
         return self._violations + ([f"D6: {more} more lookups are not exact"] if more > 0 else [])
 
     def figures(self) -> list[Figure]:
-        """Success, exactness, hops, questions and seconds."""
-        self._drop_late()
+        """Return success, exactness, hops, requests and times."""
+        self._count_late()
         n = self.found + self.missed + self.late
-        # Two at least: who is asked names others, and these are asked whether they are there.
+        # Two hops at least: the first names the target, and the second confirms that it is alive.
         most = max(2.0, math.log2(max(2, len(self._residents))) / 2)
         figures = [
             share("lookups.success", self.found, n),
@@ -123,7 +123,7 @@ class Lookups(Load):
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
-    def _look(self, place: int, other: int) -> None:
+    def _start_lookup(self, place: int, other: int) -> None:
         life, sought = self._residents.node(place), self._residents.node(other)
         self._begun += 1
         number = self._begun
@@ -133,7 +133,7 @@ class Lookups(Load):
     def _answered(self, contacts: list[Contact], number: int) -> None:
         trial = self._open.pop(number, None)
         if trial is None:
-            return  # it was late
+            return  # it exceeded the time limit
         took = self._clock.seconds() - trial.began
         if self._is_void(trial):
             self.void += 1
@@ -144,7 +144,7 @@ class Lookups(Load):
         else:
             self.found += 1
             self.seconds.append(took)
-            # It was heard last when it answered this lookup, or up to a tenth of a second before (``overlay.FRESH``).
+            # The target answered this lookup, or was heard up to a tenth of a second before (``overlay.FRESH``).
             self.reached.append(took - min(took, trial.life.overlay.silence(contacts[0])))
             looked = next((one for one in reversed(trial.life.overlay.lookups) if one.key == trial.target), None)
             if looked is not None:
@@ -160,7 +160,7 @@ class Lookups(Load):
             else:
                 self.missed += 1
 
-    def _drop_late(self) -> None:
+    def _count_late(self) -> None:
         since = self._clock.seconds() - self._settings.limit
         while self._open:
             number, trial = next(iter(self._open.items()))

@@ -1,6 +1,6 @@
-"""Records: clients write, remove and read a few slots, and write down what they were told; the checker judges it.
+"""Workload: clients write, remove and read a few slots; the checker judges the answers.
 
-Nothing is measured here but how much is answered: whether it is right, fresh and lasting is D1 to D4 and D7 of
+Only the share of answered requests is measured here.  Correctness, freshness and durability are D1 to D4 and D7 of
 ``sim.team.invariant.durability``, over the team's history.
 """
 
@@ -18,21 +18,21 @@ from sim.team.load.residents import Load, Pace
 from sim.team.team import Team
 
 NAME = "r"
-"""Of the one slot that each node has under a key."""
+"""Name of the slot that each node has under a key."""
 ACTS = (WRITE, WRITE, REMOVE, READ, READ, READ)
 MOST_READERS = 32
-"""Nodes that read everything at the end: in a network of thousands not all of them."""
+"""Number of nodes that read everything at the end; not all, in a network of thousands."""
 
 
 @dataclass(frozen=True)
 class RecordSettings:
-    """``[load.records]``: how much is written and read."""
+    """``[load.records]``: the rates of writes and reads."""
 
     keys: Annotated[int, Meta(ge=1, le=10_000)] = 4
-    """Keys that all write under, each in a slot of its own."""
+    """Number of keys, with one slot per node under each."""
 
     rate: Annotated[float, Meta(ge=0.001, le=10_000.0)] = 4.0
-    """Writes, removals and reads in a second, in all."""
+    """Total number of writes, removals and reads per second."""
 
 
 class Records(Load):
@@ -45,7 +45,7 @@ class Records(Load):
         self._clients = Clients(team.history)
 
     def step(self) -> None:
-        """What is due, each at a random node."""
+        """Run the operations that are due, each at a random node."""
         for _ in range(self._pace.due()):
             for place in self._residents.any(self._rng):
                 act, key = self._rng.choice(ACTS), self._rng.choice(self._keys)
@@ -55,13 +55,13 @@ class Records(Load):
                     self._clients.write(place, self._residents.node(place), key, NAME, act=act)
 
     def settled(self) -> None:
-        """Many read everything."""
+        """Let many nodes read everything."""
         for place in self._residents.any(self._rng, MOST_READERS):
             for key in self._keys:
                 self._read(place, key)
 
     def figures(self) -> list[Figure]:
-        """How much was answered; what was not may have been done."""
+        """Return the shares of answered requests; the others may have been carried out."""
         asked, answered = self._clients.asked, self._clients.answered
         return [
             share("records.acknowledged", answered[WRITE] + answered[REMOVE], asked[WRITE] + asked[REMOVE]),

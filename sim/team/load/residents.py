@@ -1,4 +1,4 @@
-"""What workloads share: who of a team lives and has entered it, the truth that lookups are held against, and a pace."""
+"""Shared parts of workloads: the joined nodes of a team, a sorted list of node ids, and a pacer."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sim.team.workload import Workload
 
 
 class Pace:
-    """``rate`` a second, from when ``due`` is first asked on; ``most`` in all, 0 without end."""
+    """A pacer: ``rate`` operations per second after the first call of ``due``; ``most`` in total, 0 for no limit."""
 
     def __init__(self, clock: IReactorTime, rate: float, most: int = 0) -> None:
         self._clock = clock
@@ -25,11 +25,11 @@ class Pace:
 
     @property
     def is_over(self) -> bool:
-        """Whether as many were due as ever will be."""
+        """Whether the total number is reached."""
         return bool(self._most) and self._given >= self._most
 
     def due(self) -> int:
-        """How many became due since this was asked last."""
+        """Return the number of operations that became due since the last call."""
         now = self._clock.seconds()
         if self._began is None:
             self._began = now
@@ -44,10 +44,10 @@ BITS = 8 * ID_BYTES
 
 
 class Census:
-    """The ids of those that live, sorted.
+    """The sorted ids of the living nodes.
 
-    Ids that share their first bits stand side by side in the order of their numbers, so those closest to a key are
-    found without looking at everybody: the narrowest such stretch around the key that has enough of them holds them.
+    Ids with a common prefix are adjacent in numerical order, so the ids closest to a key are found without a full scan:
+    they are in the narrowest such range around the key that has enough ids.
     """
 
     def __init__(self) -> None:
@@ -60,27 +60,27 @@ class Census:
         return self._place(int.from_bytes(node_id)) is not None
 
     def born(self, node_id: bytes) -> None:
-        """One more lives; nothing happens where it did already."""
+        """Add an id, if it is new."""
         number = int.from_bytes(node_id)
         if self._place(number) is None:
             insort(self._numbers, number)
 
     def died(self, node_id: bytes) -> None:
-        """One lives no more; nothing happens where it did not."""
+        """Remove an id, if it exists."""
         place = self._place(int.from_bytes(node_id))
         if place is not None:
             del self._numbers[place]
 
     def closest(self, key: bytes, count: int, without: bytes = b"") -> list[bytes]:
-        """The ids of the ``count`` closest to ``key``, the closest first; ``without`` is passed over."""
+        """Return the ``count`` ids closest to ``key``, closest first, without the id ``without``."""
         goal = int.from_bytes(key)
         passed = int.from_bytes(without) if without else -1
         first, end = 0, len(self._numbers)
-        for bits in range(1, BITS + 1):  # the more first bits are shared, the narrower
+        for bits in range(1, BITS + 1):  # a longer common prefix is a narrower range
             low = goal >> (BITS - bits) << (BITS - bits)
             next_first = bisect_left(self._numbers, low, first, end)
             next_end = bisect_left(self._numbers, low + (1 << (BITS - bits)), next_first, end)
-            if next_end - next_first <= count:  # one of them may be passed over
+            if next_end - next_first <= count:  # as ``without`` may be one of them
                 break
             first, end = next_first, next_end
         near = [number for number in self._numbers[first:end] if number != passed]
@@ -93,7 +93,7 @@ class Census:
 
 
 class Residents:
-    """Kept up to date from before the first node joins; who is still joining is none yet."""
+    """The joined nodes of a team, updated from before the first node joins."""
 
     def __init__(self, team: Team) -> None:
         self._team = team
@@ -107,19 +107,19 @@ class Residents:
         return len(self._order)
 
     def node(self, place: int) -> EntangledNode:
-        """The node of a place in its present life; ``KeyError`` where it does not live or has not entered."""
+        """Return the joined node of a place; raises ``KeyError`` if there is none."""
         return self._lives[place]
 
     def lives(self, place: int, life: EntangledNode) -> bool:
-        """Whether ``life`` goes on: a node that came back to its place is another one."""
+        """Return whether ``life`` still lives; a node that returned to its place is another life."""
         return self._lives.get(place) is life
 
-    def any(self, dice: random.Random, count: int = 1) -> list[int]:
-        """``count`` different places, or as many as there are."""
-        return dice.sample(self._order, min(count, len(self._order)))
+    def any(self, rng: random.Random, count: int = 1) -> list[int]:
+        """Return ``count`` different random places, or all if there are fewer."""
+        return rng.sample(self._order, min(count, len(self._order)))
 
     def places(self) -> list[int]:
-        """All of them."""
+        """Return all places."""
         return sorted(self._order)
 
     def _born(self, place: int, node: Node) -> None:
@@ -140,13 +140,13 @@ class Residents:
         del self._lives[place]
         self.census.died(core(node).identity.node_id)
         gap, last = self._place_in_order.pop(place), self._order.pop()
-        if last != place:  # the last one takes its place: to close the gap would be to move ten thousand
+        if last != place:  # the last place fills the gap, as a shift would move ten thousand
             self._order[gap] = last
             self._place_in_order[last] = gap
 
 
 class Load(Workload):
-    """A workload of clients at nodes that have entered ``team``, with a random generator named ``name``."""
+    """A workload of clients at joined nodes of ``team``, with a random generator named ``name``."""
 
     def __init__(self, team: Team, name: str) -> None:
         self._team = team

@@ -1,8 +1,8 @@
-"""Takeovers: who acts dies at a random moment; how long until another one holds its lease.
+"""Workload: lease holders die at random times; measures the time until another agent holds the lease.
 
-Each trial is a task of its own with three agents, of which one holds the lease and two stand by, as in a team; several
-may go on at once.  One in which a majority of the task's council is dead as well counts for nothing: nobody may take
-over then (invariant E3).
+Each trial is a separate task with three agents: one holds the lease and two are standbys, as in a team.  Several trials
+may run at once.  A trial does not count if a majority of the task's council is dead as well, as no agent may take over
+then (invariant E3).
 """
 
 from __future__ import annotations
@@ -25,28 +25,28 @@ from sim.team.team import Team
 
 AGENTS = 3
 PATIENCE = 30.0
-"""Seconds after which a lease that nobody took is said to have been taken by nobody."""
+"""Seconds after which a takeover counts as failed."""
 
 
 @dataclass(frozen=True)
 class TakeoverSettings:
-    """``[load.takeovers]``: who dies, and how often."""
+    """``[load.takeovers]``: the number and rate of holders that die."""
 
     count: Annotated[int, Meta(ge=1, le=1_000_000)] = 200
-    """Trials in all."""
+    """Total number of trials."""
 
     rate: Annotated[float, Meta(ge=0.0001, le=1000.0)] = 0.1
-    """Trials that begin in a second."""
+    """Trials started per second."""
 
     ttl: Annotated[float, Meta(ge=0.1, le=60.0), Unit("seconds")] = 1.5
-    """Seconds for which a lease runs."""
+    """Time to live of a lease in seconds."""
 
     away: Annotated[float, Meta(ge=0.1, le=3600.0), Unit("seconds")] = 10.0
-    """Seconds after which who died is back, from its disk."""
+    """Seconds after which a dead node restarts from its disk."""
 
 
 class Trial:
-    """One task, its three agents, and when the one that acted died."""
+    """One task, its three agents, and the time of the holder's death."""
 
     def __init__(self, task: Task, agents: list[Deputy]) -> None:
         self.task = task
@@ -71,18 +71,18 @@ class Takeovers(Load):
         self.never = self.overlaps = self.unheld = 0
 
     def step(self) -> None:
-        """Begin the trials that are due, as far as there are agents that have no other one."""
+        """Start the trials that are due, while there are agents without a trial."""
         self._due += self._pace.due()
         while self._due and self._begin():
             self._due -= 1
 
     def verdict(self) -> list[str]:
-        """Leases that two held at once (E2), and tasks that nobody took over (E3)."""
+        """Return leases held by two agents at once (E2), and tasks without a takeover (E3)."""
         found = [f"E2: {self.overlaps} times two agents held one lease"] if self.overlaps else []
-        return found + ([f"E3: {self.never} tasks were taken over by nobody"] if self.never else [])
+        return found + ([f"E3: {self.never} tasks were not taken over"] if self.never else [])
 
     def figures(self) -> list[Figure]:
-        """The seconds, and how often it failed."""
+        """Return the takeover times and the numbers of failures."""
         n = len(self.seconds) + self.never
         return [
             *spread("takeovers.seconds", self.seconds, "s", (0.5, 0.95, 0.99)),
@@ -102,11 +102,11 @@ class Takeovers(Load):
         task = Task(f"takeover {self._begun}", "none", "nothing", lease_ttl=self._settings.ttl)
         trial = Trial(task, agents)
         self._busy.update(agent.place for agent in agents)
-        Deferred.fromCoroutine(self._stand(trial))
+        Deferred.fromCoroutine(self._prepare(trial))
         return True
 
-    async def _stand(self, trial: Trial) -> None:
-        """Let the first agent hold the lease and the others stand by, then set the moment of the first one's death."""
+    async def _prepare(self, trial: Trial) -> None:
+        """Let the first agent hold the lease and the others be standbys, then schedule the holder's death."""
         try:
             trial.task = await trial.agents[0].pinned(trial.task)
         except EntangledError:
@@ -114,7 +114,7 @@ class Takeovers(Load):
             self.unheld += 1
             return
         for agent in trial.agents:
-            trial.lessees.append(agent.lessee(trial.task, lambda: self._changed(trial)))
+            trial.lessees.append(agent.lessee(trial.task, lambda: self._on_lease_change(trial)))
         for rank, lessee in enumerate(trial.lessees):
             if rank:
                 lessee.stand_by(rank)
@@ -126,7 +126,7 @@ class Takeovers(Load):
     def _kill(self, trial: Trial) -> None:
         holder = next((place for place, lessee in enumerate(trial.lessees) if lessee.lease is not None), None)
         if holder is None or not all(self._deputies.lives(agent) for agent in trial.agents):
-            self.unheld += 1  # the faults of the scenario were faster
+            self.unheld += 1  # a fault of the scenario came first
             self._end(trial)
             return
         trial.gone, trial.died_at = trial.agents[holder], self._clock.seconds()
@@ -134,9 +134,9 @@ class Takeovers(Load):
         there = sum(member.node_id in self._residents.census for member in trial.task.council)
         trial.has_quorum = 2 * there > len(trial.task.council)
         self._clock.callLater(self._settings.away, self._return, trial.gone.place)
-        self._clock.callLater(PATIENCE, self._too_late, trial)
+        self._clock.callLater(PATIENCE, self._give_up, trial)
 
-    def _changed(self, trial: Trial) -> None:
+    def _on_lease_change(self, trial: Trial) -> None:
         held = [
             lessee
             for agent, lessee in zip(trial.agents, trial.lessees, strict=False)
@@ -151,7 +151,7 @@ class Takeovers(Load):
             trial.died_at = math.inf
             self._clock.callLater(self._settings.ttl, self._end, trial)
 
-    def _too_late(self, trial: Trial) -> None:
+    def _give_up(self, trial: Trial) -> None:
         if trial.died_at == math.inf:
             return
         trial.died_at = math.inf

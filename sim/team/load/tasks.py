@@ -1,6 +1,6 @@
-"""Tasks: very many at once, each bid for by the few agents that sense it (Assumption 1), each to have one holder.
+"""Workload: many tasks at once, each with the bids of a few agents that sense it (Assumption 1) and with one holder.
 
-Every one goes the whole way: council, bids, announcement, claim.
+Each task runs completely: council, bids, announcement, claim.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ from sim.team.team import Team
 
 @dataclass(frozen=True)
 class TaskSettings:
-    """``[load.tasks]``: how many at once."""
+    """``[load.tasks]``: the number of simultaneous tasks."""
 
     count: Annotated[int, Meta(ge=1, le=100_000)] = 1000
-    """Tasks that are published at the same moment."""
+    """Number of tasks published at the same time."""
 
     bidders: Annotated[int, Meta(ge=1, le=10_000)] = 8
-    """Agents that bid for each of them."""
+    """Number of agents that bid for each task."""
 
     waiting: Annotated[float, Meta(ge=0.0, le=60.0), Unit("seconds")] = 0.5
-    """Seconds that they wait for each other's bids after the first one."""
+    """Waiting period for bids after the first one, in seconds."""
 
     ttl: Annotated[float, Meta(ge=0.1, le=60.0), Unit("seconds")] = 1.5
-    """Seconds for which a lease runs."""
+    """Time to live of a lease in seconds."""
 
     after: Annotated[float, Meta(ge=0.0, le=3600.0), Unit("seconds")] = 2.0
-    """Seconds after the first step at which they are published."""
+    """Seconds from the first step until the tasks are published."""
 
 
 class Tasks(Load):
@@ -55,7 +55,7 @@ class Tasks(Load):
         self._right = 0
 
     def step(self) -> None:
-        """Publish all of them when it is time."""
+        """Publish all tasks when it is time."""
         now = self._clock.seconds()
         if self._due_at is None:
             self._due_at = now + self._settings.after
@@ -71,14 +71,14 @@ class Tasks(Load):
                 Deferred.fromCoroutine(contest.begin())
 
     def settled(self) -> None:
-        """Count the holders of each, and let them go."""
+        """Count the holders of each task, and end the contests."""
         self._counted = [len(contest.holders()) for contest in self._contests]
         self._right = self._nearest()
         for contest in self._contests:
             contest.end()
 
     def verdict(self) -> list[str]:
-        """Tasks without a holder, and those that two held at once (E2)."""
+        """Return tasks without a holder, and tasks held by two agents at once (E2)."""
         found = [f"E2: two held {c.task.task_id} at once" for c in self._contests if c.overlaps]
         found += [
             f"{contest.task.task_id} is held by {held} agents{': ' if contest.trouble else ''}{contest.trouble}"
@@ -89,7 +89,7 @@ class Tasks(Load):
         return found[:LISTED] + ([f"and {more} more tasks"] if more > 0 else [])
 
     def figures(self) -> list[Figure]:
-        """How many have exactly one holder, and how soon they had one."""
+        """Return the share of tasks with exactly one holder, and the times until they had one."""
         n = len(self._contests)
         held = self._counted or [len(contest.holders()) for contest in self._contests]
         right = self._right if self._counted else self._nearest()
@@ -102,5 +102,5 @@ class Tasks(Load):
         ]
 
     def _nearest(self) -> int:
-        """How many tasks are held by the nearest of those that live."""
+        """Return the number of tasks held by the nearest living agent."""
         return sum(any(b.deputy.uuid == contest.best() for b in contest.holders()) for contest in self._contests)

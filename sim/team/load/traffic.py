@@ -1,7 +1,7 @@
-"""Traffic: what a team costs by itself: datagrams, bytes, contacts, and the processor and memory of the simulation.
+"""Workload: observe the traffic of a team; measures datagrams, bytes, contacts, and the simulation's CPU and memory.
 
-Seconds of the processor and bytes of memory are those of the process that runs all nodes, divided by them; they depend
-on the machine, and on what else the scenario asks of the nodes.
+CPU time and memory are those of the process that runs all nodes, divided by their number; they depend on the machine,
+and on the other workloads of the scenario.
 """
 
 from __future__ import annotations
@@ -23,24 +23,24 @@ PAGE = resource.getpagesize()
 
 @dataclass(frozen=True)
 class TrafficSettings:
-    """``[load.traffic]``: who is counted."""
+    """``[load.traffic]``: the sampled nodes."""
 
     sample: Annotated[int, Meta(ge=1, le=100_000)] = 200
-    """Nodes whose contacts are counted at the end; the bytes of all are."""
+    """Number of nodes with counted contacts at the end; bytes are counted for all nodes."""
 
 
 def resident_bytes() -> int:
-    """The memory that this process has now."""
+    """Return the resident memory of this process in bytes."""
     try:
         with open("/proc/self/statm", encoding="ascii") as file:
             return int(file.read().split()[1]) * PAGE
-    except OSError:  # another system: the most that it ever had
+    except OSError:  # other systems: the maximum so far
         most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         return most if sys.platform == "darwin" else most * 1024
 
 
 class Traffic(Workload):
-    """The workload ``traffic``; it asks nothing of anybody."""
+    """The workload ``traffic``; it sends nothing."""
 
     def __init__(self, team: Team, settings: TrafficSettings) -> None:
         self._team = team
@@ -53,7 +53,7 @@ class Traffic(Workload):
         self._before: dict[int, tuple[int, int]] = {}
 
     def step(self) -> None:
-        """Take note of who lives; the first time is the beginning."""
+        """Count the living nodes; the first call starts the measurement."""
         now = self._team.clock.seconds()
         if self._began is None:
             self._began = self._last_at = now
@@ -63,7 +63,7 @@ class Traffic(Workload):
         self._last_at = now
 
     def figures(self) -> list[Figure]:
-        """Of a node and a second of its life; its contacts; and what it costs here."""
+        """Return the traffic per node and second, the contacts, and the cost of the simulation."""
         spent, elapsed, lived = 0.0, 0.0, self._node_seconds
         sent, volume, busiest = 0, 0, 0
         known: list[float] = []

@@ -1,12 +1,12 @@
-"""Values: somebody stores something, some of its holders die at once, somebody else reads it.
+"""Workload: store values, let some of their holders die at once, and read the values at other nodes.
 
-``deaths`` says how many: "quorum" is one less than acknowledged it, the most that an acknowledged value has to outlive
-(invariant D1); "none" leaves the dying to the faults of the scenario, so that what half of a network takes along
-can be held against the model 2 ** -k.  Until it is read, an answer may be the value or "unavailable", never "not
-found"; a value that nobody can read for ``patience`` seconds is lost.
+``deaths`` selects the deaths: "quorum" kills one less than acknowledged the value, which an acknowledged value must
+survive (invariant D1); "none" leaves deaths to the faults of the scenario, for a comparison of the loss of half of a
+network with the model 2 ** -k.  A read may return the value or "unavailable", but never "not found"; a value that
+cannot be read for ``patience`` seconds is lost.
 
-Without deaths a random reader looks up who holds each value before it is read; the share of its holders (of the k
-closest of them) that it finds is what lookups of KAD in the field had 18 % of (Kang et al., 2009).
+Without deaths a random reader looks up the holders of each value before it is read; the figure is the share of the
+holders (among the k closest) that it finds.  Lookups of KAD in the field found 18 % (Kang et al., 2009).
 """
 
 from __future__ import annotations
@@ -33,37 +33,37 @@ from sim.team.team import Team
 
 QUORUM, NONE = "quorum", "none"
 AGAIN = 2.0
-"""Seconds between two tries to read a value that is not available."""
+"""Seconds between two attempts to read an unavailable value."""
 NAME = "value"
 
 
 @dataclass(frozen=True)
 class ValueSettings:
-    """``[load.values]``: what is stored, and who dies for it."""
+    """``[load.values]``: the number of values, and the deaths."""
 
     count: Annotated[int, Meta(ge=1, le=1_000_000)] = 1000
-    """Values in all."""
+    """Total number of values."""
 
     rate: Annotated[float, Meta(ge=0.001, le=10_000.0)] = 1.0
-    """Values that are stored in a second."""
+    """Values stored per second."""
 
     deaths: Annotated[str, one_of((NONE, QUORUM))] = NONE
-    """``quorum``: at once one less than acknowledged it; ``none``: only whom the scenario lets die."""
+    """``quorum``: kill one less than acknowledged the value, at once; ``none``: only the faults of the scenario."""
 
     age: Annotated[float, Meta(ge=0.0, le=86_400.0), Unit("seconds")] = 5.0
-    """Seconds after these deaths in which a value is read; without deaths it is read at the end."""
+    """Seconds from these deaths until a value is read; without deaths it is read at the end."""
 
     away: Annotated[float, Meta(ge=1.0, le=86_400.0), Unit("seconds")] = 30.0
-    """Seconds after which a newcomer takes the place of each that died."""
+    """Seconds after which a new node takes the place of each dead one."""
 
     patience: Annotated[float, Meta(ge=0.0, le=3600.0), Unit("seconds")] = 90.0
-    """Seconds for which reading is tried before a value counts as lost.  Members that died count in majorities for
-    half a minute at least, so what many of them held may be unavailable for as long."""
+    """Seconds of attempts before a value counts as lost.  Dead members count in majorities for at least half a minute,
+    so values that many of them held may be unavailable for this time."""
 
 
 @dataclass
 class Value:
-    """One value on its way through its life."""
+    """One value and its state."""
 
     number: int
     key: bytes
@@ -75,7 +75,7 @@ class Value:
 
     @property
     def content(self) -> bytes:
-        """What was stored."""
+        """The stored bytes."""
         return b"value %d" % self.number
 
 
@@ -95,28 +95,28 @@ class Values(Load):
         self.holders: list[float] = []
         self.copies: list[float] = []
         self.kills = self.read = self.lost = self.missing = self.unread = 0
-        self._found: list[str] = []
+        self._violations: list[str] = []
 
     def step(self) -> None:
-        """Store what is due."""
+        """Store the values that are due."""
         for _ in range(self._pace.due()):
             place = self._residents.any(self._rng)
             if place:
                 self._put(place[0])
 
     def settled(self) -> None:
-        """Read what nobody has read yet."""
+        """Read the values that have not been read yet."""
         waiting, self._waiting = self._waiting, []
         for value in waiting:
             self._count_holders(value)
             self._read(value)
 
     def verdict(self) -> list[str]:
-        """Values that were lost, or said not to be there; with "none" the faults may have taken more than they may."""
-        return self._found if self._settings.deaths == QUORUM else []
+        """Return lost values and wrong "not found" answers; with "none" the faults may exceed the tolerance."""
+        return self._violations if self._settings.deaths == QUORUM else []
 
     def figures(self) -> list[Figure]:
-        """Durability, seconds, and how many holders a reader finds."""
+        """Return durability, times, and the share of holders that a reader finds."""
         over = self.read + self.lost
         figures = [
             Figure("values.acknowledged", float(self._begun - self.refused), "values", n=self._begun),
@@ -159,8 +159,8 @@ class Values(Load):
         else:
             self._waiting.append(value)
 
-    def _held_by(self, value: Value) -> list[int]:
-        """The places of those that live and hold the value."""
+    def _holder_places(self, value: Value) -> list[int]:
+        """Return the places of living nodes that hold the value."""
         holders = []
         for place in self._residents.places():
             held = self._residents.node(place).store.slot(value.slot)
@@ -169,8 +169,8 @@ class Values(Load):
         return holders
 
     def _kill(self, value: Value) -> None:
-        """Let as many of those that acknowledged it die at once as it has to outlive."""
-        held = self._held_by(value)
+        """Kill as many of the nodes that acknowledged the value as it must survive."""
+        held = self._holder_places(value)
         dying = self._rng.sample(held, min(value.acknowledged - 1, len(held) - 1)) if held else []
         for place in dying:
             self.kills += 1
@@ -184,14 +184,14 @@ class Values(Load):
             self._team.start(place)
 
     def _count_holders(self, value: Value) -> None:
-        """Let somebody look up who holds it, and count those of the holders that it finds."""
-        held = [self._residents.node(place) for place in self._held_by(value)]
+        """Let a random node look up the holders, and count those that it finds."""
+        held = [self._residents.node(place) for place in self._holder_places(value)]
         life = self._reader()
         if life is None or not held:
             return
         self.copies.append(float(len(held)))
         ids = sorted((one.identity.node_id for one in held), key=lambda id_: distance(id_, value.key))[:K]
-        life.find_node(value.key).addCallbacks(self._counted, _weather, (ids, life))
+        life.find_node(value.key).addCallbacks(self._counted, _ignore_failure, (ids, life))
 
     def _counted(self, contacts: list[Contact], ids: list[bytes], reader: EntangledNode) -> None:
         seen = {contact.node_id for contact in contacts} | {node_id(reader.identity.public)}
@@ -204,7 +204,7 @@ class Values(Load):
             self.unread += 1
         life = self._reader()
         if life is None:
-            self._go_on(value)
+            self._retry_or_give_up(value)
             return
         life.get(value.key).addCallbacks(self._answered, self._unavailable, (value, now), {}, (value,))
 
@@ -222,26 +222,26 @@ class Values(Load):
             self.unread -= 1
             return
         self.missing += 1
-        self._say(f"D1: value {value.number}, acknowledged by {value.acknowledged}, is said not to be there")
-        self._go_on(value)
+        self._add_violation(f"D1: value {value.number}, acknowledged by {value.acknowledged}, is reported as not found")
+        self._retry_or_give_up(value)
 
     def _unavailable(self, failure: Failure, value: Value) -> None:
         failure.trap(EntangledError)
-        self._go_on(value)
+        self._retry_or_give_up(value)
 
-    def _go_on(self, value: Value) -> None:
+    def _retry_or_give_up(self, value: Value) -> None:
         if self._clock.seconds() - value.asked_since < self._settings.patience:
             self._clock.callLater(AGAIN, self._read, value)
             return
         self.lost += 1
         self.unread -= 1
         after = f"after {value.killed} of {value.acknowledged} that acknowledged it died"
-        self._say(f"D1: value {value.number} is lost {after}")
+        self._add_violation(f"D1: value {value.number} is lost {after}")
 
-    def _say(self, line: str) -> None:
-        if len(self._found) < LISTED:
-            self._found.append(line)
+    def _add_violation(self, line: str) -> None:
+        if len(self._violations) < LISTED:
+            self._violations.append(line)
 
 
-def _weather(failure: Failure) -> None:
+def _ignore_failure(failure: Failure) -> None:
     failure.trap(EntangledError)

@@ -1,4 +1,4 @@
-"""Watches: some follow keys that others change; how long it takes until each hears of it."""
+"""Workload: watch keys that other nodes change; measures the time until each watcher is notified."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ NAME = "watched"
 
 @dataclass(frozen=True)
 class WatchSettings:
-    """``[load.watches]``: who follows what."""
+    """``[load.watches]``: the numbers of keys and watchers."""
 
     keys: Annotated[int, Meta(ge=1, le=100_000)] = 10
-    """Keys that are followed."""
+    """Number of watched keys."""
 
     watchers: Annotated[int, Meta(ge=1, le=10_000)] = 10
-    """Nodes that follow each of them; who dies is followed by another."""
+    """Number of watchers of each key; a dead watcher is replaced."""
 
     rate: Annotated[float, Meta(ge=0.001, le=10_000.0)] = 1.0
-    """Changes a second, of all keys together."""
+    """Changes per second of all keys together."""
 
     limit: Annotated[float, Meta(ge=0.1, le=600.0), Unit("seconds")] = 10.0
-    """Seconds after which a change that was not heard of counts as unheard."""
+    """Time limit of a notification in seconds."""
 
 
 @dataclass
 class Follower:
-    """One watch: who follows, in which life, and the newest change that it has heard of each owner."""
+    """One watch: the watching node, its life, and the newest change received from each owner."""
 
     place: int
     life: EntangledNode
@@ -48,14 +48,14 @@ class Follower:
 
 @dataclass
 class Change:
-    """One change: made when, by whom, and who is to hear of it."""
+    """One change: its time, its owner, and the watchers to be notified."""
 
     number: int
     key: bytes
     owner: bytes
     at: float
     waiting: dict[int, Follower]
-    """By place, those that have not heard of it."""
+    """The watchers that have not been notified, by place."""
 
 
 class Watches(Load):
@@ -73,7 +73,7 @@ class Watches(Load):
         self.seconds: list[float] = []
 
     def step(self) -> None:
-        """Have as many watchers as wanted for each key, and make the changes that are due."""
+        """Keep the number of watchers of each key, and make the changes that are due."""
         for key in self._keys:
             self._follow(key)
         for _ in range(self._pace.due()):
@@ -81,11 +81,11 @@ class Watches(Load):
         self._drop_late()
 
     def settled(self) -> None:
-        """Count what was not heard."""
+        """Count the missed notifications."""
         self._drop_late()
 
     def figures(self) -> list[Figure]:
-        """How many heard in time, and the seconds."""
+        """Return the share of notifications in time, and their delays."""
         return [
             share("watches.heard", self.heard, self.heard + self.unheard),
             *spread("watches.seconds", self.seconds, "s", (0.5, 0.99)),
@@ -133,7 +133,7 @@ class Watches(Load):
         life.put(key, NAME, b"%d" % number).addErrback(lambda failure: self._not_stored(failure, number))
 
     def _not_stored(self, failure: Failure, number: int) -> None:
-        """A change that nobody acknowledged need not be heard; one that some have may be."""
+        """Drop a change that no replica acknowledged; watchers may see a partially acknowledged one."""
         failure.trap(EntangledError)
         if not failure.check(NotAcknowledged):
             self._open = [change for change in self._open if change.number != number]

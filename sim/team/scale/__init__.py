@@ -1,1 +1,1 @@
-"""Scale: the curves of what a team costs and takes against the number of its nodes."""
+"""Measure the cost and the latencies of teams against the number of their nodes."""

@@ -1,4 +1,4 @@
-"""Apart: a call in a process of its own, so that what it takes of the machine's memory can be told from the rest."""
+"""Run a call in a separate process, so that its memory can be measured separately."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from typing import TypeVar
 T = TypeVar("T")
 
 LOOK_S = 0.5
-"""Seconds between two looks whether it is to end."""
+"""Interval in seconds at which ``is_stopped`` is called."""
 
 
 def apart(call: Callable[[], T], *quiet: type[Exception], is_stopped: Callable[[], bool] = lambda: False) -> T:
-    """What ``call`` returns, or raises of ``quiet``; it sees this process as it is now, and changes nothing in it.
+    """Return the result of ``call``, or raise its exception if that is one of ``quiet``; the call runs in a fork.
 
-    When this process ``is_stopped``, the other one is told by SIGTERM, and does what this one would do then.  Raises
-    ``RuntimeError`` where the process ends without a word; what went wrong stands on its standard error.
+    When ``is_stopped`` returns True, the fork gets a SIGTERM, and handles it as this process would.  Raises
+    ``RuntimeError`` if the fork ends without a result; its standard error has the cause.
     """
     context = multiprocessing.get_context("fork")
     here, there = context.Pipe(duplex=False)
@@ -31,7 +31,7 @@ def apart(call: Callable[[], T], *quiet: type[Exception], is_stopped: Callable[[
         is_well, result = here.recv()
     except EOFError:
         process.join()
-        raise RuntimeError(f"the process that measured ended with {process.exitcode}") from None
+        raise RuntimeError(f"the measuring process ended with exit code {process.exitcode}") from None
     process.join()
     if not is_well:
         raise result

@@ -1,4 +1,4 @@
-"""Command: ``sim scale``, what a team costs and takes at one size after the other, drawn beside what theory says."""
+"""``sim scale``: measure the cost and latencies of teams of several sizes, and draw them next to theoretical values."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ Measure = Callable[[int, SurveySettings, Watcher], Sized]
 
 
 def surveyed_apart(nodes: int, settings: SurveySettings, watcher: Watcher) -> Sized:
-    """Measure a team of that size in a process of its own; raises ``Ended``.
+    """Measure a team of that size in a separate process; raises ``Ended``.
 
-    What one team leaves behind would be free memory for the next one, which then seemed to need less.
+    Memory freed by one team would otherwise be reused for the next one, which would then seem to need less.
     """
     return apart(partial(surveyed, nodes, settings, watcher), Ended, is_stopped=watcher.is_stopped)
 
 
 def scale(arguments: Sequence[str], world: Environment, measure: Measure = surveyed_apart) -> int:
-    """Measure the sizes that are not measured yet, print and draw all; 1 where a target is missed.
+    """Measure the sizes that are missing in the record, print and draw all; returns 1 if a target is missed.
 
     Raises ``BadSetting``.
     """
@@ -45,7 +45,7 @@ def scale(arguments: Sequence[str], world: Environment, measure: Measure = surve
     out = Path(wanted.out)
     for key, value in (("--takeovers", wanted.takeovers), ("--swarm-most", wanted.swarm_most)):
         if value < 0:
-            raise BadSetting("command line", key, f"must be from 0 on, is {value}", f"write {key} 100")
+            raise BadSetting("command line", key, f"must be 0 or more, is {value}", f"write {key} 100")
     settings = SurveySettings(seed=wanted.seed, takeovers=wanted.takeovers, swarm_most=wanted.swarm_most)
     record = Record(out / "scale.json", settings)
     record.prepare()
@@ -54,7 +54,7 @@ def scale(arguments: Sequence[str], world: Environment, measure: Measure = surve
     for nodes in sizes:
         check(Scenario(nodes=nodes), world.read)
         if nodes in record.sizes:
-            world.err.write(f"{nodes:,} nodes are measured already\n")
+            world.err.write(f"{nodes:,} nodes: already measured\n")
             continue
         try:
             sized = measure(nodes, settings, watcher)
@@ -76,13 +76,13 @@ def scale(arguments: Sequence[str], world: Environment, measure: Measure = surve
 
 
 def held(sized: Sized) -> list[Figure]:
-    """The figures of one size, held to what is wanted of a team of that size."""
+    """Return the figures of one size with the targets for that size."""
     targets = {curve.figure: curve.target(sized.nodes) for curve in CURVES}
     return [figure.against(targets.get(figure.name)) for figure in sized.figures]
 
 
 def points(sizes: Mapping[int, Sized]) -> dict[str, list[tuple[int, float]]]:
-    """By figure, its value at each size at which it was measured."""
+    """Return the values of each figure at the measured sizes, by name."""
     found: dict[str, list[tuple[int, float]]] = {}
     for nodes in sorted(sizes):
         for figure in sizes[nodes].figures:
@@ -93,7 +93,7 @@ def points(sizes: Mapping[int, Sized]) -> dict[str, list[tuple[int, float]]]:
 
 def _draw(out: Path, sizes: Mapping[int, Sized], settings: SurveySettings) -> None:
     measured = ", ".join(f"{nodes:,}" for nodes in sorted(sizes))
-    note = f"seed {settings.seed}; measured at {measured} nodes, all in one process on one turned clock"
+    note = f"seed {settings.seed}; measured at {measured} nodes, all in one process in virtual time"
     (out / "scale.svg").write_text(drawn(CURVES, points(sizes), note), encoding="utf-8")
     (out / "table.md").write_text(f"# Scale: the figures\n\n{page(CURVES, points(sizes))}", encoding="utf-8")
 
@@ -117,18 +117,18 @@ def _sizes(text: str) -> list[int]:
 def _parsed(arguments: Sequence[str]) -> argparse.Namespace:
     default = SurveySettings()
     parser = argparse.ArgumentParser(prog="sim scale", description=__doc__)
-    parser.add_argument("--nodes", default=SIZES, help="the sizes (default %(default)s)")
+    parser.add_argument("--nodes", default=SIZES, help="the sizes, separated by commas (default %(default)s)")
     parser.add_argument(
-        "--out", default="docs/scale", help="where scale.json, scale.svg and table.md are (default %(default)s)"
+        "--out", default="docs/scale", help="folder of scale.json, scale.svg and table.md (default %(default)s)"
     )
-    parser.add_argument("--seed", type=int, default=default.seed, help="everything follows from it (default 1)")
+    parser.add_argument("--seed", type=int, default=default.seed, help="seed of all random numbers (default 1)")
     parser.add_argument(
-        "--takeovers", type=int, default=default.takeovers, help="holders that die (default %(default)s)"
+        "--takeovers", type=int, default=default.takeovers, help="number of lease holders killed (default %(default)s)"
     )
     parser.add_argument(
         "--swarm-most",
         type=int,
         default=default.swarm_most,
-        help="nodes of the largest team of whole nodes, for the directory (default %(default)s)",
+        help="size of the largest team of whole nodes, for the directory (default %(default)s)",
     )
     return parser.parse_args(arguments)

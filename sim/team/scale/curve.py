@@ -1,4 +1,4 @@
-"""Curve: one figure against the number of nodes, with the theory's and others' beside it; pure."""
+"""Define the curves: figures against the number of nodes, with theoretical and published values.  Pure."""
 
 from __future__ import annotations
 
@@ -12,31 +12,31 @@ from sim.team.scale.theory import Published, Theory
 
 @dataclass(frozen=True)
 class Curve:
-    """``figure`` under ``title`` in ``unit``; ``bound`` is what it is held to, by size where there is one for some."""
+    """``figure`` under ``title`` in ``unit``; ``bound`` is its target, and ``at`` has other targets for some sizes."""
 
     figure: str
     title: str
     unit: str
     theory: Theory | None = None
     says: str = ""
-    """What the theory's curve is."""
+    """A description of the theoretical curve."""
     is_limit: bool = False
-    """Whether the theory's curve is the target."""
+    """Whether the theoretical curve is the target."""
     bound: Bound | None = None
     since: int = 0
-    """Nodes from which on it is held to that; below, nobody asked for anything."""
+    """Number of nodes from which on the target applies."""
     at: tuple[tuple[int, Bound], ...] = ()
     published: Sequence[Published] = ()
 
     def target(self, nodes: int) -> Bound | None:
-        """What is wanted of a team of that size."""
+        """Return the target for a team of that size."""
         if self.is_limit and self.theory is not None:
             return Bound(self.theory(nodes))
         return dict(self.at).get(nodes, self.bound if nodes >= self.since else None)
 
 
 LARGE = 1000
-"""Nodes from which on the targets of cost are meant."""
+"""Number of nodes from which on the targets of cost apply."""
 
 CURVES = (
     Curve("lookups.success", "Lookups that find their node within 4 s", "share", bound=Bound(0.999, most=False)),

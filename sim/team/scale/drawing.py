@@ -1,4 +1,4 @@
-"""Drawing: the curves as one SVG, sizes to the right, both axes by their logarithm where the values allow it; pure."""
+"""Draw the curves as SVG over the number of nodes, with logarithmic axes if the values allow it.  Pure."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ LEFT, TOP, RIGHT, BOTTOM = 52, 44, 16, 46
 COLUMNS = 3
 OURS, THEORY, OTHERS, BOUND = "#2563a8", "#6b7280", "#c2410c", "#15803d"
 EDGE = 12
-"""What the last number of the rightmost fields needs beyond them."""
+"""Horizontal space for the last label of the rightmost plots."""
 SMALLEST, LARGEST = 3, 10_000
 WIDEST_LINEAR = 8.0
-"""Where the largest value is no more times the least one, the upward axis counts and does not multiply."""
+"""Maximum ratio of the largest to the smallest value for a linear vertical axis."""
 
 
 def drawn(curves: Sequence[Curve], points: Mapping[str, Points], note: str) -> str:
-    """Every curve that has points in a field of its own; ``note`` stands below all of them."""
+    """Return a plot of every curve that has points; ``note`` is added below all of them."""
     present = [curve for curve in curves if points.get(curve.figure)]
     rows = math.ceil(len(present) / COLUMNS)
     parts = []
@@ -50,7 +50,7 @@ def drawn(curves: Sequence[Curve], points: Mapping[str, Points], note: str) -> s
 
 
 class _Axis:
-    """From values to pixels; by the logarithm, or not."""
+    """A linear or logarithmic mapping from values to pixels."""
 
     def __init__(self, low: float, high: float, first: float, last: float, is_log: bool) -> None:
         self.is_log = is_log
@@ -58,7 +58,7 @@ class _Axis:
         self._first, self._last = first, last
 
     def at(self, value: float) -> float:
-        """Where a value lies."""
+        """Return the pixel of a value."""
         part = ((math.log(value) if self.is_log else value) - self._low) / ((self._high - self._low) or 1.0)
         return self._first + part * (self._last - self._first)
 
@@ -114,7 +114,7 @@ def _field(curve: Curve, points: Points) -> str:
 
 
 def _between(low: int, high: int) -> list[int]:
-    """Sizes from ``low`` to ``high``, a quarter more each."""
+    """Return sizes from ``low`` to ``high``, in steps of a quarter."""
     found, n = [], float(low)
     while n < high:
         found.append(round(n))
@@ -123,7 +123,7 @@ def _between(low: int, high: int) -> list[int]:
 
 
 def _ticks(low: float, high: float, is_log: bool) -> list[float]:
-    """Round values between both."""
+    """Return round values between both."""
     if is_log:
         first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
         steps = (1, 3) if last - first <= 4 else (1,)

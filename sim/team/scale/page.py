@@ -1,4 +1,4 @@
-"""Page: the curves as a table in Markdown, and where they lead if they go on as they do; pure."""
+"""Write the curves as a table in Markdown, with an extrapolation.  Pure."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from sim.team.scale.drawing import Points
 
 MILLION = 1_000_000
 FROM = 100
-"""Nodes from which on sizes say where a curve leads: below, everybody knows everybody."""
+"""Number of nodes from which on sizes are used for the extrapolation; below, every node knows all others."""
 LEAST = 3
-"""Sizes that a straight line is drawn through at least."""
+"""Minimum number of sizes for the extrapolation."""
 
 
 def led(points: Points, nodes: int = MILLION) -> float | None:
-    """The value at ``nodes`` on the straight line through ``points`` over log2 n; None where there are too few."""
+    """Extrapolate ``points`` to ``nodes`` by linear regression over log2 n; None for too few points."""
     some = [(math.log2(n), value) for n, value in points if n >= FROM]
     if len(some) < LEAST:
         return None
@@ -28,7 +28,7 @@ def led(points: Points, nodes: int = MILLION) -> float | None:
 
 
 def page(curves: Sequence[Curve], points: Mapping[str, Points]) -> str:
-    """One line a curve, one column a size; what misses its target is bold."""
+    """Return a table with one row per curve and one column per size; values that miss their targets are bold."""
     present = [curve for curve in curves if points.get(curve.figure)]
     sizes = sorted({n for curve in present for n, _ in points[curve.figure]})
     lines = [

@@ -1,4 +1,4 @@
-"""Record: the JSON of measured sizes, which a run that was ended is taken up from."""
+"""Keep the measured sizes in a JSON file, from which an interrupted run continues."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sim.team.scale.survey import Sized, SurveySettings
 
 
 class Record:
-    """The sizes that were measured with ``settings``, in the file ``path``."""
+    """The sizes measured with ``settings``, in the file ``path``."""
 
     def __init__(self, path: Path, settings: SurveySettings) -> None:
         self._path = path
@@ -23,17 +23,17 @@ class Record:
         self.sizes: dict[int, Sized] = {}
 
     def prepare(self) -> None:
-        """Make the folder, and see that a file can be written there; raises ``BadSetting``."""
+        """Create the folder, and check that a file can be written there; raises ``BadSetting``."""
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             self._new.touch()
             self._new.unlink()
         except OSError as error:
-            problem = f"{error.filename} cannot be written: {error.strerror}"
-            raise BadSetting("command line", "--out", problem, "name a folder in which you may write") from error
+            problem = f"cannot write {error.filename}: {error.strerror}"
+            raise BadSetting("command line", "--out", problem, "name a folder that you can write to") from error
 
     def read(self) -> None:
-        """Take up what is there; raises ``BadSetting`` for a file that is none of ours, or of other settings."""
+        """Read the file; raises ``BadSetting`` if it is invalid or was measured with other settings."""
         try:
             content = json.loads(self._path.read_text(encoding="utf-8"))
         except FileNotFoundError:
@@ -41,16 +41,16 @@ class Record:
         except (OSError, ValueError) as error:
             raise self._wrong(str(error)) from error
         if not isinstance(content, dict) or not isinstance(content.get("sizes"), dict):
-            raise self._wrong("it has no sizes")
+            raise self._wrong("it contains no sizes")
         if content.get("digest") != self._settings.digest():
             raise self._wrong(f"it was measured with other settings: {content.get('settings')}")
         try:
             self.sizes = {int(nodes): _sized(int(nodes), size) for nodes, size in content["sizes"].items()}
         except (TypeError, ValueError, KeyError) as error:
-            raise self._wrong(f"a size in it is not as it was written: {error}") from error
+            raise self._wrong(f"it contains an invalid size: {error}") from error
 
     def add(self, sized: Sized) -> None:
-        """Keep one more size, and write the file whole: it is there at any moment."""
+        """Add a size, and replace the file atomically."""
         self.sizes[sized.nodes] = sized
         content = {
             "digest": self._settings.digest(),
@@ -61,7 +61,7 @@ class Record:
         os.replace(self._new, self._path)
 
     def _wrong(self, problem: str) -> BadSetting:
-        return BadSetting(str(self._path), "", f"cannot be taken up: {problem}", "move it away, or name another --out")
+        return BadSetting(str(self._path), "", f"cannot be used: {problem}", "move it away, or name another --out")
 
 
 def _packed(sized: Sized) -> dict[str, Any]:

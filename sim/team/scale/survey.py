@@ -1,8 +1,8 @@
-"""Survey: everything that is measured of a team of one size, one thing after the other.
+"""Measure all figures of a team of one size, one after the other.
 
-Nodes wait for an answer as long as answers took before, so a team stays on the links on which it came together: one of
-bare nodes has an internet, for its cost and its lookups, and one the quick links that auctions and takeovers are held
-to.  The directory has a third one of whole nodes, for bare ones have no devices.
+Nodes adapt their timeouts to observed round-trip times, so a team keeps the links on which it was formed.  One team of
+bare nodes has internet links, for cost and lookups, another one fast links, for which the targets of auctions and
+takeovers are defined.  A third team of whole nodes measures the directory, as bare nodes have no devices.
 """
 
 from __future__ import annotations
@@ -26,48 +26,48 @@ from sim.team.team import Team
 from sim.team.workload import Workload
 
 DELAY, JITTER = 0.02, 0.01
-"""Seconds one way on the link of ``docs/explanation/choosing-a-robot.md``, and the mean of the exponential jitter."""
+"""One-way delay in seconds of the link of ``docs/explanation/choosing-a-robot.md``, and the mean exponential jitter."""
 STEP = 0.5
 SLICE = 0.25
-"""Seconds of the team's time between two looks at whether a person wants an end."""
+"""Seconds of the team's time between two calls of ``Watcher.is_stopped``."""
 AWAY = 5.0
-"""Seconds for which those that die while they act are gone."""
+"""Seconds for which killed lease holders are away."""
 VERSION = 2
-"""Another one when what is measured means something else."""
+"""Version of the measurements; changed when a figure changes its meaning."""
 
 
 @dataclass(frozen=True)
 class SurveySettings:
-    """What is done with each team; figures of other settings are not to be compared."""
+    """The parameters of the measurement; figures of different settings are not comparable."""
 
     seed: int = 1
     settle: float = 30.0
-    """Seconds from the moment when all are in until the team counts as quiet."""
+    """Seconds from the last join until the team counts as quiet."""
     quiet: float = 20.0
-    """Seconds in which nothing is asked, and what is sent is counted."""
+    """Seconds without requests in which traffic is counted."""
     lookups: float = 10.0
-    """Seconds of lookups."""
+    """Duration of the lookups in seconds."""
     rate: float = 30.0
-    """Lookups a second."""
+    """Lookups per second."""
     exact: int = 1000
-    """Keys whose lookup has to be exact."""
+    """Number of keys with exact results required."""
     auctions: int = 3
-    """Auctions in which everybody bids."""
+    """Number of auctions in which all agents bid."""
     takeovers: int = 100
-    """Holders that die."""
+    """Number of lease holders killed."""
     loss: float = 0.1
-    """Share of the datagrams that auctions and takeovers have to do without."""
+    """Share of datagrams lost during auctions and takeovers."""
     swarm_most: int = 100
-    """Nodes of the largest team of whole nodes."""
+    """Number of nodes of the largest team of whole nodes."""
 
     def digest(self) -> str:
-        """What tells these settings from all others."""
+        """Return a hash that identifies these settings."""
         return hashlib.blake2s(f"{VERSION} {self!r}".encode(), digest_size=8).hexdigest()
 
 
 @dataclass
 class Sized:
-    """What was measured at one size; ``cpu`` is in seconds of the processor."""
+    """The results of one size; ``cpu`` is in processor seconds."""
 
     nodes: int
     figures: list[Figure] = field(default_factory=list)
@@ -77,12 +77,12 @@ class Sized:
 
 
 class Ended(Exception):
-    """A person wants an end; what was measured of this size is let go of."""
+    """The user has stopped the measurement; the results of this size are discarded."""
 
 
 @dataclass(frozen=True)
 class Watcher:
-    """Who looks on: ``say`` is told what is being done, ``is_stopped`` says whether a person wants an end."""
+    """Callbacks: ``say`` receives progress messages, ``is_stopped`` returns whether the user wants to stop."""
 
     say: Callable[[str], None] = lambda line: None
     is_stopped: Callable[[], bool] = lambda: False
@@ -94,7 +94,7 @@ def surveyed(nodes: int, settings: SurveySettings, watcher: Watcher = Watcher())
 
 
 class Survey:
-    """The measuring of one size."""
+    """The measurement of one size."""
 
     def __init__(self, nodes: int, settings: SurveySettings, watcher: Watcher) -> None:
         self._nodes = nodes
@@ -105,84 +105,84 @@ class Survey:
         self._scenario = Scenario(nodes=nodes, join=join, link=LinkSettings("internet"), step=STEP)
 
     def run(self) -> Sized:
-        """Measure everything; raises ``Ended``."""
+        """Measure all figures; raises ``Ended``."""
         began, sized = time.process_time(), self._sized
-        hashes = [self._far(), self._near()]
+        hashes = [self._measure_lookups(), self._measure_auctions()]
         if self._nodes <= self._settings.swarm_most:
-            hashes.append(self._whole())
+            hashes.append(self._measure_directory())
         sized.hash = hashlib.blake2s("".join(hashes).encode(), digest_size=16).hexdigest()
         sized.cpu = time.process_time() - began
         return sized
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
-    def _far(self) -> str:
-        """Cost and lookups, by nodes of the library on an internet."""
+    def _measure_lookups(self) -> str:
+        """Measure cost and lookups, with bare nodes on internet links."""
         team = Team(self._scenario, self._settings.seed)
         cost = Traffic(team, TrafficSettings())
-        deputies_of(team)  # the rooms for bids cost memory too
+        deputies_of(team)  # the services for bids need memory too
         asking = Lookups(team, LookupSettings(rate=self._settings.rate, exact=self._settings.exact))
-        self._say("nodes come together")
-        self._stand(team)
+        self._say("nodes join")
+        self._form_team(team)
         self._say("nodes in quiet")
-        self._play(team, cost, self._settings.quiet)
+        self._run_workload(team, cost, self._settings.quiet)
         self._sized.figures += cost.figures()
-        self._say("nodes look for each other")
-        self._play(team, asking, self._settings.lookups)
+        self._say("nodes look up each other")
+        self._run_workload(team, asking, self._settings.lookups)
         self._finish(team, asking)
-        return team.digest()  # and no goodbyes, which would take longer than all the lookups
+        return team.digest()  # without graceful leaves, which would take longer than all lookups
 
-    def _near(self) -> str:
-        """Auctions and takeovers, by nodes of the library with the rooms for bids beside them."""
+    def _measure_auctions(self) -> str:
+        """Measure auctions and takeovers, with bare nodes and the services for bids."""
         nodes, settings = self._nodes, self._settings
         team = Team(self._scenario, settings.seed)
         team.board.link = Radio(Air(DELAY, JITTER, settings.loss))
         bidding = Auctions(team, AuctionSettings(count=settings.auctions, every=4.0))
-        # No more are away at once than a small team can do without.
+        # The rate limits the nodes that are away at once to a number that a small team tolerates.
         rate = min(5.0, max(0.12, nodes / 200))
         dying = Takeovers(team, TakeoverSettings(count=settings.takeovers, rate=rate, away=AWAY))
-        self._say("nodes come together for a task")
-        self._stand(team)
+        self._say("nodes join for a task")
+        self._form_team(team)
         self._say("nodes bid")
-        self._play(team, bidding, 4.0 * settings.auctions + STEP)
+        self._run_workload(team, bidding, 4.0 * settings.auctions + STEP)
         self._finish(team, bidding)
-        self._say(f"nodes, and {settings.takeovers} of them die while they act")
-        self._play(team, dying, settings.takeovers / rate + 15.0)
+        self._say(f"nodes, {settings.takeovers} lease holders are killed")
+        self._run_workload(team, dying, settings.takeovers / rate + 15.0)
         self._finish(team, dying)
         return team.digest()
 
-    def _whole(self) -> str:
-        """The directory, by the nodes of devices."""
+    def _measure_directory(self) -> str:
+        """Measure the directory, with device nodes."""
         scenario = replace(self._scenario, kind="swarm", link=LinkSettings("wifi"))
         team = Team(scenario, self._settings.seed)
         listing = Directory(team, DirectorySettings())
         self._say("devices announce themselves")
-        self._stand(team)
-        self._play(team, listing, 16.0)
+        self._form_team(team)
+        self._run_workload(team, listing, 16.0)
         self._finish(team, listing)
         return team.digest()
 
-    def _stand(self, team: Team) -> None:
-        self._pass(team, team.come())
-        self._pass(team, self._scenario.join.within, team.is_standing)
+    def _form_team(self, team: Team) -> None:
+        self._advance(team, team.come())
+        self._advance(team, self._scenario.join.within, team.is_standing)
         if not team.is_standing():
-            self._sized.violations.append(f"join: {len(team.living) - len(team.inside())} nodes are not in")
-        self._pass(team, self._scenario.join.settle)
+            self._sized.violations.append(f"join: {len(team.living) - len(team.inside())} nodes have not joined")
+        self._advance(team, self._scenario.join.settle)
 
-    def _play(self, team: Team, workload: Workload, seconds: float) -> None:
+    def _run_workload(self, team: Team, workload: Workload, seconds: float) -> None:
         end = team.clock.seconds() + seconds
         while team.clock.seconds() < end - 1e-9:
             workload.step()
-            self._pass(team, STEP)
+            self._advance(team, STEP)
         workload.step()
 
     def _finish(self, team: Team, workload: Workload) -> None:
         workload.settled()
-        self._pass(team, 5.0)
+        self._advance(team, 5.0)
         self._sized.figures += workload.figures()
         self._sized.violations += workload.verdict()
 
-    def _pass(self, team: Team, seconds: float, until: Callable[[], bool] = lambda: False) -> None:
+    def _advance(self, team: Team, seconds: float, until: Callable[[], bool] = lambda: False) -> None:
         end = team.clock.seconds() + seconds
         while team.clock.seconds() < end - 1e-9 and not until():
             team.run(min(SLICE, end - team.clock.seconds()))

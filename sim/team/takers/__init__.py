@@ -1,1 +1,1 @@
-"""Simulated trials of the tuple space: many takers, faults, and a record of what every council member accepted."""
+"""Simulated trials of the tuple space: many takers, faults, and a record of all votes of council members."""

@@ -1,7 +1,7 @@
 """Trials of a tuple space with one list of records instead of replicas, so that thousands of tuples take a minute.
 
-Seats, spaces and the wire between them are those that ship; only records are not replicated: one list holds them all,
-and everybody hears of changes a little later.  What is shown here is shown of the councils, not of the replicas.
+Acceptors, tuple spaces and the endpoints between them are production code; only records are not replicated: one list
+holds all of them, and watchers are notified of changes with a delay.  These trials test councils, not replicas.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ FOREVER = 1e9
 
 
 class LightNode:
-    """One node of a trial, with the interface that a tuple space needs (``space.peer.Peer``)."""
+    """One node of a trial, with the interface that a tuple space requires (``space.peer.Peer``)."""
 
     def __init__(self, trial: LightTrial, place: int, identity: Identity, rng: random.Random) -> None:
         self.identity = identity
@@ -45,15 +45,15 @@ class LightNode:
         self.endpoint.start()
 
     def join(self, known: object) -> None:
-        """Everybody knows everybody here."""
+        """Do nothing: all nodes know each other."""
 
     def vanish(self) -> None:
-        """Leave without a word."""
+        """Leave without notice."""
         self.endpoint.stop()
         self.watches.clear()
 
     def find_node(self, target: bytes) -> Deferred[list[Contact]]:
-        """The others who live, the closest first."""
+        """Fire with the other living nodes, closest first."""
         others = [node.contact for node in self._trial.living_nodes() if node is not self]
         return defer.succeed(closest(others, target, 8))
 
@@ -62,7 +62,7 @@ class LightNode:
         return contact
 
     def put(self, key: bytes, name: str, value: bytes | None) -> Deferred[int]:
-        """Store a record a little later, unless this node dies before."""
+        """Store a record after a delay, unless this node dies before."""
         sequence = self._trial.sequence(Slot(key, self.identity.public, name))
         record = Record(key, name, self.identity.public, sequence, "team", 60.0, value).signed(self.identity)
         done: Deferred[int] = Deferred()
@@ -76,23 +76,23 @@ class LightNode:
         return done
 
     def remove(self, key: bytes, name: str) -> Deferred[int]:
-        """Empty a slot."""
+        """Write a tombstone."""
         return self.put(key, name, None)
 
     def get(self, key: bytes) -> Deferred[list[Record]]:
-        """What stands under ``key``, heard a little later."""
+        """Fire with the records under ``key`` after a delay."""
         done: Deferred[list[Record]] = Deferred()
         self._trial.clock.callLater(self._rng.uniform(0.002, 0.05), done.callback, self._trial.under(key))
         return done
 
     def watch(self, key: bytes, changed: Callable[[list[Record]], None]) -> LightWatch:
-        """Tell ``changed`` of every change."""
+        """Call ``changed`` at every change."""
         watch = LightWatch(self, key, changed, self._trial.under(key))
         self.watches.append(watch)
         return watch
 
     def refresh(self, watch: LightWatch) -> None:
-        """Nothing: no push is ever lost here."""
+        """Do nothing: pushes are never lost here."""
 
 
 class LightWatch:
@@ -107,19 +107,19 @@ class LightWatch:
         self._changed = changed
 
     def tell(self, records: list[Record]) -> None:
-        """Tell of a change, if anybody still listens."""
+        """Notify the watcher, if the watch has not ended."""
         if self in self._node.watches:
             self.records = records
             self._changed(records)
 
     def stop(self) -> None:
-        """End it."""
+        """End the watch."""
         if self in self._node.watches:
             self._node.watches.remove(self)
 
 
 class LightTrial(Trial):
-    """A trial in a trial."""
+    """A trial with light nodes."""
 
     def __init__(self, *arguments: Any, **keywords: Any) -> None:
         self._records: dict[Slot, Record] = {}
@@ -127,24 +127,24 @@ class LightTrial(Trial):
         super().__init__(*arguments, **keywords)
 
     def living_nodes(self) -> list[LightNode]:
-        """Those who live."""
+        """Return the living nodes."""
         return [self.living[place] for place in self.alive()]
 
     def node(self, place: int, identity: Identity, rng: random.Random) -> EntangledNode:
-        """A node of this kind for the node of this place."""
+        """Return a light node for this place."""
         return cast(EntangledNode, LightNode(self, place, identity, rng))
 
     def sequence(self, slot: Slot) -> int:
-        """The next number in a slot."""
+        """Return the next sequence number of a slot."""
         self._sequences[slot] = self._sequences.get(slot, 0) + 1
         return self._sequences[slot]
 
     def under(self, key: bytes) -> list[Record]:
-        """The records of ``key``."""
+        """Return the records of ``key``."""
         return [record for record in self._records.values() if record.key == key and not record.is_tombstone]
 
     def stored(self, record: Record) -> None:
-        """Keep a record, and tell everybody who watches, each a little later."""
+        """Store a record, and notify all watchers with random delays."""
         if not record.beats(self._records.get(record.slot)):
             return
         self._records[record.slot] = record

@@ -1,4 +1,4 @@
-"""One simulated trial of a tuple space: publishers, takers and faults from a seed, written down for the checker."""
+"""Run one trial of a tuple space: publishers, takers and faults from a seed, recorded for the checker."""
 
 from __future__ import annotations
 
@@ -20,20 +20,19 @@ from sim.team.world import JOINING, TEAM, World
 
 STEP = 0.25
 WAITING = 24
-"""Tuples that wait to be taken, about."""
+"""Approximate number of tuples waiting to be taken."""
 MAX_DOWN = 2
-"""Nodes that are dead at the same moment: fewer than a majority of any council and of the holders of any record."""
+"""Maximum number of dead nodes: less than a majority of any council and of the holders of any record."""
 
 
 class Trial(World):
-    """One run: publishers, takers that go on and on, and whatever befalls them, from one ``seed``.
+    """One run from one ``seed``: publishers, takers that take repeatedly, and faults.
 
-    ``loss`` is the share of datagrams that the network loses, ``churn`` whether nodes are killed, one of them for good,
-    and links cut.
+    ``loss`` is the share of lost datagrams; with ``churn`` nodes are killed, one permanently, and links are cut.
     """
 
     aftermath = 240.0
-    """Seconds that the takers get, once all faults are over, for what is left."""
+    """Seconds that the takers get after all faults for the remaining tuples."""
 
     def __init__(
         self, seed: int, tuples: int, loss: float = 0.0, churn: bool = False, takers: int = 8, nodes: int = 12
@@ -55,17 +54,17 @@ class Trial(World):
             self.start(place)
             self.clock.advance(JOINING)
 
-    # -- the world --------------------------------------------------------------------------------------------------
+    # -- nodes ------------------------------------------------------------------------------------------------------
 
     def node(self, place: int, identity: Identity, rng: Any) -> EntangledNode:
-        """The next life of the node of this place, on the store of the last one, not started."""
+        """Return the next life of the node at this place, with the store of the last one, not started."""
         network = self.network(place)
         node = EntangledNode(identity, TEAM, network, self.store(place), self.clock, rng)
         node.replica.on_record.add(self.witness.stored)
         return node
 
     def start(self, place: int) -> None:
-        """Let the node of this place live, if it does not."""
+        """Start the node of this place, if it does not live."""
         if place in self.living or place == self.grave:
             return
         identity, rng = self.identity(place), self.rng(place)
@@ -79,17 +78,17 @@ class Trial(World):
             self.take(place)
 
     def kill(self, place: int) -> None:
-        """End the node of this place between two instructions, as a loss of power does."""
+        """Kill the node of this place between two instructions, like a loss of power."""
         if place in self.living:
             node, space = self.end_life(place), self.spaces.pop(place)
             self.board.kill(self.address(place))
             node.vanish()
             space.stop()
 
-    # -- the story --------------------------------------------------------------------------------------------------
+    # -- schedule ---------------------------------------------------------------------------------------------------
 
     def play(self) -> None:
-        """Let it all happen, then let everybody come back and finish."""
+        """Run the trial, then restart all nodes and let the takers finish."""
         self.board.weather = self.storm
         if self.churn:
             self.clock.callLater(self.dice.uniform(0.2, 1.0), self.befall)
@@ -117,7 +116,7 @@ class Trial(World):
             self.kill(place)
 
     def publish(self) -> None:
-        """Put the next few tuples, while not too many wait."""
+        """Put the next few tuples, unless too many are waiting."""
         if not self.is_open:
             self.is_open = True
             for place in range(self.takers):
@@ -133,7 +132,7 @@ class Trial(World):
             self.look(self.dice.choice(self.alive()))
 
     def look(self, place: int) -> None:
-        """Read all tuples; while nothing disturbs the network, whatever was taken before must not be among them."""
+        """Read all tuples; in a quiet network the result must not contain tuples taken before."""
         is_quiet = self.board.weather is self.calm or not (self.storm.loss or self.churn)
         asked = self.history.asked(place, SURVEY if is_quiet else "look", "job")
 
@@ -144,7 +143,7 @@ class Trial(World):
         follow(self.history, asked, self.spaces[place].read_all(("job", int, float)), seen)
 
     def take(self, place: int) -> None:
-        """Let the taker of this place take once more, in one way or another."""
+        """Start the next operation of this place's taker, of a random kind."""
         space = self.spaces.get(place)
         if space is None or self.busy.get(place) is space:
             return
@@ -171,16 +170,16 @@ class Trial(World):
             self.clock.callLater(work + late, lambda: claim.confirm().addBoth(self.took, place, space, asked))
 
     def took(self, result: Any, place: int, space: TupleSpace, asked: int) -> None:
-        """Write down what a call was told, and go on."""
+        """Record the result of a call, and start the next one."""
         if self.spaces.get(place) is not space:
-            return  # a dead node tells nobody
+            return  # calls of a dead node have no result
         taken = result if isinstance(result, list) else [result] if isinstance(result, tuple) else []
         self.history.answered(asked, tuple(taken))
         del self.busy[place]
         self.clock.callLater(self.dice.uniform(0.0, 0.05), self.take, place)
 
     def befall(self) -> None:
-        """Kill a node for a while or, once, for good; or cut the network in two."""
+        """Kill a node for some time or, once, permanently; or partition the network."""
         if not self.churn:
             return
         self.clock.callLater(self.dice.uniform(0.2, 2.0), self.befall)
@@ -196,14 +195,14 @@ class Trial(World):
                 self.grave = place
             self.clock.callLater(self.dice.uniform(0.1, 4.0), self.start, place)
 
-    # -- what came of it --------------------------------------------------------------------------------------------
+    # -- results ----------------------------------------------------------------------------------------------------
 
     def stands(self, posted: Posted) -> bool:
-        """Whether a living node still keeps this tuple; one that was never acknowledged may vanish with its nodes."""
+        """Return whether a living node holds this tuple; an unacknowledged one may vanish with its nodes."""
         held = [node.store.slot(posted.place.slot) for node in self.living.values()]
         return any(record is not None and posting(record) == posted for record in held)
 
     def violations(self) -> list[str]:
-        """Everything that must not be; to be asked while the nodes live."""
+        """Return all violations; must be called while the nodes live."""
         left = [posted for posted in self.witness.open() if self.stands(posted)]
-        return check(self.history) + [f"T5: {posted.fields} stands and was not taken" for posted in left]
+        return check(self.history) + [f"T5: {posted.fields} exists and was not taken" for posted in left]

@@ -1,4 +1,4 @@
-"""A record of every vote of every council member of a tuple space, over all lives of its nodes, for the checker."""
+"""Record every vote of every council member of a tuple space, over all lives of its nodes, for the checker."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from sim.team import event
 from sim.team.history import History
 
 INCARNATION = "decree/incarnation"
-"""The note in which a member of councils keeps which life it is in."""
+"""The note in which a council member stores its incarnation."""
 
 
 class Witness:
-    """Writes down every acceptance of every council member, in all of its lives."""
+    """Records every acceptance of every council member, in all of its lives."""
 
     def __init__(self, history: History) -> None:
         self._history = history
@@ -33,62 +33,64 @@ class Witness:
         self.bids: dict[Place, dict[tuple[int, bytes, bytes], set[bytes]]] = defaultdict(lambda: defaultdict(set))
 
     def stored(self, record: Record) -> None:
-        """Take note of a tuple that some replica holds now."""
-        said = posting(record)
-        if isinstance(said, Posted):
-            if said.place not in self.posted:
-                seats = [(member.contact.public, member.incarnation) for member in said.council]
-                self._history.note(event.Posted, said.place, said.fields, *map(tuple, zip(*seats, strict=True)))
-            self.posted[said.place] = said
+        """Record a tuple that a replica holds."""
+        content = posting(record)
+        if isinstance(content, Posted):
+            if content.place not in self.posted:
+                seats = [(member.contact.public, member.incarnation) for member in content.council]
+                self._history.note(event.Posted, content.place, content.fields, *map(tuple, zip(*seats, strict=True)))
+            self.posted[content.place] = content
 
     def attend(self, seat: Seat, expose: Callable[..., object], member: bytes) -> None:
-        """Look over the shoulder of the council member ``member`` as it confirms takes, and tells what it accepted."""
+        """Wrap the answers of the council member ``member`` to record the takes that it accepts."""
         confirm: Callable[..., Any] = seat.answer_confirm
         claim: Callable[..., Any] = seat.answer_claim
 
-        def told(asked: Event, key: bytes, places: list[object], answers: list[object]) -> list[tuple[Place, Reply]]:
+        def parse_answers(
+            asked: Event, key: bytes, places: list[object], answers: list[object]
+        ) -> list[tuple[Place, Reply]]:
             pairs = [(place_unpacked(key, p), unpack_reply(a, asked)) for p, a in zip(places, answers, strict=True)]
             return [(place, reply) for place, reply in pairs if place is not None and reply is not None]
 
         def confirmed(peer: Contact, key: bytes, places: list[object], incarnation: bytes, *ballot: Any) -> Any:
-            def noted(answers: list[object]) -> list[object]:
-                for place, reply in told(Event.ACCEPT, key, places, answers):
+            def note_accepted(answers: list[object]) -> list[object]:
+                for place, reply in parse_answers(Event.ACCEPT, key, places, answers):
                     if reply.kind is Kind.GRANTED:
                         self.accepted(place, ballot, member)
                 return answers
 
-            return maybeDeferred(confirm, peer, key, places, incarnation, *ballot).addCallback(noted)
+            return maybeDeferred(confirm, peer, key, places, incarnation, *ballot).addCallback(note_accepted)
 
         def claimed(peer: Contact, key: bytes, places: list[object], *rest: Any) -> Any:
-            def noted(answers: list[object]) -> list[object]:
-                # One whose disk was full when it accepted could not say so, and tells it with the next it can write.
-                for place, reply in told(Event.PREPARE, key, places, answers):
+            def note_accepted(answers: list[object]) -> list[object]:
+                # A member with a full disk reports an acceptance only with a later answer.
+                for place, reply in parse_answers(Event.PREPARE, key, places, answers):
                     if reply.accepted != NONE:
                         self.accepted(place, (*reply.accepted, reply.value), member)
                 return answers
 
-            return maybeDeferred(claim, peer, key, places, *rest).addCallback(noted)
+            return maybeDeferred(claim, peer, key, places, *rest).addCallback(note_accepted)
 
         seat.answer_confirm, seat.answer_claim = confirmed, claimed  # type: ignore[method-assign, assignment]
         expose("decree.confirm", confirmed, changes=True)
         expose("decree.claim", claimed, changes=True)
 
     def accepted(self, place: Place, ballot: tuple[int, bytes, bytes], member: bytes) -> None:
-        """Take note of what a member of the council accepted."""
+        """Record an acceptance of a council member."""
         if member not in self.bids[place][ballot]:
             self._history.note(event.Voted, place, ballot[:2], ballot[2], member)
         self.bids[place][ballot].add(member)
 
     def seated(self, nodes: Iterable[EntangledNode]) -> None:
-        """Write down who lives now, and what it is to the councils; to ask it would make it take its seat."""
+        """Record the living members and their incarnations; a request would make them take their seats."""
         members = [(node.identity.public, node.seat._life or node.store.noted(INCARNATION) or b"") for node in nodes]
         self._history.note(event.Seated, tuple(members))
 
     def takers(self, place: Place) -> set[bytes]:
-        """Everybody for whom a majority of the council ever accepted a take; more than one is a violation."""
+        """Return all takers that a majority of the council ever accepted; more than one is a violation."""
         quorum = len(self.posted[place].council) // 2 + 1
         return {value for (_, _, value), members in self.bids[place].items() if len(members) >= quorum}
 
     def open(self) -> list[Posted]:
-        """The tuples that no majority has given to anybody."""
+        """Return the tuples without a taker accepted by a majority."""
         return [posted for place, posted in self.posted.items() if not self.takers(place)]

@@ -275,14 +275,14 @@ class StageTests(SynchronousTestCase):
         self.folder.write_text("mine")
         for folder in (self.folder, self.folder / "inner"):
             said = str(self.assertRaises(Trouble, fresh, folder))
-            self.assertTrue(said.startswith(f"{folder} cannot be used ("), said)
+            self.assertTrue(said.startswith(f"cannot use {folder} ("), said)
             self.assertIn("choose another --run-dir", said)
 
     def test_foreign_address_is_refused(self) -> None:
         """An address that is none of this machine is refused as such, and its port is not called busy."""
         for wanted in (None, 8080):
             error = self.assertRaises(Trouble, arranged, self.folder, "192.0.2.1", wanted, True, lambda line: None)
-            self.assertRegex(str(error), r"the page cannot be at 192\.0\.2\.1 \(.*\); give --web-host")
+            self.assertRegex(str(error), r"cannot serve the page on 192\.0\.2\.1 \(.*\); set --web-host")
 
 
 class CommandLineTests(SynchronousTestCase):
@@ -292,7 +292,7 @@ class CommandLineTests(SynchronousTestCase):
             (["--nonsense"], "unrecognized arguments: --nonsense"),
             (["--web-port", "99999"], "--web-port: must be 0 to 65535, is '99999'"),
             (["--web-port", "-1"], "--web-port: must be 0 to 65535, is '-1'"),
-            (["--headless", "--report", "/nowhere/x.json"], "--report /nowhere/x.json: there is no such folder; make"),
+            (["--headless", "--report", "/nowhere/x.json"], "--report /nowhere/x.json: no such folder; create"),
         ):
             errors = io.StringIO()
             with contextlib.redirect_stderr(errors):

@@ -139,4 +139,6 @@ class TrialTests(SynchronousTestCase):
                 main(words, PlayedTeam)
             self.assertEqual(caught.exception.code, 2)
             self.assertNotIn("Traceback", errors.getvalue())
-            self.assertIn("must be a whole number from 0 on" if "--count" in words else "cannot be", errors.getvalue())
+            self.assertIn(
+                "must be a whole number from 0 on" if "--count" in words else "cannot create", errors.getvalue()
+            )

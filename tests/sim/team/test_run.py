@@ -129,7 +129,7 @@ class RunTests(SynchronousTestCase):
         """A node that does not get in within the time for it is said to be outside."""
         link = LinkSettings("none", loss=0.9)
         scenario = replace(BASE, link=link, join=replace(JOIN, within=1.0), seconds=0.0)
-        self.assertIn("nodes are not in", Run(scenario, 1, KINDS).go().violations[0])
+        self.assertIn("nodes have not joined", Run(scenario, 1, KINDS).go().violations[0])
 
     def test_exception_is_a_violation(self) -> None:
         """A call that raises, or a failure that a node only logs, ends nothing; the verdict has it."""
