@@ -183,7 +183,7 @@ class LoopTests(SynchronousTestCase):
         for odd in (task, replace(task, task_id="t2", created=1.0, strategy="loudest")):
             node.entangled.put(TASKS, odd.task_id, odd.packed(), "team")
             self.team.clock.advance(1.0)
-            self.assertIn(f"no strategy is called {odd.strategy!r}", self.lines("dog1")[-1])
+            self.assertIn(f"unknown strategy {odd.strategy!r}", self.lines("dog1")[-1])
 
     def test_old_task_that_is_done_is_not_begun_again(self) -> None:
         """A dog that comes after the end of a task does not take it up."""

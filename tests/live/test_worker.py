@@ -89,7 +89,7 @@ class WorkerTests(SynchronousTestCase):
     def loaded(self, guard: Guard) -> Consensus:
         """What it finds as soon as its process has begun."""
         end = time.monotonic() + PATIENCE
-        while "still being loaded" in (found := guard.find(TEAM)).reason and time.monotonic() < end:
+        while "still loading" in (found := guard.find(TEAM)).reason and time.monotonic() < end:
             pass
         self.flushLoggedErrors()
         return found
@@ -116,7 +116,7 @@ class WorkerTests(SynchronousTestCase):
         guard = self.guard("Looping", DEADLINE_S)
         worst = 0.0
         end = time.monotonic() + PATIENCE
-        while "asked no more" not in guard.find(TEAM).reason and time.monotonic() < end:
+        while "not called again" not in guard.find(TEAM).reason and time.monotonic() < end:
             began = time.monotonic()
             self.assertEqual(guard.find(TEAM).assigned_agent, "b")
             worst = max(worst, time.monotonic() - began)
