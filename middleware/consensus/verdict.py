@@ -26,7 +26,7 @@ SLOT = "verdict"
 KEPT = 4
 """Number of epochs of a task that an agent keeps; a new one replaces the slot of the epoch ``KEPT`` before it."""
 MANY, BEST = 30, 8
-"""Of more than ``MANY`` reports only the ``BEST`` are recorded, with the total count; of the silent at most ``BEST``."""
+"""Of more than ``MANY`` reports only the ``BEST`` are recorded, with the total count; ``BEST`` silent names at most."""
 STANDBY = 3
 MAX_VERDICT = 3300
 """Maximum size of a record's value in bytes: three datagrams, and one for a team of ten."""

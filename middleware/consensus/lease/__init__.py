@@ -1,1 +1,1 @@
-"""Task leases: a majority of a task's council grants one lease, with a fencing token that only grows."""
+"""Task leases: a majority of a task's quorum members grants one lease at a time, with increasing fencing tokens."""

@@ -1,4 +1,4 @@
-"""The acceptor of leases on tasks, and the agents that wait for the end of a lease."""
+"""The acceptor of task leases, and the agents that it notifies of the end of a lease."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from middleware.entangled.quorum.register import Kind, Register, Reply
 
 MAX_LISTENERS = 16
 ENDED_AGE, IDLE_AGE = 600.0, 86_400.0
-"""Seconds after which a register may go that was not touched: of a task that has ended, and of any other."""
+"""Seconds after which an unused register may be removed: of a task that has ended, and of any other."""
 
 
 class LeaseAcceptor(Acceptor[str]):
-    """The acceptor of one node, with the votes in its ``store``.
+    """The acceptor of one node, with its votes in ``store``.
 
-    It does not know whether a task exists: a lease on nothing hurts nobody and runs out.
+    It does not check that a task exists: a lease on an unknown task is harmless and expires.
     """
 
     def __init__(self, store: Store, born_at: float) -> None:
@@ -28,7 +28,7 @@ class LeaseAcceptor(Acceptor[str]):
     def prepare(
         self, key: str, configuration: int, ballot: Ballot, ttl: float, now: float, reserve: float = 0.0
     ) -> Reply:
-        """Promise as an acceptor does; an agent that a lease is in the way of is told when that is given back."""
+        """Promise as any acceptor; if a lease prevents the promise, notify the agent when the lease is released."""
         reply = super().prepare(key, configuration, ballot, ttl, now, reserve)
         register = self.log.get(key)
         if reply.remaining > 0.0 and register is not None and register.until > now and not register.is_given_back:
@@ -39,7 +39,7 @@ class LeaseAcceptor(Acceptor[str]):
         return reply
 
     def free(self, key: str, ballot: Ballot, now: float, rest: float = 0.0) -> list[str]:
-        """Give back what was promised or leased under ``ballot`` (``release``), and name the agents to tell."""
+        """Release the promises and leases under ``ballot``; returns the agents to notify."""
         register = self.log.get(key)
         released = self.release(key, ballot, now, rest).kind is Kind.GRANTED
         if not released or register is None or (register.until > now and not register.is_given_back):
@@ -48,7 +48,10 @@ class LeaseAcceptor(Acceptor[str]):
         return [agent for agent, until in listeners.items() if until > now and agent != ballot.proposer]
 
     def freed(self, key: str, agent: str, token: int, now: float, rest: float = 0.0) -> list[str]:
-        """End the lease of that ``agent`` and token: it said so to a stand-by that is a member, too (``free``)."""
+        """Release the lease with this ``agent`` and token, after the holder notified this node as a standby.
+
+        See ``free``.
+        """
         register = self.log.get(key)
         if register is None or (register.holder.proposer, register.token) != (agent, token):
             return []
@@ -56,9 +59,9 @@ class LeaseAcceptor(Acceptor[str]):
 
 
 def may_forget(task_id: str, register: Register, now: float) -> bool:
-    """Whether a register can harm nothing any more: the lease ran out long ago, or the task has ended."""
+    """Return whether a register may be removed safely: its lease expired long ago, or its task has ended."""
     age = ENDED_AGE if register.is_over else IDLE_AGE
-    # C3: while the task is open an old configuration must not rise again.
+    # C3: while the task is open, an old configuration must not become valid again.
     return max(register.until, register.touched_at) + age <= now and (
         register.configuration == FIRST or register.is_over
     )

@@ -1,7 +1,7 @@
-"""Charter: the proof of which nodes are the council of a task; pure.
+"""The signed chain of a task's quorum members (charter); pure.
 
-The first council is signed by the member that publishes the task.  Each later one is certified by a majority of the
-council before it: every member that accepts a change signs it.  So no single node can name a council.
+The node that publishes the task signs the first members.  Each change is certified by a majority of the previous
+members: every member that accepts it signs it.  So no single node can appoint quorum members.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ from middleware.entangled.quorum.ballot import FIRST, NONE, ROOM, Ballot, is_num
 from middleware.entangled.quorum.register import Reply
 
 MAX_LINKS = 64
-"""Changes of one task's council; a change of three members takes 350 bytes, one of seven 700."""
+"""Maximum number of changes for one task; a change of three members takes 350 bytes, one of seven 700."""
 LEAST = 3
-"""Members of a council that was changed, at least: of a smaller one a single member would be a majority."""
+"""Minimum number of members after a change: in a smaller set one member would be a majority."""
 MAX_TOKEN = 2 * ROOM
-"""No council begins above it, whatever one member of the council before says."""
+"""Upper bound of the token of a new configuration, against a false token from one previous member."""
 SIGNATURE_BYTES = 64
 
 Votes = tuple[tuple[int, int, bytes], ...]
-"""Of each member that signed: its place in the council, its highest token, its signature."""
+"""For each member that signed: its index among the members, its highest token, and its signature."""
 
 
 class Link(NamedTuple):
-    """One change: the ``members`` of the next council, and who of the one before accepted them under ``ballot``."""
+    """One change: the new ``members``, and the votes of the previous members under ``ballot``."""
 
     members: tuple[Contact, ...]
     ballot: Ballot
@@ -42,7 +42,7 @@ class Link(NamedTuple):
 
 @dataclass(frozen=True)
 class Charter:
-    """The first council of a task, signed by ``owner``, and the changes of it, the oldest first."""
+    """The first quorum members of a task, signed by ``owner``, and their changes, the oldest first."""
 
     owner: bytes
     first: tuple[Contact, ...]
@@ -51,105 +51,108 @@ class Charter:
 
     @property
     def configuration(self) -> int:
-        """The number of the newest council."""
+        """The number of the newest configuration."""
         return FIRST + len(self.links)
 
     @property
     def members(self) -> tuple[Contact, ...]:
-        """The newest council."""
+        """The members of the newest configuration."""
         return self.links[-1].members if self.links else self.first
 
     @property
     def ballot(self) -> Ballot:
-        """The ballot under which the newest council was chosen."""
+        """The ballot under which the newest members were chosen."""
         return self.links[-1].ballot if self.links else NONE
 
     @property
     def token(self) -> int:
-        """The token above which the newest council goes on."""
+        """The token above which the newest members grant leases."""
         return min(MAX_TOKEN, max((token for link in self.links for _, token, _ in link.votes), default=0))
 
     @property
     def pin(self) -> tuple[bytes, bytes]:
-        """What tells the charters of different first councils apart."""
+        """The key that distinguishes charters with different first members."""
         return self.owner, self.signature
 
     def extended(self, members: tuple[Contact, ...], ballot: Ballot, votes: Votes) -> Charter:
-        """This charter with one more council; raises ``Refused`` where it has changed too often."""
+        """Return this charter with one more change; raises ``Refused`` after ``MAX_LINKS`` changes."""
         if len(self.links) >= MAX_LINKS:
-            raise Refused(f"the council has changed {MAX_LINKS} times; have the operator make the task anew")
+            raise Refused(f"the quorum members have changed {MAX_LINKS} times; have the operator create the task again")
         return replace(self, links=(*self.links, Link(members, ballot, votes)))
 
     def is_genuine(self, task_id: str) -> bool:
-        """Whether every signature holds; whether ``owner`` may publish tasks is another question."""
+        """Return whether all signatures are valid; whether ``owner`` may publish tasks is checked separately."""
         return _is_genuine(self.packed, task_id)
 
     @cached_property
     def packed(self) -> bytes:
-        """The charter as it stands in a message, a record or a note."""
+        """The encoding of the charter in messages, records and the store."""
         links = [[pack_members(link.members), *link.ballot, [list(vote) for vote in link.votes]] for link in self.links]
         return bytes(msgpack.packb([self.owner, pack_members(self.first), self.signature, links]))
 
 
 def pin(identity: Identity, task_id: str, members: tuple[Contact, ...]) -> Charter:
-    """The charter of a new task, whose first council is ``members``."""
-    return Charter(identity.public, members, identity.sign(_pinned(task_id, members)))
+    """Return the charter of a new task with the first ``members``."""
+    return Charter(identity.public, members, identity.sign(_pin_statement(task_id, members)))
 
 
 def sign_change(
     identity: Identity, task_id: str, configuration: int, ballot: Ballot, members: tuple[Contact, ...], token: int
 ) -> bytes:
-    """Certify that ``members`` were accepted as the council after ``configuration``, and the highest token granted."""
-    return identity.sign(_changed(task_id, configuration, ballot, members, token))
+    """Sign the acceptance of ``members`` as the next configuration, and the highest token granted."""
+    return identity.sign(_change_statement(task_id, configuration, ballot, members, token))
 
 
 def sign_end(identity: Identity, task_id: str, configuration: int, agent: str, token: int) -> bytes:
-    """Certify that ``agent`` closed the task under ``token``, which it was granted."""
-    return identity.sign(_ended(task_id, configuration, agent, token))
+    """Sign that ``agent`` closed the task under ``token``, which it was granted."""
+    return identity.sign(_end_statement(task_id, configuration, agent, token))
 
 
 def charter_of(packed: object) -> Charter | None:
-    """The charter that ``packed`` is, or None where it cannot be one; its signatures are not checked.  Never raises."""
+    """Decode a charter without checking its signatures; None if it is malformed.  Never raises."""
     return _charter_of(packed) if isinstance(packed, bytes) and 0 < len(packed) <= MAX_PROOF_BYTES else None
 
 
 def is_change_signed(
     member: Contact, task_id: str, configuration: int, ballot: Ballot, members: tuple[Contact, ...], reply: Reply
 ) -> bool:
-    """Whether ``reply`` has the signature of ``member`` under that change (``sign_change``)."""
-    statement = _changed(task_id, configuration, ballot, members, reply.token)
+    """Return whether ``reply`` has a valid signature of ``member`` for that change (``sign_change``)."""
+    statement = _change_statement(task_id, configuration, ballot, members, reply.token)
     return verified(member.public, statement, reply.proof)
 
 
 def is_end_signed(member: Contact, task_id: str, configuration: int, agent: str, token: int, proof: bytes) -> bool:
-    """Whether ``proof`` is the signature of ``member`` under that end (``sign_end``)."""
-    return verified(member.public, _ended(task_id, configuration, agent, token), proof)
+    """Return whether ``proof`` is a valid signature of ``member`` for that end (``sign_end``)."""
+    return verified(member.public, _end_statement(task_id, configuration, agent, token), proof)
 
 
 @dataclass(frozen=True)
 class Ending:
-    """The proof that a task was ended under a token: a majority of the council of ``charter`` signed it."""
+    """The proof that a task was closed under a token: the signatures of a majority of the members of ``charter``."""
 
     charter: Charter
     signatures: tuple[tuple[int, bytes], ...]
 
     def is_genuine(self, task_id: str, agent: str, token: int) -> bool:
-        """Whether a majority says that ``agent`` ended the task under ``token``."""
+        """Return whether a majority signed that ``agent`` closed the task under ``token``."""
         members = self.charter.members
-        statement = _ended(task_id, self.charter.configuration, agent, token)
+        statement = _end_statement(task_id, self.charter.configuration, agent, token)
         return self.charter.is_genuine(task_id) and _is_majority(
             members, {place: (statement, signature) for place, signature in self.signatures}
         )
 
     @property
     def packed(self) -> bytes:
-        """The proof as it stands in a record; the first council stands in the record of the task already."""
+        """The encoding of the proof in a record.
+
+        A charter without changes is left out, since the task's record has it.
+        """
         charter = self.charter.packed if self.charter.links else b""
         return bytes(msgpack.packb([charter, [list(each) for each in self.signatures]]))
 
 
 def ending_of(packed: object, pinned: Charter) -> Ending | None:
-    """The proof that ``packed`` is for the task that was published with ``pinned``, or None.  Never raises."""
+    """Decode the proof for the task that was published with ``pinned``; None if it is malformed.  Never raises."""
     fields = unpack_note(packed) if isinstance(packed, bytes) and len(packed) <= 2 * MAX_PROOF_BYTES else None
     if not isinstance(fields, list) or len(fields) != 2 or not isinstance(fields[1], list):
         return None
@@ -162,13 +165,13 @@ def ending_of(packed: object, pinned: Charter) -> Ending | None:
 
 
 class Judge:
-    """Reads charters that others sent; ``may_pin`` says whether the holder of a key may publish that task."""
+    """Decodes and checks charters of other nodes; ``may_pin`` returns whether the owner of a key may publish a task."""
 
     def __init__(self, may_pin: Callable[[bytes, str], bool]) -> None:
         self._may_pin = may_pin
 
     def read(self, task_id: str, packed: object) -> Charter | None:
-        """The charter of ``task_id`` that ``packed`` is, or None where anything in it does not hold."""
+        """Return the charter of ``task_id`` in ``packed``, or None if any part of it is invalid."""
         charter = charter_of(packed)
         if charter is None or not self._may_pin(charter.owner, task_id) or not charter.is_genuine(task_id):
             return None
@@ -178,15 +181,15 @@ class Judge:
 # -- inside ---------------------------------------------------------------------------------------------------------
 
 
-@lru_cache(maxsize=64)  # each costs 80 us a signature, and the same one is read again and again
+@lru_cache(maxsize=64)  # a signature takes 80 us to check, and the same charter is read often
 def _is_genuine(packed: bytes, task_id: str) -> bool:
     charter = _charter_of(packed)
-    if charter is None or not verified(charter.owner, _pinned(task_id, charter.first), charter.signature):
+    if charter is None or not verified(charter.owner, _pin_statement(task_id, charter.first), charter.signature):
         return False
     before, configuration = charter.first, FIRST
     for members, ballot, votes in charter.links:
         statements = {
-            place: (_changed(task_id, configuration, ballot, members, token), signature)
+            place: (_change_statement(task_id, configuration, ballot, members, token), signature)
             for place, token, signature in votes
         }
         if len(members) < LEAST or not _is_majority(before, statements):
@@ -196,7 +199,7 @@ def _is_genuine(packed: bytes, task_id: str) -> bool:
 
 
 def _is_majority(members: tuple[Contact, ...], signed: Mapping[int, tuple[bytes, bytes]]) -> bool:
-    """Whether a majority of ``members`` signed, each the statement at its place."""
+    """Return whether a majority of ``members`` signed, each the statement at its index."""
     if len(signed) < majority(len(members)) or any(place >= len(members) for place in signed):
         return False
     return all(verified(members[place].public, *pair) for place, pair in signed.items())
@@ -238,14 +241,16 @@ def _is_bytes(value: object, size: int) -> bool:
     return isinstance(value, bytes) and len(value) == size
 
 
-def _pinned(task_id: str, members: tuple[Contact, ...]) -> bytes:
+def _pin_statement(task_id: str, members: tuple[Contact, ...]) -> bytes:
     return bytes(msgpack.packb([b"swarm-council-1", task_id, FIRST, pack_members(members)]))
 
 
-def _changed(task_id: str, configuration: int, ballot: Ballot, members: tuple[Contact, ...], token: int) -> bytes:
+def _change_statement(
+    task_id: str, configuration: int, ballot: Ballot, members: tuple[Contact, ...], token: int
+) -> bytes:
     fields = [b"swarm-council-change-1", task_id, configuration, *ballot, pack_members(members), token]
     return bytes(msgpack.packb(fields))
 
 
-def _ended(task_id: str, configuration: int, agent: str, token: int) -> bytes:
+def _end_statement(task_id: str, configuration: int, agent: str, token: int) -> bytes:
     return bytes(msgpack.packb([b"swarm-task-end-1", task_id, configuration, agent, token]))

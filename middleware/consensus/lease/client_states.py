@@ -1,7 +1,7 @@
 """The states of a lease client, and its transition table.  Pure.
 
 The client (``lessee``) turns calls, timers and the results of rounds into events, looks up the transition, and performs
-its actions.  A claim runs through PREPARING, PROMISED where the previous lease has not ended, and PROPOSING to HOLDING;
+its actions.  A claim runs through PREPARING, PROMISED if the previous lease has not ended, and PROPOSING to HOLDING;
 a standby alternates between WATCHING and LOOKING until the lease is about to end.
 """
 
@@ -13,44 +13,44 @@ from typing import NamedTuple
 
 
 class State(Enum):
-    """The value says what the client does in the state."""
+    """The states of a lease client; the value describes its activity."""
 
     IDLE = "does not want the lease"
     WATCHING = "waits, and then asks when the lease ends"
     LOOKING = "asks when the lease ends"
     WAITING = "waits, and then claims"
-    PREPARING = "asks the council for promises"
+    PREPARING = "asks the quorum members for promises"
     PROMISED = "has the promises of a majority, and waits for the end of the previous lease"
-    PROPOSING = "asks the council to grant or renew the lease"
-    COMPLETING = "completes a change of the council that another proposer began"
+    PROPOSING = "asks the quorum members to grant or renew the lease"
+    COMPLETING = "completes a change of the quorum members that another proposer began"
     HOLDING = "holds the lease"
     OUTBID = "holds the lease, and needs a new ballot to renew it"
     OVER = "knows that the task has ended"
 
 
 class Event(Enum):
-    """The value says what happened."""
+    """The events of a lease client."""
 
     WANT = "the agent wants the lease"
     STAND_BY = "the agent wants the lease when its holder loses it"
     RANK = "the agent's rank among the standbys changed while the lease is not held"
     SUSPECT = "the holder may have failed"
-    FREED = "the holder gave the lease back"
+    FREED = "the holder released the lease"
     OUTRANK = "the device obeyed a higher token"
-    RELEASE = "the agent gives the lease back or stops to claim it"
-    MOVE = "the agent changes the council"
-    MOVED = "the change of the council has ended"
+    RELEASE = "the agent releases the lease or stops claiming it"
+    MOVE = "the agent changes the quorum members"
+    MOVED = "the change of the quorum members has ended"
     DUE = "the timer fired"
-    DUE_FREED = "the timer fired soon after the lease was given back"
+    DUE_FREED = "the timer fired soon after the lease was released"
     EXPIRED = "the timer fired after the deadline of the own lease"
     NEAR = "the lease ends soon"
     FAR = "the lease ends late, or at an unknown time"
     FREE = "a majority says that the lease is free"
     TAKEN = "no majority says that the lease is free"
-    RECONFIGURED = "a member named a newer council"
+    RECONFIGURED = "a member reported a newer configuration"
     PROMISES = "a majority promised, and the lease is free"
     EARLY_PROMISES = "a majority promised before the end of the previous lease"
-    UNFINISHED = "a majority promised, and a member accepted a change of the council before"
+    UNFINISHED = "a majority promised, and a member has accepted a change of the quorum members"
     COMPLETED = "that change is complete"
     GRANTS = "a majority granted the lease, and no member needs another ballot"
     PARTIAL_GRANTS = "a majority granted the lease, and some member needs another ballot"
@@ -61,23 +61,23 @@ class Event(Enum):
 
 
 class Action(Enum):
-    """The value says what the client does at the transition."""
+    """The actions at a transition."""
 
     CANCEL = "drop the round and the timer"
     LOOK = "ask when the lease ends"
     PREPARE = "ask for promises under a new ballot"
     PROPOSE = "ask for the lease under the promised ballot"
     RENEW = "ask for the lease again under the ballot that it was granted under"
-    COMPLETE = "complete the change of the council"
+    COMPLETE = "complete the change of the quorum members"
     LEAP = "choose the next ballot above those of other standbys"
     LOSE = "forget the own lease, and notify the listener"
-    DROP = "give back what a minority granted, and lose the own lease"
+    DROP = "release a lease that only a minority granted, and lose the own lease"
     NOTIFY = "notify the listener of the own lease"
     LINE_UP = "estimate the end of the lease: NEAR or FAR follows"
     AFTER_RANK = "set the timer for the first look, later for higher ranks"
     AFTER_POLL = "set the timer for the next look"
     AFTER_WAIT = "set the timer for the claim at the end of the lease"
-    AFTER_TURN = "set the timer for the claim of a lease that was given back"
+    AFTER_TURN = "set the timer for the claim of a released lease"
     AFTER_PREVIOUS = "set the timer for the end of the previous lease"
     AFTER_RENEWAL = "set the timer for the renewal"
     AFTER_RETRY = "set the timer for another try before the deadline"
@@ -184,12 +184,12 @@ TABLE: Mapping[State, Mapping[Event, Step]] = {
     },
     S.OVER: {E.RELEASE: Step(S.OVER, (A.CANCEL,))},
 }
-"""The transitions.  A pair that stands neither here nor in ``IMPOSSIBLE`` changes nothing."""
+"""The transitions.  A pair that is neither here nor in ``IMPOSSIBLE`` changes nothing."""
 
 TIMED = (S.WATCHING, S.WAITING, S.PROMISED, S.HOLDING, S.OUTBID)
-"""States in which a timer runs, but for the time between MOVE and MOVED."""
+"""States in which a timer runs, except between MOVE and MOVED."""
 ASKING = (S.LOOKING, S.PREPARING, S.PROPOSING)
-"""States with a round under way."""
+"""States in which a round is under way."""
 ACTIVE = tuple(state for state in State if state not in (S.IDLE, S.OVER))
 """States in which the agent wants the lease."""
 _OF_TIMERS = (E.DUE, E.DUE_FREED, E.EXPIRED)
@@ -209,7 +209,7 @@ IMPOSSIBLE: frozenset[tuple[State, Event]] = frozenset(
         *((state, E.DUE_FREED) for state in (S.HOLDING, S.OUTBID)),
     ]
 )
-"""Pairs that the client never meets: the result of a round in another state, and the like."""
+"""Pairs that cannot occur: for example the result of a round in another state."""
 
 
 def next_step(state: State, event: Event) -> Step:

@@ -1,8 +1,8 @@
-"""Council: the nodes whose majority says who may act on a task, as a claimant knows them; pinned, never "the closest".
+"""The quorum members of a task, as a client of theirs sees them: they are fixed, not the nodes closest to a key.
 
-Which nodes these are stands in the task's record with a number, its configuration.  A change is decided by a majority
-of the old council and by nobody else, never while a claim is open (consensus rules 1 and 2).  The signatures of that
-majority are kept in the ``charter``; what a single member says of another council is not believed.
+The task's record has the members and the number of their configuration.  Only a majority of the current members can
+change them, and never while a claim is open (consensus rules 1 and 2).  The signatures of that majority are in the
+``charter``; the statement of a single member is not trusted.
 """
 
 from __future__ import annotations
@@ -24,32 +24,32 @@ from middleware.entangled.quorum.register import Kind, Reply
 from middleware.entangled.quorum.round import PAUSE, Round, Tally
 
 Ask = Callable[[Contact, str, tuple[Any, ...]], Deferred[Any]]
-"""Ask a council member: (member, method, arguments)."""
+"""Sends a request to a member: (member, method, arguments)."""
 IsGenuine = Callable[[int, Reply], bool]
 Read = Callable[[str, object], Charter | None]
-"""Makes a charter of what a member sent, where it holds: (task id, packed)."""
+"""Decodes and checks a charter from a member: (task id, packed); None if it is invalid."""
 LEAP = 16
-"""More ballots than a holder needs until a stand-by looks."""
+"""Number of ballots to skip; more than a holder needs between two polls of a standby."""
 
 
 class OpenClaim(Refused):
-    """The council cannot change: an agent holds a lease of it."""
+    """The quorum members cannot change while an agent holds a lease."""
 
 
 class Superseded(Refused):
-    """Another council was chosen than the one that was asked for; the present one is known now."""
+    """A concurrent change or claim won; this object now knows the current members or token."""
 
 
 class NoMajority(Refused):
-    """Too few members of the council answered, or another proposer was faster; try again."""
+    """Too few members agreed: they did not answer, or another proposer was faster.  Try again."""
 
 
 class Council:
-    """The council of one task, in the name of ``agent``.
+    """The quorum members of one task, as used by ``agent``.
 
-    ``moved`` is called when it has become another one, so that the task's record can say so.  ``token`` is the highest
-    that was ever seen: whatever is claimed next lies above it.  ``charter`` proves which council it is, ``read`` makes
-    one of what a member sent, and ``ending`` is the proof that the task was closed under a token.
+    ``moved`` is called after a change of the members, so that the task's record can be updated.  ``token`` is the
+    highest token seen; new claims are above it.  ``charter`` proves the members, ``read`` checks charters from members,
+    and ``ending`` is the proof that the task was closed under a token.
     """
 
     def __init__(
@@ -85,12 +85,12 @@ class Council:
         self._silent_since: dict[bytes, float] = {}
 
     def next_ballot(self) -> Ballot:
-        """A ballot above all that were seen."""
+        """Return a ballot above all ballots seen."""
         self._rounds += 1
         return Ballot(self._rounds * LIFE + self._life, self.agent)
 
     def leap(self) -> None:
-        """Have the next ballot be above those of which nobody has told here; there are more than enough."""
+        """Skip ballots, so that the next one is above the ballots of other standbys."""
         self._rounds += LEAP
 
     def round(
@@ -102,9 +102,9 @@ class Council:
         is_genuine: IsGenuine = lambda place, reply: True,
         others: tuple[Contact, ...] = (),
     ) -> Round:
-        """Ask every member, or ``others``; tell ``hear`` what came of it.
+        """Send a request to all members, or to ``others``; pass the finished round to ``hear``.
 
-        ``short`` is the wait for another's lease that is one.
+        ``short`` is the longest remaining lease of another agent, in seconds, that the round waits for.
         """
         members = others or self.members
         question = (self.task_id, *arguments) if others else (self.task_id, self.configuration, *arguments)
@@ -124,27 +124,27 @@ class Council:
         return asked
 
     def visit(self) -> None:
-        """Ask the members for nothing but whether they are there; ``silent`` knows it later."""
+        """Probe the members without a claim; see ``silent``."""
         self.round("lease.prepare", 0, self.ttl)
 
     def silent(self, seconds: float) -> tuple[Contact, ...]:
-        """The members that have answered nothing for so long, in spite of questions."""
+        """Return the members that have not answered any request for at least this time."""
         self._note_silence()
         latest = self._clock.seconds() - seconds
         return tuple(m for m in self.members if self._silent_since.get(m.node_id, math.inf) <= latest)
 
     def learn(self, packed: bytes) -> None:
-        """A record of the task has the charter of a council; what is older, or does not hold, changes nothing."""
+        """Process the charter in a task's record; older and invalid ones are ignored."""
         charter = self._read(self.task_id, packed)
         if charter is not None:
             self._adopt(charter, is_news=False)
 
     def note_token(self, token: int) -> None:
-        """Some node says that ``token`` was granted; it may have invented it."""
+        """Raise ``token`` to a token reported by one node, within the limit of a plausible value."""
         self.token = max(self.token, believed([token], len(self.members)))
 
     def hear(self, round_: Round) -> None:
-        """Learn from answers which numbers are taken, and whether the council is another one now."""
+        """Learn the taken ballots and tokens from the replies of a round, and a newer configuration."""
         replies, size = round_.tally.replies.values(), len(self.members)
         self._rounds = max(self._rounds, believed((reply.promised.counter // LIFE for reply in replies), size))
         self.token = max(self.token, believed((reply.token for reply in replies), size))
@@ -155,49 +155,49 @@ class Council:
         if newest is not None and newest.configuration > self.configuration:
             self._adopt(newest)
             return
-        # Who was away when this council was chosen is told by whoever meets it.
+        # Members that missed the change to the current configuration are informed here.
         for place, reply in round_.tally.replies.items():
             if reply.kind is Kind.BEHIND and reply.configuration < self.configuration:
                 self._install(self.members[place])
 
     def let_go(self, ballot: Ballot, heirs: Sequence[Contact] = (), rest: float = 0.0) -> Deferred[Any]:
-        """Give back whatever was promised or granted under ``ballot``, and tell ``heirs``.
+        """Release all promises and grants under ``ballot``, and notify the standbys ``heirs``.
 
-        The robot moves for at most ``rest`` seconds from now on.  Fires when every member has been told, or does not
-        answer.
+        ``rest`` is the longest time in seconds for which the robot may still move.  Fires when every member has
+        answered or timed out.
         """
         told = [self._ask(member, "lease.release", (self.task_id, ballot.counter, rest)) for member in self.members]
         told += [self._ask(heir, "lease.freed", (self.task_id, self.token, rest)) for heir in heirs]
         return DeferredList(told, consumeErrors=True)
 
     def close(self, token: int = 0) -> Deferred[None]:
-        """Have no more leases granted on the task, which has ended; fires when nobody can act on it any more.
+        """Close the task, so that no more leases are granted; fires when no agent can act on it any longer.
 
-        ``token`` is that of the lease under which it was done (the device stands still by now), 0 the word of a node
-        that may order.  Fails with ``NoMajority``, or with ``Superseded`` where a higher token was granted.
+        ``token`` is the token of the lease under which the task was done (the device has stopped), or 0 for a node that
+        may cancel tasks.  Fails with ``NoMajority``, or with ``Superseded`` if a higher token was granted.
         """
         return Deferred.fromCoroutine(self._close(token))
 
     def change(self, members: Sequence[Contact], keep: bool = False) -> Deferred[None]:
-        """Have ``members`` be the council from now on; fires when a majority of them knows.
+        """Change the quorum members to ``members``; fires when a majority of the new members knows.
 
-        With ``keep`` the own lease is given back with this (``Lessee.move``), and for a ttl granted to nobody else.
-        Fails with ``OpenClaim`` while somebody holds a lease, ``NoMajority`` where the old council cannot decide, and
-        ``Superseded`` where another change was under way, which is then completed instead.
+        With ``keep`` the own lease is released by the change (``Lessee.move``) and reserved for this agent for one TTL.
+        Fails with ``OpenClaim`` while an agent holds a lease, ``NoMajority`` if too few old members agree, and
+        ``Superseded`` if another change was under way, which is then completed instead.
         """
         wanted = tuple(members)
         if not 0 < len(wanted) <= MAX_COUNCIL:
-            raise ValueError(f"a council has 1 to {MAX_COUNCIL} members, not {len(wanted)}")
+            raise ValueError(f"a task has 1 to {MAX_COUNCIL} quorum members, not {len(wanted)}")
         return Deferred.fromCoroutine(self._change(wanted, keep))
 
     async def finish(self, ballot: Ballot, prepared: Round, keep: bool = True) -> None:
-        """Complete a change that a member has accepted: it may be decided already, so no other may follow."""
+        """Complete a change that a member has accepted: it may be decided already, so no other may replace it."""
         await self._decide(ballot, prepared.tally.to_complete, keep)
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
     def _note_silence(self) -> None:
-        """Who did not answer the last round, though it was asked often enough; who did is there."""
+        """Record the members that did and did not answer the last round."""
         if self._last is not None:
             asked, members = self._last
             for place in asked.answered:
@@ -218,23 +218,23 @@ class Council:
 
             done = await self.round(*question, kinds=ended, is_genuine=is_genuine).outcome
             self.hear(done)
-            over_at = max(over_at, self._over_at(done))
+            over_at = max(over_at, self._leases_end_at(done))
             if self.configuration != configuration:
                 done.close()
-                continue  # there is another council by now
+                continue  # the configuration has changed meanwhile
             sealed = [reply for reply in done.tally.replies.values() if reply.kind is Kind.SEALED]
             if done.tally.is_won and sealed and len(done.tally.agreed) - len(sealed) < majority(len(self.members)):
-                # A change was accepted by some: it may be decided, so the council to come has to know as well.
+                # Some members accepted a change, which may be decided, so the new members must agree as well.
                 if token:
-                    raise NoMajority("the end of the task is not recorded: its council is changing; try again")
+                    raise NoMajority("the end of the task is not recorded: its quorum members are changing; try again")
                 others = done.tally.to_complete
                 done = await self.round("lease.cancel", configuration + 1, kinds=ended, others=others).outcome
-                over_at = max(over_at, self._over_at(done))
+                over_at = max(over_at, self._leases_end_at(done))
             if not done.tally.is_won:
                 done.close()
                 if any(reply.kind is Kind.OUTBID for reply in done.tally.replies.values()):
                     raise Superseded("the end of the task is not recorded: a higher token was granted")
-                _raise(done, "the end of the task is not recorded")
+                _raise_rejection(done, "the end of the task is not recorded")
             break
         if token and self.charter is not None:
             votes = [
@@ -247,8 +247,8 @@ class Council:
             self._clock.callLater(rest, waited.callback, None)
             await waited
 
-    def _over_at(self, done: Round) -> float:
-        """When a lease ends that may be in force: a member that granted it is among any majority that closed."""
+    def _leases_end_at(self, done: Round) -> float:
+        """Return the end of any lease that may be valid: every majority has a member that granted it."""
         return self._clock.seconds() + max(
             (done.tally.replies[place].remaining for place in done.tally.agreed), default=0.0
         )
@@ -261,28 +261,32 @@ class Council:
         prepared.close()
         self.hear(prepared)
         if self.configuration != before:
-            raise Superseded(f"the council is at configuration {self.configuration} already; look at it again")
+            raise Superseded(
+                f"the quorum members are already at configuration {self.configuration}; check them and try again"
+            )
         if not prepared.tally.is_won:
-            _raise(prepared, "the council stays as it is")
+            _raise_rejection(prepared, "the quorum members are unchanged")
         if prepared.tally.to_complete is not None:
             await self.finish(ballot, prepared, keep)
         else:
             await self._decide(ballot, wanted, keep)
         if self.configuration == before + 1 and set(self.members) != set(wanted):
-            raise Superseded("another change of the council was under way and is complete now; look at it again")
+            raise Superseded("another change of the quorum members was under way and is now complete; try again")
 
     async def _decide(self, ballot: Ballot, members: tuple[Contact, ...], keep: bool) -> None:
-        """Let a majority of the old council accept ``members``, then tell these; a majority of them must know."""
-        # The council of this object may become another one while answers are awaited; this decision is of this one.
+        """Have a majority of the old members accept ``members``, and a majority of the new ones install the charter."""
+        # The attributes may change while this coroutine waits; this decision is about the present configuration.
         old, before = self.members, self.charter
         if before is None or before.configuration != self.configuration:
-            raise Refused("the council of this task was not signed when it was published; make the task anew")
-        accepted = await self._decision(ballot, members, keep)
+            raise Refused(
+                "the quorum members of this task were not signed when it was published; create the task again"
+            )
+        accepted = await self._accept_change(ballot, members, keep)
         accepted.close()
         if not accepted.tally.is_won:
             self.hear(accepted)
-            self.let_go(ballot, rest=self.ttl)  # a lease that this agent holds goes on
-            _raise(accepted, "the council stays as it is")
+            self.let_go(ballot, rest=self.ttl)  # a lease that this agent holds continues
+            _raise_rejection(accepted, "the quorum members are unchanged")
         votes = [
             (place, accepted.tally.replies[place]) for place in sorted(accepted.tally.agreed)[: majority(len(old))]
         ]
@@ -290,15 +294,18 @@ class Council:
         question, kinds = (charter.packed, keep, self.ttl), (Kind.GRANTED, Kind.MOVED)
         installed = await self.round("lease.install", *question, kinds=kinds, others=members).outcome
         if not installed.tally.is_won:
-            raise NoMajority("the new council is chosen, but too few of its members know; ask for the change again")
+            raise NoMajority("the new quorum members are chosen, but too few of them are informed; repeat the change")
         self._adopt(charter)
         for member in old:
-            # So that who leaves can tell where the council is now.
+            # Inform the departing members, so that they can redirect clients.
             if member not in members:
                 self._install(member, charter)
 
-    async def _decision(self, ballot: Ballot, members: tuple[Contact, ...], keep: bool) -> Round:
-        """A majority of the *old* council decides: so no lease of it can be open, nor another change be chosen."""
+    async def _accept_change(self, ballot: Ballot, members: tuple[Contact, ...], keep: bool) -> Round:
+        """Have a majority of the old members accept the change.
+
+        Then no lease of theirs is open, and no other change wins.
+        """
         old, configuration = self.members, self.configuration
 
         def is_genuine(place: int, reply: Reply) -> bool:
@@ -309,7 +316,7 @@ class Council:
         return await self.round("lease.change", *question, is_genuine=is_genuine).outcome
 
     def _install(self, member: Contact, charter: Charter | None = None) -> None:
-        """Tell ``member`` of the present council, which was chosen by the one before."""
+        """Inform ``member`` of the current configuration."""
         charter = charter or self.charter
         if charter is not None and charter.links:
             news = (self.task_id, charter.packed, False, self.ttl)
@@ -322,14 +329,14 @@ class Council:
                 self.moved()
 
 
-def _raise(round_: Round, what: str) -> None:
-    """Say by name why a majority did not agree."""
+def _raise_rejection(round_: Round, what: str) -> None:
+    """Raise the error that explains why there was no majority."""
     replies: list[Reply] = list(round_.tally.replies.values())
     held = [reply.remaining for reply in replies if reply.kind is Kind.HELD]
     if held:
-        raise OpenClaim(f"{what}: a claim is open and runs out in {max(held):.2f} s unless it is renewed")
+        raise OpenClaim(f"{what}: an agent holds a lease, which expires in {max(held):.2f} s unless it is renewed")
     if any(reply.kind is Kind.OUTBID for reply in replies):
         raise NoMajority(f"{what}: another claimant was faster; try again")
     if any(reply.kind is Kind.OVER for reply in replies) and Kind.OVER not in round_.tally.kinds:
         raise Refused(f"{what}: the task has ended")
-    raise NoMajority(f"{what}: {len(replies)} members answered, too few of them with yes; try again")
+    raise NoMajority(f"{what}: {len(replies)} members answered, and too few of them agreed; try again")

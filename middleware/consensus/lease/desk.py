@@ -1,7 +1,7 @@
-"""Desk: where peers reach this node's acceptor; it checks what they send; answers wait until they are kept.
+"""The network interface of this node's lease acceptor: checks requests, and replies after the state is durable.
 
-Which role may call which method is decided before (``middleware.admission.roles``): only nodes that may order tasks
-reach ``lease.cancel``.
+The roles of callers are checked before (``middleware.admission.roles``): only nodes that may order tasks reach
+``lease.cancel``.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ Answer = list[object] | Deferred[list[object]]
 
 
 class Desk:
-    """The acceptor of one node, and the lessees that wait for news from others' acceptors.
+    """The acceptor of one node, and its lease clients that wait for notifications of other acceptors.
 
-    It may be made when the first peer asks: ``born_at`` is when the node began, for silence counts from then.
-    ``judge`` reads the charters of councils; ``may_sit`` says whether the holder of a key may be a member of one.
+    It may be created at the first request: ``born_at`` is the time at which the node started, for its initial quiet
+    period.  ``judge`` reads charters; ``may_sit`` returns whether the owner of a key may be a quorum member.
     """
 
     def __init__(
@@ -76,28 +76,30 @@ class Desk:
         }
 
     def answer(self, method: str, peer: Contact, arguments: tuple[Any, ...]) -> object:
-        """What a peer is told; raises ``Refused`` where its arguments do not fit."""
+        """Handle a peer's request; raises ``Refused`` for invalid arguments."""
         return self._methods[method].run(peer, arguments)
 
     def enter(self, lessee: Lessee) -> None:
-        """Let ``lessee`` hear when the lease of its task is given back."""
+        """Register ``lessee`` for notifications that its lease was released."""
         self._lessees[lessee.task_id] = lessee
 
     def ask(
         self, own: Contact, member: Contact, method: str, arguments: tuple[Any, ...], patience: float
     ) -> Deferred[Any]:
-        """Ask a member, which may be this node itself."""
+        """Send a request to a member, which may be this node itself."""
         if member.node_id == own.node_id:
             return maybeDeferred(self.answer, method, own, arguments)
         return self._endpoint.ask(member, method, *arguments, changes=True, timeout=patience)
 
-    # -- what peers ask ---------------------------------------------------------------------------------------------
+    # -- requests of peers ------------------------------------------------------------------------------------------
 
     def _prepare(self, peer: Contact, task_id: str, configuration: int, counter: int, ttl: float) -> Answer:
         _check(task_id, configuration, counter + 1, ttl=ttl)
-        agent = self._known(peer)
+        agent = self._remember(peer)
         ballot = Ballot(counter, agent)
-        return self._kept(self._acceptor.prepare(task_id, configuration, ballot, float(ttl), self._clock.seconds()))
+        return self._after_write(
+            self._acceptor.prepare(task_id, configuration, ballot, float(ttl), self._clock.seconds())
+        )
 
     def _propose(self, peer: Contact, task_id: str, configuration: int, counter: int, token: int, ttl: float) -> Answer:
         _check(task_id, configuration, counter, token, ttl=ttl)
@@ -106,12 +108,12 @@ class Desk:
         def proposed() -> Reply:
             return self._acceptor.lease(task_id, configuration, ballot, token, ttl, self._clock.seconds())
 
-        return in_time(proposed, self._clock).addCallback(self._kept)
+        return in_time(proposed, self._clock).addCallback(self._after_write)
 
     def _release(self, peer: Contact, task_id: str, counter: int, rest: float) -> None:
         _check(task_id, counter, rest=rest)
         ballot = Ballot(counter, peer.node_id.hex())
-        self._tell(self._acceptor.free(task_id, ballot, self._clock.seconds(), float(rest)), task_id, rest)
+        self._notify(self._acceptor.free(task_id, ballot, self._clock.seconds(), float(rest)), task_id, rest)
 
     def _close(self, peer: Contact, task_id: str, configuration: int, token: int) -> Answer:
         _check(task_id, configuration, token)
@@ -119,11 +121,11 @@ class Desk:
         reply = self._acceptor.close(task_id, agent, configuration, token, now)
         if reply.kind in (Kind.OVER, Kind.SEALED):
             reply = reply._replace(proof=sign_end(self._identity, task_id, configuration, agent, token))
-        return self._kept(reply)
+        return self._after_write(reply)
 
     def _cancel(self, peer: Contact, task_id: str, configuration: int) -> Answer:
         _check(task_id, configuration)
-        return self._kept(self._acceptor.close(task_id, "", configuration, 0, self._clock.seconds()))
+        return self._after_write(self._acceptor.close(task_id, "", configuration, 0, self._clock.seconds()))
 
     def _change(
         self,
@@ -138,19 +140,21 @@ class Desk:
         _check(task_id, configuration, counter, token + 1)
         members = members_of(packed)
         if members is None or len(members) < LEAST or not all(self._may_sit(member.public) for member in members):
-            raise Refused(f"the next council has {LEAST} to {MAX_COUNCIL} members of the team that are no viewers")
+            raise Refused(
+                f"new quorum members must be {LEAST} to {MAX_COUNCIL} members of the team that are not viewers"
+            )
         ballot, now = Ballot(counter, peer.node_id.hex()), self._clock.seconds()
         reply = self._acceptor.accept(task_id, configuration, ballot, members, now, token, keep)
         if reply.kind is Kind.GRANTED:
             signature = sign_change(self._identity, task_id, configuration, ballot, members, reply.token)
             reply = reply._replace(proof=signature)
-        return self._kept(reply)
+        return self._after_write(reply)
 
     def _install(self, peer: Contact, task_id: str, packed: bytes, keep: bool, ttl: float) -> Answer:
         _check(task_id, ttl=ttl)
         charter = self._judge.read(task_id, packed)
         if charter is None or not charter.links:
-            raise Refused("a council is installed with the signatures of a majority of the one before it")
+            raise Refused("new quorum members need the signatures of a majority of the previous ones")
         mine = keep and charter.ballot.proposer == peer.node_id.hex()
         reply = self._acceptor.install(
             task_id,
@@ -162,27 +166,27 @@ class Desk:
             float(ttl),
             packed,
         )
-        return self._kept(reply)
+        return self._after_write(reply)
 
     def _freed(self, peer: Contact, task_id: str, token: int, rest: float) -> None:
         _check(task_id, token + 1, rest=rest)
         agent, now = peer.node_id.hex(), self._clock.seconds()
-        self._tell(self._acceptor.freed(task_id, agent, token, now, float(rest)), task_id, rest)
+        self._notify(self._acceptor.freed(task_id, agent, token, now, float(rest)), task_id, rest)
         lessee = self._lessees.get(task_id)
         if lessee is not None:
             lessee.freed(token, float(rest))
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
-    def _tell(self, agents: list[str], task_id: str, rest: float) -> None:
-        """Tell those that asked for it that a lease was given back."""
+    def _notify(self, agents: list[str], task_id: str, rest: float) -> None:
+        """Notify waiting agents that a lease was released."""
         for agent in agents:
             contact = self._contacts.get(agent)
             if contact is not None:
                 self._endpoint.tell(contact, "lease.freed", task_id, 0, rest)
 
-    def _known(self, peer: Contact) -> str:
-        """The id of an agent, to which its address is remembered for a push."""
+    def _remember(self, peer: Contact) -> str:
+        """Remember an agent's contact for notifications, and return its id."""
         agent = peer.node_id.hex()
         self._contacts.pop(agent, None)
         if len(self._contacts) >= 256:
@@ -190,8 +194,8 @@ class Desk:
         self._contacts[agent] = peer
         return agent
 
-    def _kept(self, reply: Reply) -> Answer:
-        """The answer, once everything that it promises survives the end of the process."""
+    def _after_write(self, reply: Reply) -> Answer:
+        """Return the reply after all that it promises is durable."""
         packed = pack_reply(reply)
         written = self._store.written()
         return packed if written.called and written.result is None else written.addCallback(lambda _: packed)
@@ -199,23 +203,25 @@ class Desk:
 
 def _check(task_id: str, *numbers: int, ttl: float = 1.0, rest: float = 0.0) -> None:
     if len(task_id) > MAX_NAME or not all(0 < number < MAX_NUMBER for number in numbers):
-        raise Refused("a lease is asked for with a task id and positive numbers below 2^62")
+        raise Refused(
+            f"a lease request needs a task id of at most {MAX_NAME} characters and positive numbers below 2^62"
+        )
     if not 0.0 < ttl <= MAX_TTL:
-        raise Refused(f"a lease lasts more than 0 and at most {MAX_TTL:g} seconds")
+        raise Refused(f"the TTL of a lease must be more than 0 and at most {MAX_TTL:g} seconds")
     if not 0.0 <= rest <= MAX_TTL:
-        raise Refused(f"a robot comes to rest within 0 to {MAX_TTL:g} seconds")
+        raise Refused(f"the time in which a robot stops must be 0 to {MAX_TTL:g} seconds")
 
 
 MOST_WAIT_S = 0.15
-"""Seconds for which an answer is put off."""
+"""Maximum seconds for which a reply is delayed."""
 MIN_WAIT_S = 0.001
-"""Seconds that pass at least until a proposal is looked at again."""
+"""Minimum seconds between two attempts of a delayed proposal."""
 
 
 def in_time(propose: Callable[[], Reply], clock: IReactorTime) -> Deferred[Reply]:
-    """What ``propose`` brings: now, or in a moment where only the end of another's lease is missing.
+    """Return the reply to a proposal, delayed if only the imminent end of another lease prevents a grant.
 
-    So neither a round trip nor a guess at its length lies between the end of one lease and the next.
+    This saves a round trip, and a guess at its duration, between the end of one lease and the start of the next.
     """
     return Deferred.fromCoroutine(_in_time(propose, clock))
 

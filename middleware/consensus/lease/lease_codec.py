@@ -1,6 +1,6 @@
-"""How leases stand in messages (``lease.*``) and in notes of the store; every decoder is total.
+"""The encoding of leases in messages (``lease.*``) and in the store; every decoder accepts any input.
 
-Durations travel, never moments (PaxosLease, arXiv 1209.4187).
+Durations are sent, never times (PaxosLease, arXiv 1209.4187).
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ MAX_COUNCIL = 7
 MAX_PROOF_BYTES = 2**16
 _BUCKETS = 64
 LIFE = 2**20
-"""The lowest digits of a counter are drawn anew in each life of an agent."""
+"""Number of ballots per round; the low digits of a counter are random in each run of an agent."""
 AHEAD = 0.2
-"""Share of a ttl before the end of a lease from which on its successor is promised."""
+"""Share of the TTL before the end of a lease from which members promise the next one."""
 
 
 def pack_reply(reply: Reply) -> list[object]:
-    """The reply as it stands in a message; most have no proof."""
+    """Encode a reply for a message; the proof is left out if it is empty."""
     is_sealed = reply.kind is Kind.SEALED
     ballot, members = (reply.accepted, reply.value) if is_sealed else (reply.promised, ())
     proof = [reply.proof] if reply.proof else []
@@ -32,22 +32,22 @@ def pack_reply(reply: Reply) -> list[object]:
 
 
 def unpack_reply(answer: object) -> Reply | None:
-    """The reply that ``pack_reply`` made, or None where the answer cannot be one; never raises."""
+    """Decode a reply of ``pack_reply``; None if it is malformed.  Never raises."""
     if not isinstance(answer, list) or not 7 <= len(answer) <= 8:
         return None
     name, counter, agent, token, remaining, configuration, packed = answer[:7]
     proof = answer[7] if len(answer) > 7 else b""
     kind = next((kind for kind in Kind if kind.value == name), None)
     members = members_of(packed)
-    lawful = (
+    is_valid = (
         all(map(is_number, (counter, token, configuration)))
         and isinstance(agent, str)
         and isinstance(remaining, float)
         and isinstance(proof, bytes)
     )
-    if not lawful or kind is None or members is None:
+    if not is_valid or kind is None or members is None:
         return None
-    # What cannot be a duration counts as none.
+    # An invalid duration counts as none.
     remaining = remaining if remaining > 0.0 else 0.0
     ballot = Ballot(counter, agent)
     accepted, value = (ballot, members) if kind is Kind.SEALED else (NONE, None)
@@ -55,12 +55,12 @@ def unpack_reply(answer: object) -> Reply | None:
 
 
 def pack_members(members: tuple[Contact, ...]) -> list[list[object]]:
-    """The members of a council as they stand in a message."""
+    """Encode the quorum members for a message."""
     return [member.packed() for member in members]
 
 
 def members_of(packed: object) -> tuple[Contact, ...] | None:
-    """The members that ``pack_members`` packed, or None where these cannot be some."""
+    """Decode the members of ``pack_members``; None if they are malformed."""
     if not isinstance(packed, list) or len(packed) > MAX_COUNCIL:
         return None
     members = tuple(contact for fields in packed if (contact := unpacked(fields)) is not None)
@@ -91,25 +91,25 @@ def _pack_floor(floor: Floor) -> bytes:
 def _unpack_floor(noted: bytes | None) -> Floor | None:
     state = unpack_note(noted or b"")
     if isinstance(state, list) and len(state) == 2:
-        state = [*state, state[0]]  # of a version that had one floor for both
+        state = [*state, state[0]]  # written by an earlier version with one floor for both
     if not isinstance(state, list) or len(state) != 3:
         return None
     counter, longest, token = state
-    is_lawful = isinstance(longest, float) and is_number(counter) and is_number(token)
-    return Floor(counter, token, longest) if is_lawful else None
+    is_valid = isinstance(longest, float) and is_number(counter) and is_number(token)
+    return Floor(counter, token, longest) if is_valid else None
 
 
 def unpack_row(row: object) -> Register | None:
-    """The register of one task as it stands in a note, or None where the row cannot be one; never raises."""
+    """Decode the register of one task from the store; None if the row is malformed.  Never raises."""
     if not isinstance(row, list) or not 6 <= len(row) <= 8:
         return None
     configuration, ballots, token, ttl, packed, is_over = row[:6]
-    proof = row[6] if len(row) > 6 else b""  # the version before kept none
+    proof = row[6] if len(row) > 6 else b""  # earlier versions stored no proof
     if not isinstance(ballots, list) or len(ballots) != 8:
         return None
-    grantee = row[7] if len(row) > 7 else ballots[3]  # the versions before knew that of a lease not given back
+    grantee = row[7] if len(row) > 7 else ballots[3]  # earlier versions stored only the holder of an unreleased lease
     members = members_of(packed)
-    lawful = (
+    is_valid = (
         all(map(is_number, (configuration, token, *ballots[::2])))
         and all(isinstance(agent, str) for agent in (*ballots[1::2], grantee))
         and isinstance(ttl, float)
@@ -117,7 +117,7 @@ def unpack_row(row: object) -> Register | None:
         and isinstance(proof, bytes)
         and len(proof) <= MAX_PROOF_BYTES
     )
-    if not lawful or members is None:
+    if not is_valid or members is None:
         return None
     promised, holder, spent, accepted = (Ballot(ballots[n], ballots[n + 1]) for n in range(0, 8, 2))
     return Register(
@@ -127,10 +127,10 @@ def unpack_row(row: object) -> Register | None:
 
 
 def unpack_note(noted: bytes) -> object:
-    """What msgpack makes of bytes, or None."""
+    """Decode msgpack, or return None."""
     try:
         return msgpack.unpackb(noted, strict_map_key=True, max_ext_len=0)
-    except Exception:  # the decoder raises many kinds on rotten or crafted bytes
+    except Exception:  # the decoder raises many kinds of exceptions on corrupt or malicious bytes
         return None
 
 

@@ -1,11 +1,12 @@
-"""The lease client of one agent for one task: it claims the lease, renews it, gives it back, and stands by for it.
+"""The lease client of one agent for one task: it claims, renews and releases the lease, and waits for it as a standby.
 
 A claim has two phases: a majority promises and reports the highest token, then a majority grants.  A renewal needs the
-second phase only.  The deadline counts from the time at which the granted request was *sent*, less a margin for clock
-drift and the time that the robot needs to stop, so it ends before any member grants another lease (consensus rule 5).
+second phase only.  The deadline is computed from the time at which the granted request was *sent*, minus a margin for
+clock drift and the time that the robot needs to stop, so it is before any member grants another lease (consensus rule
+5).
 
-The states and transitions of the client are in ``client_states``; this module performs the actions.  ``clock`` has to
-run while the machine is suspended, if the system has such a clock (rule 7).
+The states and transitions of the client are in ``client_states``; this module performs the actions.  ``clock`` must
+continue while the machine is suspended, if the system has such a clock (rule 7).
 """
 
 from __future__ import annotations
@@ -31,30 +32,34 @@ from middleware.entangled.quorum.round import PAUSE, Round
 CLOCK_MARGIN = 0.02
 """Share by which the clocks of two correct nodes may drift apart: 2 rho, with rho = 1 %."""
 RENEWALS = 3
-"""How often a lease is renewed, and a stand-by asks, in each ttl."""
+"""Number of renewals, or polls of a standby, per TTL."""
 RETRY = 0.1
 JITTER = (0.0, 0.02)
 BACK_OFF = (0.02, 0.08)
-"""Seconds after which a claim is tried again that another one was faster than."""
+"""Seconds before a claim is retried after another agent was faster."""
 SOON = 1.5
-"""Periods of asking within which a lease that runs out is claimed rather than looked at once more."""
+"""Poll periods before its end from which a lease is claimed instead of polled again."""
 FRESH = 0.3
-"""Seconds for which the news of a release is believed against members that have not heard it."""
+"""Seconds for which a release notification outweighs members that have not received it yet."""
 EARLY = 0.8
-"""Share of the time before the end of a lease in which its successor may be promised (``AHEAD``), in which it is asked
-for: a guess that is a little late still is in time."""
+"""Share of the promise window before the end of a lease (``AHEAD``) in which the first standby asks for promises.
+
+Below 1, so that a slightly wrong estimate is still in time.
+"""
 LEAD = 0.1
-"""Seconds before a lease ends at which its successor is asked for: time for another try, and what comes too early waits
-at the members (``patience``)."""
+"""Seconds before the end of a lease at which the next one is proposed: time for a retry.
+
+Members delay early proposals (``desk.in_time``).
+"""
 STAGGER = 0.2
-"""Seconds by which each rank of those that stand by waits longer than the one before it."""
+"""Seconds by which each standby rank waits longer than the previous one."""
 TICK = 0.05
-"""A timer that fires later than this counts as a possible pause."""
+"""Seconds by which a timer must be late to count as a possible suspension."""
 
 
 @dataclass(frozen=True)
 class Lease:
-    """The right to act on a task until ``deadline`` (seconds of the lessee's own clock)."""
+    """The right to act on a task until ``deadline`` (seconds on the lease client's clock)."""
 
     task_id: str
     token: int
@@ -71,10 +76,10 @@ class _Held:
 
 
 @dataclass
-class _Line:
-    """The client's ``rank`` among the standbys, and its knowledge of the lease of another agent.
+class _Standby:
+    """The client's ``rank`` among the standbys, and its knowledge of another agent's lease.
 
-    ``freed_at`` is the time at which the robot of an agent that gave the lease back stands still, ``ends_at`` the
+    ``freed_at`` is the time at which the robot of an agent that released the lease stands still, ``ends_at`` the
     estimated end of the lease, and ``is_outbid`` says whether a higher ballot was promised in the last round.
     """
 
@@ -85,9 +90,9 @@ class _Line:
 
 
 class Lessee:
-    """The claim of one agent to the task of ``council``.
+    """The lease client of one agent for the task of ``council``.
 
-    :param clock: a clock that runs while the machine is suspended
+    :param clock: a clock that continues while the machine is suspended
     :param rng: the source of random pauses
     :param changed: called when the lease is granted, renewed or lost
     :param stop_time: the time in seconds that the robot needs to stop
@@ -112,25 +117,25 @@ class Lessee:
         self._stop_time = stop_time
         self._held = _Held()
         self._claimed = NONE
-        self._rests_at = -math.inf
-        self._line = _Line()
+        self._robot_stops_at = -math.inf
+        self._standby = _Standby()
         self._round: Round | None = None
         self._timer: IDelayedCall | None = None
         self._due_at = 0.0
 
     @property
     def token(self) -> int:
-        """The token of the lease that is or was held, 0 for none."""
+        """The token of the current or last lease; 0 for none."""
         return self._held.token
 
     @property
     def is_over(self) -> bool:
-        """Whether a majority said that the task has ended."""
+        """Whether a majority reported that the task has ended."""
         return self.state is State.OVER
 
     @property
     def lease(self) -> Lease | None:
-        """The lease while it is held."""
+        """The lease while it is held, otherwise None."""
         if self.token and self._clock.seconds() < self._held.deadline:
             return Lease(self.task_id, self.token, self._held.deadline)
         return None
@@ -138,74 +143,75 @@ class Lessee:
     # -- calls of the agent -----------------------------------------------------------------------------------------
 
     def want(self) -> None:
-        """Claim the lease and keep it, with further tries until it is granted."""
+        """Claim the lease and keep it; a claim is retried until it is granted."""
         self._set_rank(0)
         self._handle(Event.WANT)
 
     def stand_by(self, rank: int = 1) -> None:
-        """Claim the lease when it was given back or has expired, lower ranks first; until then listen and ask.
+        """Claim the lease after it was released or has expired, lower ranks first; until then poll it.
 
-        A client that holds the lease or claims it only takes the rank.
+        A client that holds or claims the lease only records the rank.
         """
         self._set_rank(max(1, rank))
         self._handle(Event.STAND_BY)
 
     def suspect(self) -> None:
-        """Ask now when the lease ends, because the holder may have failed.  It shortens no lease."""
+        """Poll the end of the lease now, because the holder may have failed.  It shortens no lease."""
         if not self._is_freed and self.lease is None:
             self._handle(Event.SUSPECT)
 
     def freed(self, token: int, rest: float = 0.0) -> None:
-        """Learn that the lease with ``token`` was given back, and that its robot moves for ``rest`` more seconds.
+        """Process the notification that the lease with ``token`` was released.
 
-        The first standby asks for promises at once, so that only the grant is left when that robot stands still.
+        Its robot moves for ``rest`` more seconds.  The first standby asks for promises at once, so that only the grant
+        remains when that robot stands still.
         """
         self.council.note_token(token)
         if self.state in ACTIVE and self.lease is None:
             is_new = not self._is_freed
-            self._line.freed_at = self._line.ends_at = self._clock.seconds() + rest
+            self._standby.freed_at = self._standby.ends_at = self._clock.seconds() + rest
             if is_new:
                 self._handle(Event.FREED)
 
     def outrank(self, token: int) -> None:
-        """Learn that a device has obeyed ``token``: claims are higher from now on, and a lower lease is lost."""
+        """Record that a device has obeyed ``token``: claims are higher from now on, and a lower lease is lost."""
         self.council.token = max(self.council.token, token)
         if 0 < self.token < token:
             self._handle(Event.OUTRANK)
 
     def release(self, heirs: Sequence[Contact] = (), rest: float = 0.0) -> Deferred[object]:
-        """Give the lease back (stop the device first), or stop claiming it; fires when the council knows.
+        """Release the lease (stop the device first), or stop claiming it; fires when the members know.
 
-        The council learns how long the robot needs to stop, and grants nothing before: ``rest`` seconds for a robot
-        that cannot be told, and its own stop time.  The members notify the standbys; ``heirs`` are notified from here,
-        half a round trip earlier.
+        The members grant no lease until the robot has stopped: after its stop time, plus ``rest`` seconds for an
+        unreachable robot.  The members notify the standbys; this client notifies the standbys ``heirs`` directly, half
+        a round trip earlier.
         """
         done: Deferred[object] = succeed(None)
         if self.lease is not None:
-            # With the margin from the beginning: a later release of another claim repeats what is left of it.
+            # Apply the margin once: a later release of another claim uses the remaining time.
             moves = (rest + self._stop_time) * (1.0 + CLOCK_MARGIN)
-            self._rests_at = min(self._rests_at, self._clock.seconds() + moves)
+            self._robot_stops_at = min(self._robot_stops_at, self._clock.seconds() + moves)
         self._handle(Event.RELEASE)
         if self._held.ballot != NONE:
-            done = self._let_go(max(self._held.ballot, self._claimed), heirs)  # which ends the older one, too
+            done = self._release_ballot(max(self._held.ballot, self._claimed), heirs)  # which also ends the older one
         else:
-            self._let_go_of_minority()
+            self._release_minority()
         self._held, self._claimed = _Held(), NONE
         return done
 
     def move(self, members: Sequence[Contact]) -> Deferred[None]:
-        """Have ``members`` be the council (stop the device first).
+        """Change the quorum members to ``members`` (stop the device first).
 
-        A lease that is held goes back with it, and is reserved for this client until it has claimed it again there.
-        Fails as ``Council.change`` does; then the lease is claimed again where it was.
+        A held lease is released with the change, and reserved for this client until it has claimed it again from the
+        new members.  Fails as ``Council.change`` does; then the lease is claimed again from the old members.
         """
         return Deferred.fromCoroutine(self._move(members))
 
     def end(self, token: int) -> Deferred[bytes]:
-        """Have the council grant no lease any more (stop the device first): the task was done under ``token``.
+        """Close the task, which was done under ``token`` (stop the device first); no more leases are granted.
 
-        If this client holds a later token by now, that one counts.  Fires with the proof, signed by a majority of the
-        council; fails as ``Council.close`` does.
+        If this client holds a later token by now, that one is used.  Fires with the proof, signed by a majority of the
+        members; fails as ``Council.close`` does.
         """
         return self.council.close(max(token, self.token)).addCallback(lambda _: self.council.ending)
 
@@ -214,18 +220,18 @@ class Lessee:
         if self.lease is not None:
             self._held.token, self._held.deadline = 0, 0.0
             moves = self._stop_time * (1.0 + CLOCK_MARGIN)
-            self._rests_at = self._clock.seconds() + moves
+            self._robot_stops_at = self._clock.seconds() + moves
             await deferLater(self._clock, moves)
         try:
             await self.council.change(members, keep=True)
-        except Exception:  # but not when the coroutine of a node that is gone is collected as garbage
+        except Exception:  # not GeneratorExit: the coroutine of a stopped node is garbage-collected
             self._handle(Event.MOVED)
             raise
         self._handle(Event.MOVED)
 
     def _set_rank(self, rank: int) -> None:
-        """Take a rank among the standbys; a claim that is due becomes due as much sooner or later."""
-        before, self._line.rank = self._stagger(), rank
+        """Set the rank among the standbys; a scheduled claim moves accordingly."""
+        before, self._standby.rank = self._stagger(), rank
         if self._stagger() != before and self.lease is None and not self._is_freed:
             self._handle(Event.RANK)
 
@@ -240,7 +246,7 @@ class Lessee:
         self.state, actions = next_step(self.state, event)
         self._steps = step = self._steps + 1
         for action in actions:
-            if self._steps == step:  # else the listener has called, and its transition has replaced this one
+            if self._steps == step:  # otherwise the listener has caused another transition, which replaces this one
                 self._perform(action, asked, delay)
 
     def _perform(self, action: Action, asked: Round | None, delay: float) -> None:
@@ -267,39 +273,39 @@ class Lessee:
                 self._lose()
             case Action.DROP:
                 was_held = self.token != 0
-                self._let_go_of_minority()
+                self._release_minority()
                 if was_held:
-                    self._let_go(self._held.ballot)
+                    self._release_ballot(self._held.ballot)
                     self._lose()
             case Action.NOTIFY:
                 self._changed()
             case Action.LINE_UP if asked is not None:
-                self._wait(asked)
+                self._estimate_end(asked)
             case Action.LINE_UP:
-                self._line_up(self._rng.uniform(*JITTER))
+                self._schedule_claim(self._rng.uniform(*JITTER))
             case Action.AFTER_RANK:
-                self._again(self._line.rank * self._poll_period)
+                self._set_timer(self._standby.rank * self._poll_period)
             case Action.AFTER_POLL | Action.AFTER_WAIT | Action.AFTER_PREVIOUS:
-                self._again(delay)
+                self._set_timer(delay)
             case Action.AFTER_TURN:
-                self._again(self._turn())
+                self._set_timer(self._released_delay())
             case Action.AFTER_RENEWAL:
-                self._again(self._poll_period)
+                self._set_timer(self._poll_period)
             case Action.AFTER_RETRY:
-                self._again(min(RETRY, self._held.deadline - self._clock.seconds()))
+                self._set_timer(min(RETRY, self._held.deadline - self._clock.seconds()))
             case Action.AFTER_BACK_OFF:
-                self._again(self._rng.uniform(*BACK_OFF))
+                self._set_timer(self._rng.uniform(*BACK_OFF))
 
     # -- rounds -----------------------------------------------------------------------------------------------------
 
     def _look(self) -> None:
-        """Ask whether the lease is free, without a promise."""
+        """Poll whether the lease is free, without a promise."""
         self._cancel()
         self._round = asked = self.council.round("lease.prepare", 0, self.council.ttl, short=0.0)
-        asked.outcome.addCallback(self._looked, self.council.configuration)
+        asked.outcome.addCallback(self._on_look, self.council.configuration)
 
-    def _looked(self, asked: Round, configuration: int) -> None:
-        if not self._counts(asked):
+    def _on_look(self, asked: Round, configuration: int) -> None:
+        if not self._is_current(asked):
             return
         asked.close()
         if self.council.configuration != configuration:
@@ -310,27 +316,27 @@ class Lessee:
             self._handle(Event.FREE if is_free else Event.TAKEN, asked)
 
     def _prepare(self) -> None:
-        """Ask for promises; a lease that is held stays valid meanwhile."""
+        """Ask for promises; a held lease stays valid meanwhile."""
         self._cancel()
         self._claimed = ballot = self.council.next_ballot()
         kinds = (Kind.GRANTED, Kind.SEALED)
         question = ballot.counter, self.council.ttl
         self._round = asked = self.council.round("lease.prepare", *question, kinds=kinds, short=self._short)
-        asked.outcome.addCallback(self._promised, self.council.configuration)
+        asked.outcome.addCallback(self._on_promises, self.council.configuration)
 
-    def _promised(self, asked: Round, configuration: int) -> None:
-        if not self._counts(asked):
+    def _on_promises(self, asked: Round, configuration: int) -> None:
+        if not self._is_current(asked):
             return
         if self.council.configuration != configuration:
             return self._handle(Event.RECONFIGURED)
         if not asked.tally.is_won:
-            return self._failed(asked)
+            return self._on_failure(asked)
         asked.close()
         wait = asked.free_in() - LEAD if self.lease is None else 0.0
         if asked.tally.to_complete is not None:
             self._handle(Event.UNFINISHED, asked)
         elif wait > 0.0:
-            # The lease is about to expire, or the robot of the agent that gave it back to stop.
+            # The lease is about to expire, or the robot of its last holder to stop.
             self._handle(Event.EARLY_PROMISES, delay=wait)
         else:
             self._handle(Event.PROMISES)
@@ -345,27 +351,27 @@ class Lessee:
     def _propose(self, ballot: Ballot, token: int) -> None:
         question = ballot.counter, token, self.council.ttl
         self._round = asked = self.council.round("lease.propose", *question, short=self._short)
-        asked.outcome.addCallback(self._granted, ballot, token)
+        asked.outcome.addCallback(self._on_grants, ballot, token)
 
-    def _granted(self, asked: Round, ballot: Ballot, token: int) -> None:
-        if not self._counts(asked):
+    def _on_grants(self, asked: Round, ballot: Ballot, token: int) -> None:
+        if not self._is_current(asked):
             return
         deadline = self._deadline_of(asked) if asked.tally.is_won else 0.0
         if deadline <= self._clock.seconds():
-            return self._failed(asked)
+            return self._on_failure(asked)
         self._held = _Held(token, deadline, ballot)
-        # The device counts the deadline on its own clock, which may be slower than the one of this client.
-        self._rests_at = deadline + self._stop_time + self.council.ttl * CLOCK_MARGIN
-        # A member that may not grant anything yet needs no other ballot later.
+        # The device's clock may be slower than this client's.
+        self._robot_stops_at = deadline + self._stop_time + self.council.ttl * CLOCK_MARGIN
+        # A member that may not grant anything yet does not need another ballot.
         others = [reply for reply in asked.tally.replies.values() if reply.kind not in (Kind.GRANTED, Kind.QUIET)]
         self._handle(Event.PARTIAL_GRANTS if others else Event.GRANTS)
 
     def _deadline_of(self, won: Round) -> float:
-        """Return the time by which the robot must stand still again, on the own clock."""
+        """Return the time, on the own clock, by which the robot must stand still."""
         return won.sent_at + self.council.ttl * (1.0 - CLOCK_MARGIN) - self._stop_time
 
-    def _counts(self, asked: Round) -> bool:
-        """Learn from a round; return whether it is the newest one, and the task has not ended."""
+    def _is_current(self, asked: Round) -> bool:
+        """Process a round; return whether it is the newest one and the task has not ended."""
         self.council.hear(asked)
         if self._round is not asked:
             return False
@@ -374,7 +380,7 @@ class Lessee:
             self._handle(Event.ENDED)
         return not self.is_over
 
-    def _failed(self, asked: Round) -> None:
+    def _on_failure(self, asked: Round) -> None:
         asked.close()
         if self.lease is None:
             self._handle(Event.REJECTED, asked)
@@ -385,19 +391,19 @@ class Lessee:
 
     # -- times ------------------------------------------------------------------------------------------------------
 
-    def _wait(self, asked: Round) -> None:
-        """Estimate the end of the lease from a round that failed, and set the timer."""
+    def _estimate_end(self, asked: Round) -> None:
+        """Estimate the end of the lease from a failed round, and set the timer."""
         is_outbid = any(reply.kind is Kind.OUTBID for reply in asked.tally.replies.values())
         free_in = asked.free_in()
         if is_outbid and free_in == math.inf:
             free_in = 0.0  # the other members did not answer; under a higher ballot they may
-        self._line.ends_at, self._line.is_outbid = self._clock.seconds() + free_in, is_outbid
-        self._line_up(self._rng.uniform(*(BACK_OFF if is_outbid else JITTER)))
+        self._standby.ends_at, self._standby.is_outbid = self._clock.seconds() + free_in, is_outbid
+        self._schedule_claim(self._rng.uniform(*(BACK_OFF if is_outbid else JITTER)))
 
-    def _line_up(self, pause: float) -> None:
-        """Set the timer for the claim; if that is late or unknown, for a look, because a notification may be lost."""
-        wait = self._turn() if self._is_freed else self._claims_in()
-        # A healthy holder renews well before the end: a lease that expires so soon is claimed without a look.
+    def _schedule_claim(self, pause: float) -> None:
+        """Set the timer for the claim; if that is late or unknown, for a poll, because a notification may be lost."""
+        wait = self._released_delay() if self._is_freed else self._expiry_delay()
+        # A healthy holder renews well before the end: a lease that expires this soon is claimed without a poll.
         is_far = wait > SOON * self._poll_period
         self._handle(Event.FAR if is_far else Event.NEAR, delay=(self._poll_period if is_far else wait) + pause)
 
@@ -405,32 +411,32 @@ class Lessee:
     def _poll_period(self) -> float:
         return self.council.ttl / RENEWALS
 
-    def _claims_in(self) -> float:
-        """Return the seconds until the claim of a lease that expires; the first standby gets the promises before."""
-        is_first = not (self._stagger() or self._line.is_outbid)
+    def _expiry_delay(self) -> float:
+        """Return the seconds until an expiring lease is claimed; the first standby gets its promises before."""
+        is_first = not (self._stagger() or self._standby.is_outbid)
         lead = EARLY * AHEAD * self.council.ttl if is_first else 0.0
-        return max(0.0, self._line.ends_at + self._stagger() - lead - self._clock.seconds())
+        return max(0.0, self._standby.ends_at + self._stagger() - lead - self._clock.seconds())
 
     def _stagger(self) -> float:
-        return STAGGER * max(0, self._line.rank - 1)
+        return STAGGER * max(0, self._standby.rank - 1)
 
-    def _turn(self) -> float:
-        """Return the seconds until the claim of a lease that was given back; the first standby claims at once."""
+    def _released_delay(self) -> float:
+        """Return the seconds until a released lease is claimed; the first standby claims at once."""
         wait = self._stagger()
-        return wait and max(0.0, self._line.freed_at - self._clock.seconds()) + wait
+        return wait and max(0.0, self._standby.freed_at - self._clock.seconds()) + wait
 
     @property
     def _is_freed(self) -> bool:
-        """Whether the lease was given back a moment ago: some members may not know it yet."""
-        return self._clock.seconds() < self._line.freed_at + FRESH
+        """Whether the lease was released so recently that some members may not know it."""
+        return self._clock.seconds() < self._standby.freed_at + FRESH
 
     @property
     def _short(self) -> float:
-        """The longest remaining lease in seconds that a round waits for; one that was given back ends soon."""
+        """The longest remaining lease in seconds that a round waits for; a released one ends soon."""
         return math.inf if self._is_freed else PAUSE
 
-    def _due(self) -> None:
-        """Handle the timer; one that is late may mean that this process or machine was suspended."""
+    def _on_timer(self) -> None:
+        """Handle the timer; a late one may mean that this process or machine was suspended."""
         self._timer = None
         self.pauses += self._clock.seconds() - self._due_at > TICK
         if self.state is State.PROMISED:
@@ -442,14 +448,14 @@ class Lessee:
         else:
             self._handle(Event.DUE)
 
-    def _again(self, delay: float) -> None:
+    def _set_timer(self, delay: float) -> None:
         if self._timer is not None and self._timer.active():
             self._timer.cancel()
         self._due_at = self._clock.seconds() + delay
-        self._timer = self._clock.callLater(delay, self._due)
+        self._timer = self._clock.callLater(delay, self._on_timer)
 
     def _cancel(self) -> None:
-        """Drop the round under way and the timer."""
+        """Cancel the round under way and the timer."""
         if self._round is not None:
             self._round.close()
             self._round = None
@@ -457,19 +463,19 @@ class Lessee:
             self._timer.cancel()
         self._timer = None
 
-    # -- giving back ------------------------------------------------------------------------------------------------
+    # -- release ----------------------------------------------------------------------------------------------------
 
     def _lose(self) -> None:
-        """Forget a lease that was not given back, and notify the listener."""
+        """Forget a lease that was not released, and notify the listener."""
         self._held = _Held()
         self._changed()
 
-    def _let_go(self, ballot: Ballot, heirs: Sequence[Contact] = ()) -> Deferred[object]:
-        """Release ``ballot`` at the council, with the time for which the robot may still move."""
-        rest = max(0.0, self._rests_at - self._clock.seconds())
+    def _release_ballot(self, ballot: Ballot, heirs: Sequence[Contact] = ()) -> Deferred[object]:
+        """Release ``ballot`` at the members, with the time for which the robot may still move."""
+        rest = max(0.0, self._robot_stops_at - self._clock.seconds())
         return self.council.let_go(ballot, heirs, rest * (1.0 + CLOCK_MARGIN))
 
-    def _let_go_of_minority(self) -> None:
-        """Release a claim that only a minority granted, so that it delays no other claimant."""
+    def _release_minority(self) -> None:
+        """Release a claim that only a minority granted, so that it delays no other agent."""
         if self._claimed not in (self._held.ballot, NONE):
-            self._let_go(self._claimed)
+            self._release_ballot(self._claimed)
