@@ -23,7 +23,7 @@ GREY = 128.0
 BLUR = 2
 MIN_AREA = 14
 SAME_SHAPE = 0.2
-ENOUGH_PIXELS = 1024
+ENOUGH = 1024
 """Pixels per side that are sufficient for detection."""
 
 
@@ -83,9 +83,9 @@ def find_target(jpeg: bytes, size: Size, lens: tuple[float, float | None] = VIEW
 
 def _reduction(side: int) -> int:
     """Return the decoding mode for a picture with ``side`` pixels: large ones are reduced by 2 or 4."""
-    if side <= ENOUGH_PIXELS:
+    if side <= ENOUGH:
         return cv2.IMREAD_COLOR
-    return cv2.IMREAD_REDUCED_COLOR_2 if side <= 2 * ENOUGH_PIXELS else cv2.IMREAD_REDUCED_COLOR_4
+    return cv2.IMREAD_REDUCED_COLOR_2 if side <= 2 * ENOUGH else cv2.IMREAD_REDUCED_COLOR_4
 
 
 def _extent(redness: npt.NDArray[np.float32]) -> tuple[float, float]:
