@@ -120,7 +120,7 @@ class WorkerTests(SynchronousTestCase):
             began = time.monotonic()
             self.assertEqual(guard.find(TEAM).assigned_agent, "b")
             worst = max(worst, time.monotonic() - began)
-        self.assertIn(f"no answer {STRIKES} times", guard.find(TEAM).reason)
+        self.assertIn(f"no result {STRIKES} times", guard.find(TEAM).reason)
         self.assertLess(worst, PATIENCE / STRIKES)
         self.assertIsNone(guard.strategy._process)  # type: ignore[attr-defined]
         self.flushLoggedErrors()
