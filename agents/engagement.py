@@ -357,7 +357,7 @@ class Engagement:
     def _standby_rank(self, decision: Decision, now: float) -> int:
         """Return the standby rank, from 1, of an agent that is to take over at once; 0 otherwise.
 
-        The acting agent is not counted.
+        The assigned agent counts until it acts.
         """
         if not 0 < self.course.rank <= STANDBYS:
             return 0

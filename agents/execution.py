@@ -75,7 +75,7 @@ class Execution:
         return Turn(action, math.floor(max(progress, self._best_progress) / PROGRESS_STEP + 1e-9) * PROGRESS_STEP)
 
     def has_stalled(self, now: float) -> bool:
-        """Return whether there was no progress for ``stall_limit`` seconds, less than ``stall_limit`` seconds ago.
+        """Return whether progress stalled within the last ``stall_limit`` seconds.
 
         In that time another agent may try.
         """

@@ -122,12 +122,12 @@ class Part:
         Fires when the quorum members know.
         """
         self.is_left = True
-        told = self.engagement.abandon(self._clock.seconds())
+        released = self.engagement.abandon(self._clock.seconds())
         self._close()
         self._group.leave()
         if is_running:
             self._group.withdraw()
-        return told
+        return released
 
     def _on_reports(self, members: list[Member], outcome: Result | None) -> None:
         self.engagement.heard(members, outcome, self._clock.seconds())

@@ -117,10 +117,7 @@ class SearchAndApproach:
             self._distances = [*self._distances, self._measure_distance(sighting)][-9:]
 
     def _measure_distance(self, sighting: Sighting) -> float:
-        """Return the distance in metres from the head.
-
-        The ranger's if it agrees with the picture, else the picture's.
-        """
+        """Return the metres from the head: the ranger's if it agrees with the picture, else the picture's."""
         for name in FAR:
             ranged = self._ranges[name] + self._radius
             if abs(ranged - sighting.distance) < DISAGREEMENT * sighting.distance:

@@ -178,10 +178,7 @@ def checked(found: Consensus, contacts: Sequence[Report]) -> Consensus:
 def checked_group(
     found: Sequence[Consensus], contacts: Sequence[Report], items: Sequence[Item]
 ) -> tuple[Consensus, ...]:
-    """Return ``found`` if it has one possible decision per item within all capacities.
-
-    Raise ``NoOpinion`` otherwise.
-    """
+    """Return ``found`` if it has one possible decision per item within all capacities; else raise ``NoOpinion``."""
     if not isinstance(found, tuple) or not all(isinstance(point, Consensus) for point in found):
         raise NoOpinion("find_group does not return a tuple of Consensus")
     if [point.task for point in found] != [item.task for item in listed(items)]:

@@ -14,10 +14,7 @@ QUANTUM = 1_000_000
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """A task to assign.
-
-    Its id, its ``position`` in metres (may be empty) and ``slots``, the number of agents that act.
-    """
+    """A task to assign: its ``position`` in metres (may be empty), and the number of agents that act (``slots``)."""
 
     task: str
     position: tuple[float, ...] = ()

@@ -89,7 +89,7 @@ class Verdict:
     def is_witness(self) -> bool:
         """Whether the agent should write its record.
 
-        In a group of more than ``MANY``, only the agents with the best reports do.
+        In a group of more than ``MANY`` members only the agents with the best reports do.
         """
         return self.participants <= MANY or self.agent in [report.agent for report in self.reports[:BEST]]
 
@@ -123,9 +123,9 @@ class Verdict:
         value = bytes(msgpack.packb(content))
         more = [_cut(r.more, MAX_NAME_BYTES) for r in self.reports[:MANY]]
         while any(more):
-            told = bytes(msgpack.packb({**content, "more": more}))
-            if len(told) <= MAX_VERDICT:
-                return told
+            extended = bytes(msgpack.packb({**content, "more": more}))
+            if len(extended) <= MAX_VERDICT:
+                return extended
             more.pop()  # the worst reports keep only their cost
         return value
 
@@ -167,8 +167,8 @@ def verdict_from(
     view = view or View()
     members = {m.uuid: m for m in (*others, me)}
     fit = [m for m in members.values() if m.cost is not None]
-    told = (Reported(m.uuid, m.name, float(m.cost or 0.0), _describe_fields(view.report(m))) for m in fit)
-    reports = sorted(told, key=lambda r: (r.cost, r.agent))
+    reported = (Reported(m.uuid, m.name, float(m.cost or 0.0), _describe_fields(view.report(m))) for m in fit)
+    reports = sorted(reported, key=lambda r: (r.cost, r.agent))
     best = reports if len(reports) <= MANY else reports[:BEST]
     silent = sorted(m.name for m in members.values() if m.cost is None)
     acting = sorted((m for m in fit if m.status == EXECUTING), key=lambda m: (m.cost, m.uuid))

@@ -89,7 +89,7 @@ class Following:
         self._notify(record for record in self.records if record.owner not in gone)
 
     def _notify(self, records: Iterable[Record]) -> None:
-        told = sorted(records, key=lambda record: (record.owner, record.name))
-        if told != self.records and not self._is_stopped:
-            self.records = told
-            self._changed(list(told))
+        ordered = sorted(records, key=lambda record: (record.owner, record.name))
+        if ordered != self.records and not self._is_stopped:
+            self.records = ordered
+            self._changed(list(ordered))

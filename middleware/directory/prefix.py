@@ -83,7 +83,7 @@ def prefix_of(node_id: bytes, depth: int) -> Prefix:
 def places_of(node_id: bytes, depth: int) -> list[bytes]:
     """Return the one to three keys under which a device with that id and depth is listed.
 
-    Up to ``SHALLOW`` depth 0 is included: while a team grows, some nodes still read only that place.
+    Up to ``SHALLOW`` depth 0 is included: when a team becomes undivided, some nodes read only that place earlier.
     """
     depths = (depth, max(0, depth - 1), *((0,) if depth <= SHALLOW else ()))
     return list(dict.fromkeys(prefix_of(node_id, each).key for each in depths))

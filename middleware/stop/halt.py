@@ -106,10 +106,7 @@ class Halt:
 
     @property
     def is_on(self) -> bool:
-        """Whether robots must stand still.
-
-        A stop is in force, or this node has started and does not know the stops yet.
-        """
+        """Whether robots must stand still: a stop is in force, or this node does not know the stops yet."""
         return self.is_stopped or not self.is_known
 
     @property

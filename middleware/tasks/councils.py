@@ -54,9 +54,9 @@ class Councils:
         self.desk = Desk(entangled.endpoint, entangled.identity, store, clock, born_at, self.judge, self._may_sit)
 
     async def pinned(self, task: Task) -> Task:
-        """Return a new ``task`` with its quorum members.
+        """Return a new ``task`` with its quorum members, which this node signs.
 
-        The nodes closest to its key (consensus rule 1), signed by this node.
+        They are the nodes closest to its key now (consensus rule 1).
         """
         key = group_key(task.task_id)
         found = await self._entangled.find_node(key)

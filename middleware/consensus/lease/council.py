@@ -148,9 +148,9 @@ class Council:
         replies, size = round_.tally.replies.values(), len(self.members)
         self._rounds = max(self._rounds, believed((reply.promised.counter // LIFE for reply in replies), size))
         self.token = max(self.token, believed((reply.token for reply in replies), size))
-        told = [self._read(self.task_id, reply.proof) for reply in replies if reply.kind is Kind.MOVED]
+        charters = [self._read(self.task_id, reply.proof) for reply in replies if reply.kind is Kind.MOVED]
         newest = max(
-            (each for each in told if each is not None), key=lambda charter: charter.configuration, default=None
+            (each for each in charters if each is not None), key=lambda charter: charter.configuration, default=None
         )
         if newest is not None and newest.configuration > self.configuration:
             self._adopt(newest)
@@ -160,15 +160,15 @@ class Council:
             if reply.kind is Kind.BEHIND and reply.configuration < self.configuration:
                 self._install(self.members[place])
 
-    def let_go(self, ballot: Ballot, heirs: Sequence[Contact] = (), rest: float = 0.0) -> Deferred[Any]:
-        """Release all promises and grants under ``ballot``, and notify the standbys ``heirs``.
+    def let_go(self, ballot: Ballot, standbys: Sequence[Contact] = (), rest: float = 0.0) -> Deferred[Any]:
+        """Release all promises and grants under ``ballot``, and notify ``standbys``.
 
         ``rest`` is the longest time in seconds for which the robot may still move.  Fires when every member has
         answered or timed out.
         """
-        told = [self._ask(member, "lease.release", (self.task_id, ballot.counter, rest)) for member in self.members]
-        told += [self._ask(heir, "lease.freed", (self.task_id, self.token, rest)) for heir in heirs]
-        return DeferredList(told, consumeErrors=True)
+        requests = [self._ask(member, "lease.release", (self.task_id, ballot.counter, rest)) for member in self.members]
+        requests += [self._ask(standby, "lease.freed", (self.task_id, self.token, rest)) for standby in standbys]
+        return DeferredList(requests, consumeErrors=True)
 
     def close(self, token: int = 0) -> Deferred[None]:
         """Close the task, so that no more leases are granted; fires when no agent can act on it any longer.
@@ -304,7 +304,7 @@ class Council:
     async def _accept_change(self, ballot: Ballot, members: tuple[Contact, ...], keep: bool) -> Round:
         """Have a majority of the old members accept the change.
 
-        Then no lease of theirs is open, and no other change wins.
+        This ensures that none of their leases is open and that no other change wins.
         """
         old, configuration = self.members, self.configuration
 

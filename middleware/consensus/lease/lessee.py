@@ -179,11 +179,11 @@ class Lessee:
         if 0 < self.token < token:
             self._handle(Event.OUTRANK)
 
-    def release(self, heirs: Sequence[Contact] = (), rest: float = 0.0) -> Deferred[object]:
+    def release(self, standbys: Sequence[Contact] = (), rest: float = 0.0) -> Deferred[object]:
         """Release the lease (stop the device first), or stop claiming it; fires when the members know.
 
         The members grant no lease until the robot has stopped: after its stop time, plus ``rest`` seconds for an
-        unreachable robot.  The members notify the standbys; this client notifies the standbys ``heirs`` directly, half
+        unreachable robot.  The members notify the standbys; this client notifies ``standbys`` directly, half
         a round trip earlier.
         """
         done: Deferred[object] = succeed(None)
@@ -193,7 +193,8 @@ class Lessee:
             self._robot_stops_at = min(self._robot_stops_at, self._clock.seconds() + moves)
         self._handle(Event.RELEASE)
         if self._held.ballot != NONE:
-            done = self._release_ballot(max(self._held.ballot, self._claimed), heirs)  # which also ends the older one
+            # The higher ballot also ends the older one.
+            done = self._release_ballot(max(self._held.ballot, self._claimed), standbys)
         else:
             self._release_minority()
         self._held, self._claimed = _Held(), NONE
@@ -470,10 +471,10 @@ class Lessee:
         self._held = _Held()
         self._changed()
 
-    def _release_ballot(self, ballot: Ballot, heirs: Sequence[Contact] = ()) -> Deferred[object]:
+    def _release_ballot(self, ballot: Ballot, standbys: Sequence[Contact] = ()) -> Deferred[object]:
         """Release ``ballot`` at the members, with the time for which the robot may still move."""
         rest = max(0.0, self._robot_stops_at - self._clock.seconds())
-        return self.council.let_go(ballot, heirs, rest * (1.0 + CLOCK_MARGIN))
+        return self.council.let_go(ballot, standbys, rest * (1.0 + CLOCK_MARGIN))
 
     def _release_minority(self) -> None:
         """Release a claim that only a minority granted, so that it delays no other agent."""
