@@ -77,7 +77,7 @@ class Circle:
     def hear(self, members: Sequence[Member], now: float) -> None:
         """Process the list of present participants and their reports."""
         known: dict[str, Member] = {}
-        came: dict[str, float] = {}
+        arrived_at: dict[str, float] = {}
         self._departed = {uuid: (member, at) for uuid, (member, at) in self._departed.items() if now - at < LINGERING}
         for report in members:
             if report.uuid == self._uuid:
@@ -88,9 +88,9 @@ class Circle:
                 continue
             is_news = before is None or (report != before and not is_older(report, before))
             known[report.uuid] = report if is_news or before is None else before
-            came[report.uuid] = now if is_news else self._arrived_at[report.uuid]
+            arrived_at[report.uuid] = now if is_news else self._arrived_at[report.uuid]
         self._departed.update((uuid, (member, now)) for uuid, member in self._reports.items() if uuid not in known)
-        self._reports, self._arrived_at = known, came
+        self._reports, self._arrived_at = known, arrived_at
         self._dismissed = {uuid: was for uuid, was in self._dismissed.items() if known.get(uuid) == was}
 
     def dismiss(self, uuid: str) -> None:
@@ -136,19 +136,19 @@ class Account:
         self._token = max(self._token, *(m.token for m in members))
         # The epoch is the token under which the task is done, or will be done next.
         epoch = max(tokens, default=self._token + 1)
-        judged = (epoch, decision.assigned, token, len(members), decision.digest)
-        is_new, is_due = judged[:-1] != self._recorded[:-1], now - self._recorded_at >= PAUSE
-        if judged == self._recorded or not (is_new or is_due) or not (decision.assigned or self._recorded):
+        state_key = (epoch, decision.assigned, token, len(members), decision.digest)
+        is_new, is_due = state_key[:-1] != self._recorded[:-1], now - self._recorded_at >= PAUSE
+        if state_key == self._recorded or not (is_new or is_due) or not (decision.assigned or self._recorded):
             return None
-        self._recorded = judged
+        self._recorded = state_key
         if decision.consensus is None:
             return None
         self._recorded_at = now
         rule = decision.consensus.strategy or self._strategy.name
         version = str(getattr(self._strategy, "version", "")) if rule == self._strategy.name else ""
-        given = (self._task.task_id, epoch, me, others, rule, version)
+        identification = (self._task.task_id, epoch, me, others, rule, version)
         found, view = decision.consensus, view_of(self._strategy)
-        verdict = verdict_from(*given, found, decision.assigned, self._task.hysteresis, token, view)
+        verdict = verdict_from(*identification, found, decision.assigned, self._task.hysteresis, token, view)
         return verdict if verdict.is_witness else None
 
 

@@ -66,17 +66,17 @@ class Division:
         """
         view = view_of(self.strategy)
         members = {name: list(known(now)) for name, (_, known) in sorted(self._tasks.items())}
-        acting = {m.uuid: name for name, here in members.items() for m in here if m.status == EXECUTING}
+        acting = {m.uuid: name for name, task_members in members.items() for m in task_members if m.status == EXECUTING}
         reports: list[Report] = []
         missing: set[str] = set()
-        for name, here in members.items():
-            rest = [m for m in here if acting.get(m.uuid, name) == name]
-            held = any(m.uuid in acting for m in rest)
+        for name, task_members in members.items():
+            rest = [m for m in task_members if acting.get(m.uuid, name) == name]
+            has_acting = any(m.uuid in acting for m in rest)
             for member in rest:
                 report = view.report(member)
                 if report is not None:
                     reports.append(replace(report, task=name))
-                elif member.available and not held:
+                elif member.available and not has_acting:
                     missing.add(member.name)
         is_early = since is None or since < task.waiting_period
         why = ""

@@ -82,8 +82,12 @@ class Exploration:
             middle, width = self.sector
             own = [(o, yaw) for o, yaw in seen if abs(math.remainder(yaw - middle, math.tau)) <= width / 2]
             seen = own if any(openness >= CLEARANCE + LEG for openness, _ in own) else seen
-        shut = [bump[2] for bump in self._bumps if math.dist(bump[:2], pose[:2]) <= HERE]
-        free = [one for one in seen if all(abs(math.remainder(one[1] - yaw, math.tau)) > math.pi / 3 for yaw in shut)]
+        blocked_headings = [bump[2] for bump in self._bumps if math.dist(bump[:2], pose[:2]) <= HERE]
+        free = [
+            one
+            for one in seen
+            if all(abs(math.remainder(one[1] - yaw, math.tau)) > math.pi / 3 for yaw in blocked_headings)
+        ]
         seen = free or seen
         best = max(openness for openness, _ in seen)
         return self._rng.choice([yaw for openness, yaw in seen if openness >= 0.95 * best])
@@ -135,12 +139,12 @@ class Detour:
 
     def _leg_action(self, leg: str, pose: Pose, ahead: float) -> Action | None:
         off = math.remainder(self._heading - pose[2], math.tau)
-        way = math.dist(pose[:2], self._from[:2])
+        walked = math.dist(pose[:2], self._from[:2])
         if leg == "back":
-            return None if way >= BACK else self.means.go(-BACK_SPEED)
+            return None if walked >= BACK else self.means.go(-BACK_SPEED)
         if leg == "turn":
             return turn_to(self.means, off)
-        if way >= DETOUR_LEG or is_blocked(ahead):
+        if walked >= DETOUR_LEG or is_blocked(ahead):
             return None
         return walk_to(self.means, off)
 

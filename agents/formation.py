@@ -43,8 +43,8 @@ def posts(angles: Sequence[tuple[str, float]], assigned: str | None) -> dict[str
     fixed = next((n for n, (uuid, _) in enumerate(order) if uuid == assigned), None)
     if fixed is None:
         # Each robot's preferred rotation of the posts; the circular mean moves all robots least.
-        wishes = [angle - n * step for n, (_, angle) in enumerate(order)]
-        turn = math.atan2(sum(map(math.sin, wishes)), sum(map(math.cos, wishes)))
+        preferred_turns = [angle - n * step for n, (_, angle) in enumerate(order)]
+        turn = math.atan2(sum(map(math.sin, preferred_turns)), sum(map(math.cos, preferred_turns)))
     else:
         turn = order[fixed][1] - fixed * step
     return {uuid: math.remainder(turn + n * step, math.tau) for n, (uuid, _) in enumerate(order)}
@@ -78,8 +78,8 @@ class Formation:
         """Send the robot to its post and return the angle; None without a post, as for the ``assigned`` robot."""
         if self._take_post is None or not self.is_open:
             return None
-        here = [member for member in (me, *others) if member.available]
-        angles = [(member.uuid, member.angle) for member in here if member.angle is not None]
+        available_members = [member for member in (me, *others) if member.available]
+        angles = [(member.uuid, member.angle) for member in available_members if member.angle is not None]
         placed = posts(angles, assigned)
         angle = placed.get(self._uuid) if len(angles) > 1 and self._uuid != assigned else None
         if angle is not None and self._post is not None and abs(math.remainder(angle - self._post, math.tau)) <= CLOSE:
@@ -152,13 +152,13 @@ class Circling:
         """Start a leg if one is due, and return whether it was started."""
         if self._post is None or angle is None or self._is_blocked or not is_facing or not self.means.ranges:
             return False
-        way = math.remainder(self._post - angle, math.tau)
+        arc = math.remainder(self._post - angle, math.tau)
         radius = math.dist(pose[:2], target)
-        if abs(way) <= CLOSE or radius < NEAREST:
+        if abs(arc) <= CLOSE or radius < NEAREST:
             return False
         outward = math.atan2(pose[1] - target[1], pose[0] - target[0])
         # A chord leans inwards by half its angle, so that the distance is kept.
-        half = min(abs(way) / 2, math.asin(LONGEST / 2 / radius))
+        half = min(abs(arc) / 2, math.asin(LONGEST / 2 / radius))
         self._leg = 2 * radius * math.sin(half)
-        self._heading = outward + math.copysign(math.pi / 2 + half, way)
+        self._heading = outward + math.copysign(math.pi / 2 + half, arc)
         return True

@@ -143,12 +143,12 @@ class Agent(Service):
         holder = self._holder if self._holder in active else None
         current = None if holder is None else holder.engagement
         heads = self._most_urgent_parts(active)
-        wanted = next_task(
+        due_task = next_task(
             [head.engagement.task for head in heads],
             next((head.engagement.task for head, parts in heads.items() if holder in parts), None),
             current is None or current.may_be_put_aside,
         )
-        parts = next((parts for head, parts in heads.items() if head.engagement.task is wanted), [])
+        parts = next((parts for head, parts in heads.items() if head.engagement.task is due_task), [])
         part = due(parts, holder) if parts else None
         if part is not self._holder:
             self._give_body(part)
@@ -304,9 +304,9 @@ def due(parts: list[Part], holder: Part | None) -> Part:
     own = holder if holder in parts else None
     if own is not None and (own.engagement.is_acting or not own.engagement.may_be_put_aside):
         return own
-    mine = next((part for part in parts if part.engagement.me.assigned == part.engagement.me.uuid), None)
-    if mine is not None:
-        return mine
+    assigned_part = next((part for part in parts if part.engagement.me.assigned == part.engagement.me.uuid), None)
+    if assigned_part is not None:
+        return assigned_part
     blind = [part for part in parts if part.engagement.me.cost is None]
     if own is not None and (own in blind or not blind):
         return own

@@ -95,8 +95,8 @@ def plain_observation(seen: Observation) -> list[Any]:
 def observation_of(fields: list[Any]) -> Observation:
     """Rebuild an observation from plain values."""
     t_host, t_robot, values, samples, frame = fields
-    held = {key: tuple(each) for key, each in samples.items()}
-    return Observation(t_host, t_robot, values, held, None if frame is None else Frame(*frame))
+    sample_tuples = {key: tuple(each) for key, each in samples.items()}
+    return Observation(t_host, t_robot, values, sample_tuples, None if frame is None else Frame(*frame))
 
 
 def _tuples_from_lists(value: object) -> object:

@@ -235,9 +235,9 @@ def check_group(make: Make) -> None:
         return
     for rng, contacts in _teams():
         items = [Item(f"task-{number}", (rng.uniform(-9.0, 9.0), rng.uniform(-9.0, 9.0))) for number in range(5)]
-        room = {r.agent: rng.randint(1, 2) for r in contacts}
+        capacity_of = {r.agent: rng.randint(1, 2) for r in contacts}
         bids = [
-            replace(r, task=item.task, cost=rng.choice([1.0, r.cost]), capacity=room[r.agent])
+            replace(r, task=item.task, cost=rng.choice([1.0, r.cost]), capacity=capacity_of[r.agent])
             for r in contacts
             for item in items
         ]
@@ -247,12 +247,16 @@ def check_group(make: Make) -> None:
             "find_group does not return one decision for each task",
             bids,
         )
-        held = [f.assigned_agent for f in found if f.assigned_agent is not None]
+        assigned = [f.assigned_agent for f in found if f.assigned_agent is not None]
         _demand(
-            all(held.count(agent) <= room[agent] for agent in held), "an agent has more tasks than its capacity", bids
+            all(assigned.count(agent) <= capacity_of[agent] for agent in assigned),
+            "an agent has more tasks than its capacity",
+            bids,
         )
         _demand(
-            len(held) == min(len(items), sum(room.values())), "a task has no agent although one has capacity left", bids
+            len(assigned) == min(len(items), sum(capacity_of.values())),
+            "a task has no agent although one has capacity left",
+            bids,
         )
         mixed, turned = [*bids, *bids[:3]], items[::-1]
         rng.shuffle(mixed)
@@ -266,9 +270,9 @@ def check_reads(make: Make) -> None:
     strategy = make()
     hidden: dict[str, Any] = {name: getattr(_BARE, name) for name in READABLE if name not in reads_of(strategy)}
     for _, contacts in _teams():
-        whole = strategy.find(contacts)
-        shown = strategy.find([replace(report, **hidden) for report in contacts])
-        same = [(f.assigned_agent, f.standby, f.value, f.choice) for f in (whole, shown)]
+        with_all_fields = strategy.find(contacts)
+        with_visible_fields = strategy.find([replace(report, **hidden) for report in contacts])
+        same = [(f.assigned_agent, f.standby, f.value, f.choice) for f in (with_all_fields, with_visible_fields)]
         _demand(
             same[0] == same[1], f"it reads more fields than {', '.join(reads_of(strategy)) or 'the cost'}", contacts
         )

@@ -88,12 +88,12 @@ class Guard:
         A strategy without ``find_group``, and the fallback, decide the items one after another.
         """
         valid = _valid_reports(contacts)
-        whole = getattr(self.strategy, "find_group", None)
-        if whole is None:
+        find_group = getattr(self.strategy, "find_group", None)
+        if find_group is None:
             return one_by_one(self.find, valid, items)
         try:
             self._check_losses()
-            found = checked_group(whole(valid, items), valid, items)
+            found = checked_group(find_group(valid, items), valid, items)
         except NotImplementedError:
             return one_by_one(self.find, valid, items)
         except Exception as error:  # third-party code may raise anything
@@ -184,12 +184,12 @@ def checked_group(
     if [point.task for point in found] != [item.task for item in listed(items)]:
         raise NoOpinion("find_group does not return one decision for each task")
     wanted = {"", *(item.task for item in items)}
-    room = capacities(report for report in standing(contacts) if report.task in wanted)
+    capacity_left = capacities(report for report in standing(contacts) if report.task in wanted)
     for point in found:
         checked(point, [report for report in contacts if report.task in (point.task, "")])
         for agent in {*point.assigned, *filter(None, (point.assigned_agent,))}:
-            room[agent] = room.get(agent, 0) - 1
-    if overloaded := sorted(agent for agent, left in room.items() if left < 0):
+            capacity_left[agent] = capacity_left.get(agent, 0) - 1
+    if overloaded := sorted(agent for agent, remaining in capacity_left.items() if remaining < 0):
         raise NoOpinion(f"it gives {overloaded[0]!r:.60} more tasks than its capacity")
     return found
 
@@ -199,13 +199,13 @@ def one_by_one(
 ) -> tuple[Consensus, ...]:
     """Decide the items separately, sorted by task name; agents whose capacity is used up are left out."""
     counted = standing(contacts)
-    room = capacities(counted)
+    capacity_left = capacities(counted)
     points = []
     for item in listed(items):
-        free = [replace(r, task=item.task) for r in counted if r.task in (item.task, "") and room[r.agent] > 0]
+        free = [replace(r, task=item.task) for r in counted if r.task in (item.task, "") and capacity_left[r.agent] > 0]
         point = replace(find(free), task=item.task, epoch=counted[0].epoch if counted else 0)
         if point.assigned_agent is not None:
-            room[point.assigned_agent] -= 1
+            capacity_left[point.assigned_agent] -= 1
         points.append(point)
     return tuple(points)
 

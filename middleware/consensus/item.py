@@ -25,7 +25,7 @@ class Sharing(Nearest):
     """Base class of strategies that assign several tasks; subclasses implement ``find_group``."""
 
     def find(self, contacts: Sequence[Report]) -> Consensus:
-        """Decide the first task by name."""
+        """Decide the task whose id sorts first."""
         found = self.find_group(contacts, items_of(standing(contacts)))
         return found[0] if found else super().find(contacts)
 

@@ -166,12 +166,12 @@ def verdict_from(
     """
     view = view or View()
     members = {m.uuid: m for m in (*others, me)}
-    fit = [m for m in members.values() if m.cost is not None]
-    reported = (Reported(m.uuid, m.name, float(m.cost or 0.0), _describe_fields(view.report(m))) for m in fit)
+    able = [m for m in members.values() if m.cost is not None]
+    reported = (Reported(m.uuid, m.name, float(m.cost or 0.0), _describe_fields(view.report(m))) for m in able)
     reports = sorted(reported, key=lambda r: (r.cost, r.agent))
     best = reports if len(reports) <= MANY else reports[:BEST]
     silent = sorted(m.name for m in members.values() if m.cost is None)
-    acting = sorted((m for m in fit if m.status == EXECUTING), key=lambda m: (m.cost, m.uuid))
+    acting = sorted((m for m in able if m.status == EXECUTING), key=lambda m: (m.cost, m.uuid))
     return Verdict(
         me.uuid,
         me.name,
@@ -285,8 +285,8 @@ def _describe_fields(report: Report | None) -> str:
     """Describe the fields besides the cost that the strategy read and that differ from their default."""
     if report is None:
         return ""
-    said = {name: getattr(report, name) for name in READABLE if getattr(report, name) != getattr(DEFAULT, name)}
-    return ", ".join(_describe_field(name, value) for name, value in said.items())
+    description = {name: getattr(report, name) for name in READABLE if getattr(report, name) != getattr(DEFAULT, name)}
+    return ", ".join(_describe_field(name, value) for name, value in description.items())
 
 
 def _describe_field(name: str, value: object) -> str:
@@ -307,12 +307,12 @@ def _reports_from(value: object, more: object) -> tuple[Reported, ...] | None:
     if not isinstance(more, list) or len(more) > len(value) or not all(_is_line(each) for each in more):
         return None
     reports = []
-    for entry, said in zip_longest(value, more, fillvalue=""):
+    for entry, description in zip_longest(value, more, fillvalue=""):
         if not isinstance(entry, list) or len(entry) != 3:
             return None
         agent, name, cost = entry
         is_valid = isinstance(agent, bytes) and len(agent) == ID_BYTES and _is_line(name)
         if not is_valid or not is_number(cost) or cost < 0:
             return None
-        reports.append(Reported(agent.hex(), name, float(cost), said))
+        reports.append(Reported(agent.hex(), name, float(cost), description))
     return tuple(reports)

@@ -86,9 +86,9 @@ class Directory:
     def announce(self, name: str, value: bytes, depth: int) -> Deferred[Any]:
         """Write the device's packed record at its places at ``depth``, then release its previous places."""
         lease = lease_at(depth, self.entangled.lease)
-        stands = {(key, name) for key in places_of(self._own_id, depth)}
-        self._old_places = (self._old_places | self._current_places) - stands
-        self._current_places = stands
+        new_places = {(key, name) for key in places_of(self._own_id, depth)}
+        self._old_places = (self._old_places | self._current_places) - new_places
+        self._current_places = new_places
         puts = [self.entangled.put(key, name, value, "leased", lease=lease) for key in places_of(self._own_id, depth)]
         return puts[0] if len(puts) == 1 and not self._old_places else self._release_old(puts)
 

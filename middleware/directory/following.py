@@ -85,8 +85,8 @@ class Following:
             for record in self.records
             if record.owner not in seen and not any(place.has(node_id(record.owner)) for place in listing.missed)
         }
-        gone, self._unseen = unseen & self._unseen, unseen
-        self._notify(record for record in self.records if record.owner not in gone)
+        removed, self._unseen = unseen & self._unseen, unseen
+        self._notify(record for record in self.records if record.owner not in removed)
 
     def _notify(self, records: Iterable[Record]) -> None:
         ordered = sorted(records, key=lambda record: (record.owner, record.name))

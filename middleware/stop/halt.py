@@ -150,8 +150,8 @@ class Halt:
         assert self._entangled is not None and self._rng is not None
         # Use a new id each time, so that a late release of an earlier stop does not end this one.
         stop = self._rng.randbytes(ID_BYTES)
-        made = [*(each for each in self._own_stops if each in self.stops), stop]
-        replaced, self._own_stops = made[:-MADE], made[-MADE:]
+        own_stops = [*(each for each in self._own_stops if each in self.stops), stop]
+        replaced, self._own_stops = own_stops[:-MADE], own_stops[-MADE:]
         return self._order(Statement({stop: clipped(by)}, tuple(replaced), clipped(by)), contacts)
 
     def release(self, stops: Iterable[bytes], by: str, contacts: Collection[Contact]) -> Deferred[dict[str, str]]:
@@ -178,16 +178,16 @@ class Halt:
         assert self._entangled is not None
 
         def answered(answer: Any) -> None:
-            said = answer[0] if isinstance(answer, list) and answer else ""
-            answers[uuid] = said if isinstance(said, str) else ""
+            activity = answer[0] if isinstance(answer, list) and answer else ""
+            answers[uuid] = activity if isinstance(activity, str) else ""
 
         def unanswered(failure: Any) -> None:
             failure.trap(EntangledError)
             answers[uuid] = UNHEARD if failure.check(NoAnswer) else failure.getErrorMessage()
 
         uuid = contact.node_id.hex()
-        asked = self._entangled.call(contact, METHOD, *order.packed(), changes=True)
-        return asked.addCallbacks(answered, unanswered)
+        request = self._entangled.call(contact, METHOD, *order.packed(), changes=True)
+        return request.addCallbacks(answered, unanswered)
 
     # -- orders of other nodes --------------------------------------------------------------------------------------
 
@@ -200,15 +200,15 @@ class Halt:
                 " to release, and the operator's name"
             )
         assert self._entangled is not None
-        said = self.take(peer.public, statement)
+        activity = self.take(peer.public, statement)
         obeyed = [[stop, by] for stop, by in list(self.stops.items())[-MAX_RELEASED:]]
 
         def saved(_: None) -> list[object]:
-            return [said, obeyed]
+            return [activity, obeyed]
 
         def unsaved(failure: Any) -> list[object]:
             failure.trap(EntangledError)
-            return [said + UNSAVED, obeyed]
+            return [activity + UNSAVED, obeyed]
 
         return self._entangled.store.written().addCallbacks(saved, unsaved)
 
@@ -254,17 +254,17 @@ class Halt:
 
     def _apply(self, is_new: bool) -> str:
         """Obey, then save and publish changes."""
-        said = self._obey()
+        activity = self._obey()
         if is_new:
             self._save()
             self._publish()
             self._review_later()
-        return said
+        return activity
 
     def _obey(self) -> str:
-        said = ", ".join(obey() for obey in self._obeying) or NO_ROBOT
-        self._report(list(self.stops), said if self.is_stopped else "")
-        return said
+        activity = ", ".join(obey() for obey in self._obeying) or NO_ROBOT
+        self._report(list(self.stops), activity if self.is_stopped else "")
+        return activity
 
     def _save(self) -> None:
         if self._entangled is not None:
@@ -322,10 +322,10 @@ class Halt:
         own = self._entangled.identity.public
         statements = [statement_in(record.owner, record.value) for record in self.records if record.name == SLOT]
         named = {stop for statement in statements if statement is not None for stop in statement.stops}
-        lost = {stop: by for stop, by in self.stops.items() if stop not in named}
-        room = ADOPTED - len(self._set.of(own))
-        if room > 0 and lost and self._may_order():
-            self._apply(self._merge(own, Statement(dict(list(lost.items())[-room:])), may_release=True))
+        orphaned = {stop: by for stop, by in self.stops.items() if stop not in named}
+        free_entries = ADOPTED - len(self._set.of(own))
+        if free_entries > 0 and orphaned and self._may_order():
+            self._apply(self._merge(own, Statement(dict(list(orphaned.items())[-free_entries:])), may_release=True))
 
     def _may_order(self) -> bool:
         assert self._entangled is not None

@@ -98,9 +98,9 @@ class Councils:
         None if that would be no improvement.  Fails with ``EntangledError`` if no node answers.
         """
         key, silent = group_key(task.task_id), council.silent(SILENT)
-        gone = {member.node_id for member in silent}
+        silent_ids = {member.node_id for member in silent}
         nodes = await self._entangled.find_node(key)
-        found = [node for node in nodes if node.node_id not in gone and self._may_sit(node.public)]
+        found = [node for node in nodes if node.node_id not in silent_ids and self._may_sit(node.public)]
         candidates = closest([*found, self._entangled.contact], key, len(found) + 1)
         return filled(council.members, silent, candidates, self._member_count(task))
 
@@ -120,12 +120,12 @@ def filled(
     Members that answer remain; ``candidates`` fill the other places in order, up to ``size``.  A change must increase
     the number of answering members that may be lost: three instead of two, but never four instead of three.
     """
-    gone, seated = {member.node_id for member in silent}, {member.node_id for member in members}
-    here = [member for member in members if member.node_id not in gone]
-    others = [one for one in candidates if one.node_id not in seated]
-    following = (*here, *others)[: max(size, len(here))]
+    silent_ids, member_ids = {member.node_id for member in silent}, {member.node_id for member in members}
+    responding = [member for member in members if member.node_id not in silent_ids]
+    others = [one for one in candidates if one.node_id not in member_ids]
+    following = (*responding, *others)[: max(size, len(responding))]
     following = odd(following)
-    if _spare(len(following), len(following)) <= _spare(len(here), len(members)):
+    if _spare(len(following), len(following)) <= _spare(len(responding), len(members)):
         return None
     return following
 
@@ -135,6 +135,6 @@ def odd(members: Sequence[Contact]) -> tuple[Contact, ...]:
     return tuple(members[: len(members) - 1 + len(members) % 2])
 
 
-def _spare(here: int, size: int) -> int:
-    """Return the number of members ``here`` that may be lost while the rest is a majority of ``size``."""
-    return here - majority(size)
+def _spare(responding: int, size: int) -> int:
+    """Return the number of members ``responding`` that may be lost while the rest is a majority of ``size``."""
+    return responding - majority(size)

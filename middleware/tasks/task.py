@@ -105,9 +105,9 @@ class Task:
 
     def with_newer_council(self, other: Task) -> Task:
         """Return this task with the quorum members of ``other``, if these are newer."""
-        mine, its = charter_of(self.charter), charter_of(other.charter)
-        is_newer = mine is not None and its is not None and mine.pin == its.pin and len(mine.links) < len(its.links)
-        return self.with_council(its) if is_newer and its is not None else self
+        own, newer = charter_of(self.charter), charter_of(other.charter)
+        is_newer = own is not None and newer is not None and own.pin == newer.pin and len(own.links) < len(newer.links)
+        return self.with_council(newer) if is_newer and newer is not None else self
 
     def packed(self) -> bytes:
         """Return the value of the task's record, without default values and fields that the charter has."""

@@ -130,38 +130,38 @@ class Parties:
         return len(self._held)
 
     def __iter__(self) -> Iterator[Party]:
-        return iter([held.party for held in self._held.values()])
+        return iter([entry.party for entry in self._held.values()])
 
     def get(self, digest: bytes) -> Party | None:
         """Return the party in the auction with this digest."""
-        held = self._held.get(digest)
-        return held.party if held is not None else None
+        entry = self._held.get(digest)
+        return entry.party if entry is not None else None
 
     def touch(self, digest: bytes, now: float) -> None:
         """Record activity in a party."""
-        held = self._held.get(digest)
-        if held is not None:
-            held.touched_at = now
+        entry = self._held.get(digest)
+        if entry is not None:
+            entry.touched_at = now
 
     def add(self, party: Party, opener: bytes, now: float) -> list[Party]:
         """Add ``party``, which ``opener`` (a node id, or ``OWN``) requested; returns the evicted parties."""
-        idle = [d for d, held in self._held.items() if held.opener != OWN and held.touched_at < now - LIFE_S]
-        gone = [self._held.pop(digest).party for digest in idle]
+        idle = [d for d, entry in self._held.items() if entry.opener != OWN and entry.touched_at < now - LIFE_S]
+        evicted = [self._held.pop(digest).party for digest in idle]
         while len(self._held) >= MAX_PARTIES:
-            counts = Counter(held.opener for held in self._held.values() if held.opener != OWN)
+            counts = Counter(entry.opener for entry in self._held.values() if entry.opener != OWN)
             if not counts:
                 break
             busiest = counts.most_common(1)[0][0]
-            digest = next(digest for digest, held in self._held.items() if held.opener == busiest)
-            gone.append(self._held.pop(digest).party)
+            digest = next(digest for digest, entry in self._held.items() if entry.opener == busiest)
+            evicted.append(self._held.pop(digest).party)
         self._held[party.auction.digest] = _Held(party, opener, now)
-        return gone
+        return evicted
 
     def own(self, digest: bytes, is_own: bool, opener: bytes = b"left") -> None:
         """Mark a party as this node's own, or not."""
-        held = self._held.get(digest)
-        if held is not None:
-            held.opener = OWN if is_own else opener
+        entry = self._held.get(digest)
+        if entry is not None:
+            entry.opener = OWN if is_own else opener
 
 
 class Dissemination:
@@ -217,14 +217,14 @@ class Dissemination:
         about = _auction_from(auction)
         if not 0 <= age_ms <= 1000 * MAX_WAITING:
             raise Refused(f"the age of an offer must be 0 to {1000 * MAX_WAITING:g} milliseconds")
-        given = self._checked_bids(about, bids)
+        checked = self._checked_bids(about, bids)
         # A peer may claim to send to all quorum members for its own bid only.
-        is_own = all(bid.public == peer.public for bid in given)
+        is_own = all(bid.public == peer.public for bid in checked)
         party = self._party_for(about, peer.node_id)
         if not party.has_room(peer):
             raise Refused("too many nodes send their bids here; use another contact that is nearer to the key")
         now = self._clock.seconds()
-        announcement = party.offered(given, peer, age_ms / 1000, is_shared and is_own, now)
+        announcement = party.offered(checked, peer, age_ms / 1000, is_shared and is_own, now)
         self._send_due(party)
         return announcement.packed() if announcement is not None else None
 
@@ -241,9 +241,9 @@ class Dissemination:
         about = _auction_from(auction)
         if about.exclusive:
             raise Refused("bids for an exclusive task must be sent to its quorum members")
-        given = self._checked_bids(about, bids)
+        checked = self._checked_bids(about, bids)
         party = self._party_for(about, peer.node_id)
-        party.cried(given, peer, self._clock.seconds())
+        party.cried(checked, peer, self._clock.seconds())
         self._send_due(party)
 
     # -- inside -----------------------------------------------------------------------------------------------------
@@ -266,8 +266,8 @@ class Dissemination:
             self._identity.sign,
             lambda reports: self._notify(auction.digest, reports),
         )
-        for gone in self._parties.add(party, opener, self._clock.seconds()):
-            self._cancel_timer(gone.auction.digest)
+        for evicted in self._parties.add(party, opener, self._clock.seconds()):
+            self._cancel_timer(evicted.auction.digest)
         return party
 
     def _checked_bids(self, auction: Auction, content: list[object]) -> list[Bid]:
@@ -330,9 +330,9 @@ class Dissemination:
     def leave(self, bidding: Bidding) -> None:
         """Stop notifying ``bidding``."""
         digest = bidding.auction.digest
-        here = [each for each in self._biddings.pop(digest, []) if each is not bidding]
-        if here:
-            self._biddings[digest] = here
+        remaining = [each for each in self._biddings.pop(digest, []) if each is not bidding]
+        if remaining:
+            self._biddings[digest] = remaining
         else:
             self._parties.own(digest, False)
 
@@ -386,9 +386,11 @@ class Dissemination:
             bids = [bid.packed() for bid in errand.bids]
             arguments = (OFFER, head, bids, _milliseconds(errand.age), errand.is_shared)
         method, *others = arguments
-        asked = self._wire.ask(errand.to, str(method), *others, timeout=ERRAND_S, changes=True)
-        asked.addCallbacks(self._on_answer, self._on_failure, callbackArgs=(party, errand), errbackArgs=(party, errand))
-        asked.addErrback(lambda failure: self._log.failure("sending bids failed", failure))
+        request = self._wire.ask(errand.to, str(method), *others, timeout=ERRAND_S, changes=True)
+        request.addCallbacks(
+            self._on_answer, self._on_failure, callbackArgs=(party, errand), errbackArgs=(party, errand)
+        )
+        request.addErrback(lambda failure: self._log.failure("sending bids failed", failure))
 
     def _on_answer(self, answer: object, party: Party, errand: Errand) -> None:
         if isinstance(errand, Offer) and answer is not None:

@@ -171,9 +171,9 @@ class Direct:
     def failed(self, offer: Offer, now: float) -> None:
         """Record that a member did not answer."""
         self._silent.add(offer.to.node_id)
-        asked = self._under_way.pop(offer.to.node_id, None)
+        sent_bid = self._under_way.pop(offer.to.node_id, None)
         tries, _ = self._pending.pop(offer.to.node_id, (0, now))
-        if asked is not self._bid:
+        if sent_bid is not self._bid:
             self._pending[offer.to.node_id] = (0, now)
         elif tries + 1 < MAX_TRIES:
             self._pending[offer.to.node_id] = (tries + 1, now + RETRY_PAUSE_S)

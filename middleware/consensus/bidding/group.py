@@ -57,10 +57,10 @@ class Roll:
         for uuid, member in self._present.items():
             if uuid in before and self._view.report(before[uuid]) != self._view.report(member):
                 self._drop_announced(uuid)
-        gone = before.keys() - self._present.keys()
-        for uuid in gone:
+        departed = before.keys() - self._present.keys()
+        for uuid in departed:
             self._drop_announced(uuid)
-        self._left = (self._left | gone) - self._present.keys()
+        self._left = (self._left | departed) - self._present.keys()
 
     def announced(self, reports: Iterable[Report]) -> None:
         """Process an announcement; members that it does not name are unchanged.

@@ -97,11 +97,11 @@ class Party:
         if self._teller is not None:
             self._teller.expected = bidders
 
-    def bid(self, bid: Bid, way: str, now: float) -> None:
+    def bid(self, bid: Bid, path: str, now: float) -> None:
         """Make or withdraw the own bid."""
         self._first_at = min(self._first_at, now)
         self.next_revision = max(self.next_revision, bid.revision + 1)
-        is_direct = way == DIRECT
+        is_direct = path == DIRECT
         if is_direct:
             self._direct.bid(bid, now)
         if self._teller is not None:
@@ -166,9 +166,9 @@ class Party:
         age = max(0.0, now - self._first_at) if self._first_at != math.inf else 0.0
         out: list[Errand] = []
         if self._teller is not None:
-            made = self._teller.announcement(self.announcement, self.audience.is_shared, now)
-            if made is not None:
-                self.announced(made, now)
+            new_announcement = self._teller.announcement(self.announcement, self.audience.is_shared, now)
+            if new_announcement is not None:
+                self.announced(new_announcement, now)
         out += self._gatherer.offers(age, now)
         if self._teller is None:
             out += self._check.offers(self.announcement, age, now)

@@ -30,9 +30,11 @@ class Rule:
 
     def merged(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
         """Return the join of two summaries: a subset of their reports, one per agent, in a defined order."""
-        given = {*a, *b}
+        known_reports = {*a, *b}
         try:
-            chosen = list(dict.fromkeys(report for report in self._merge(tuple(a), tuple(b)) if report in given))
+            chosen = list(
+                dict.fromkeys(report for report in self._merge(tuple(a), tuple(b)) if report in known_reports)
+            )
         except Exception as error:  # third-party code may raise anything
             self._blame("merge", error)
             return leading(a, b)
@@ -54,15 +56,15 @@ class Rule:
         return (min(reports, key=_sort_key).agent if reports else None), ""
 
 
-def leading(a: Sequence[Report], b: Sequence[Report], room: int = LEADING) -> tuple[Report, ...]:
-    """Return the ``room`` cheapest reports of both, one per agent; ties are broken by the agent's id."""
+def leading(a: Sequence[Report], b: Sequence[Report], limit: int = LEADING) -> tuple[Report, ...]:
+    """Return the ``limit`` cheapest reports of both, one per agent; ties are broken by the agent's id."""
     once: dict[str, Report] = {}
     for report in (*a, *b):
         known = once.get(report.agent)
         # Two different reports of one agent are rare; their content decides, not their order of arrival.
         if known is None or (report != known and (report.cost, repr(report)) < (known.cost, repr(known))):
             once[report.agent] = report
-    return tuple(sorted(once.values(), key=_sort_key)[:room])
+    return tuple(sorted(once.values(), key=_sort_key)[:limit])
 
 
 def _sort_key(report: Report) -> tuple[float, str]:

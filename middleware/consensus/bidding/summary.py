@@ -53,16 +53,16 @@ class Summary:
             known_reports = [bid.report for bid in self._bids.values() if bid.report is not None]
             self._standing = self._rule.merged(known_reports, ())
         else:
-            fresh = [bid.report for bid in newer.values() if bid.report is not None]
-            self._standing = self._rule.merged(self._standing, fresh)
+            new_reports = [bid.report for bid in newer.values() if bid.report is not None]
+            self._standing = self._rule.merged(self._standing, new_reports)
         self._remove_unneeded()
         return self._bids != before
 
     def _remove_unneeded(self) -> None:
         """Remove bids that neither stand nor replaced others, and replacing ones beyond the limit."""
         standing = {report.agent for report in self._standing}
-        kept = {agent: bid for agent, bid in self._bids.items() if agent in standing or bid.revision}
-        spare = [agent for agent in kept if agent not in standing]
-        for agent in spare[: max(0, len(spare) - MAX_SUPERSEDING)]:
-            del kept[agent]
-        self._bids = kept
+        needed = {agent: bid for agent, bid in self._bids.items() if agent in standing or bid.revision}
+        not_standing = [agent for agent in needed if agent not in standing]
+        for agent in not_standing[: max(0, len(not_standing) - MAX_SUPERSEDING)]:
+            del needed[agent]
+        self._bids = needed

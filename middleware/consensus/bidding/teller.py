@@ -99,10 +99,10 @@ class Teller:
             if now < self._send_at[fellow.node_id] or fellow.node_id in self._under_way:
                 continue
             self._send_at[fellow.node_id] = math.inf
-            fresh = self._missing_bids(fellow.node_id)
-            if fresh:
+            missing = self._missing_bids(fellow.node_id)
+            if missing:
                 self._under_way.add(fellow.node_id)
-                out.append(Offer(fellow, fresh, age))
+                out.append(Offer(fellow, missing, age))
         return out
 
     def answered(self, offer: Offer, now: float) -> None:

@@ -97,12 +97,12 @@ class Branch:
         if now < self.due:
             return []
         self._send_at = math.inf
-        fresh = tuple(b for b in self.summary.bids() if self._confirmed.get(b.agent) != b.rank)
+        unconfirmed = tuple(b for b in self.summary.bids() if self._confirmed.get(b.agent) != b.rank)
         parent = self._parent if self._parent is not None else self._next_parent()
-        if not fresh or parent is None:
+        if not unconfirmed or parent is None:
             return []
         self._parent, self._has_sent = parent, True
-        self._under_way = Offer(parent, fresh[:MAX_BIDS], age)
+        self._under_way = Offer(parent, unconfirmed[:MAX_BIDS], age)
         return [self._under_way]
 
     def answered(self, offer: Offer, now: float) -> None:

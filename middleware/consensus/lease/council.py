@@ -118,10 +118,10 @@ class Council:
 
         if not others:
             self._note_silence()
-        asked = Round([Tally(len(members), kinds)], ask, decode, self._clock, self.ttl / 3, short)
+        sent_round = Round([Tally(len(members), kinds)], ask, decode, self._clock, self.ttl / 3, short)
         if not others:
-            self._last = asked, members
-        return asked
+            self._last = sent_round, members
+        return sent_round
 
     def visit(self) -> None:
         """Probe the members without a claim; see ``silent``."""
@@ -199,11 +199,11 @@ class Council:
     def _note_silence(self) -> None:
         """Record the members that did and did not answer the last round."""
         if self._last is not None:
-            asked, members = self._last
-            for place in asked.answered:
+            sent_round, members = self._last
+            for place in sent_round.answered:
                 self._silent_since.pop(members[place].node_id, None)
-            for place in asked.silent:
-                self._silent_since.setdefault(members[place].node_id, asked.began_at)
+            for place in sent_round.silent:
+                self._silent_since.setdefault(members[place].node_id, sent_round.began_at)
 
     async def _close(self, token: int) -> None:
         over_at = 0.0
@@ -256,8 +256,8 @@ class Council:
     async def _change(self, wanted: tuple[Contact, ...], keep: bool) -> None:
         before = self.configuration
         ballot = self.next_ballot()
-        asked = self.round("lease.prepare", ballot.counter, self.ttl, kinds=(Kind.GRANTED, Kind.SEALED))
-        prepared = await asked.outcome
+        sent_round = self.round("lease.prepare", ballot.counter, self.ttl, kinds=(Kind.GRANTED, Kind.SEALED))
+        prepared = await sent_round.outcome
         prepared.close()
         self.hear(prepared)
         if self.configuration != before:
@@ -319,8 +319,8 @@ class Council:
         """Inform ``member`` of the current configuration."""
         charter = charter or self.charter
         if charter is not None and charter.links:
-            news = (self.task_id, charter.packed, False, self.ttl)
-            self._ask(member, "lease.install", news).addErrback(lambda _: None)
+            arguments = (self.task_id, charter.packed, False, self.ttl)
+            self._ask(member, "lease.install", arguments).addErrback(lambda _: None)
 
     def _adopt(self, charter: Charter, is_news: bool = True) -> None:
         if charter.configuration > self.configuration:
@@ -332,9 +332,11 @@ class Council:
 def _raise_rejection(round_: Round, what: str) -> None:
     """Raise the error that explains why there was no majority."""
     replies: list[Reply] = list(round_.tally.replies.values())
-    held = [reply.remaining for reply in replies if reply.kind is Kind.HELD]
-    if held:
-        raise OpenClaim(f"{what}: an agent holds a lease, which expires in {max(held):.2f} s unless it is renewed")
+    lease_times = [reply.remaining for reply in replies if reply.kind is Kind.HELD]
+    if lease_times:
+        raise OpenClaim(
+            f"{what}: an agent holds a lease, which expires in {max(lease_times):.2f} s unless it is renewed"
+        )
     if any(reply.kind is Kind.OUTBID for reply in replies):
         raise NoMajority(f"{what}: another claimant was faster; try again")
     if any(reply.kind is Kind.OVER for reply in replies) and Kind.OVER not in round_.tally.kinds:

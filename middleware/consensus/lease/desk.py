@@ -155,14 +155,14 @@ class Desk:
         charter = self._judge.read(task_id, packed)
         if charter is None or not charter.links:
             raise Refused("new quorum members need the signatures of a majority of the previous ones")
-        mine = keep and charter.ballot.proposer == peer.node_id.hex()
+        is_own_change = keep and charter.ballot.proposer == peer.node_id.hex()
         reply = self._acceptor.install(
             task_id,
             charter.configuration,
             charter.members,
             charter.token,
             self._clock.seconds(),
-            charter.ballot if mine else NONE,
+            charter.ballot if is_own_change else NONE,
             float(ttl),
             packed,
         )

@@ -238,7 +238,7 @@ class Lessee:
 
     # -- transitions ------------------------------------------------------------------------------------------------
 
-    def _handle(self, event: Event, asked: Round | None = None, delay: float = 0.0) -> None:
+    def _handle(self, event: Event, round_: Round | None = None, delay: float = 0.0) -> None:
         """Go to the next state and perform the actions.
 
         :param asked: the round whose result the event is
@@ -248,9 +248,9 @@ class Lessee:
         self._steps = step = self._steps + 1
         for action in actions:
             if self._steps == step:  # otherwise the listener has caused another transition, which replaces this one
-                self._perform(action, asked, delay)
+                self._perform(action, round_, delay)
 
-    def _perform(self, action: Action, asked: Round | None, delay: float) -> None:
+    def _perform(self, action: Action, round_: Round | None, delay: float) -> None:
         match action:
             case Action.CANCEL:
                 self._cancel()
@@ -264,8 +264,8 @@ class Lessee:
                 self._cancel()
                 self._propose(self._held.ballot, self.token)
             case Action.COMPLETE:
-                assert asked is not None
-                completing = Deferred.fromCoroutine(self.council.finish(self._claimed, asked))
+                assert round_ is not None
+                completing = Deferred.fromCoroutine(self.council.finish(self._claimed, round_))
                 completing.addErrback(lambda failure: failure.trap(EntangledError))
                 completing.addBoth(lambda _: self._handle(Event.COMPLETED))
             case Action.LEAP:
@@ -280,8 +280,8 @@ class Lessee:
                     self._lose()
             case Action.NOTIFY:
                 self._changed()
-            case Action.LINE_UP if asked is not None:
-                self._estimate_end(asked)
+            case Action.LINE_UP if round_ is not None:
+                self._estimate_end(round_)
             case Action.LINE_UP:
                 self._schedule_claim(self._rng.uniform(*JITTER))
             case Action.AFTER_RANK:
@@ -302,19 +302,19 @@ class Lessee:
     def _look(self) -> None:
         """Poll whether the lease is free, without a promise."""
         self._cancel()
-        self._round = asked = self.council.round("lease.prepare", 0, self.council.ttl, short=0.0)
-        asked.outcome.addCallback(self._on_look, self.council.configuration)
+        self._round = round_ = self.council.round("lease.prepare", 0, self.council.ttl, short=0.0)
+        round_.outcome.addCallback(self._on_look, self.council.configuration)
 
-    def _on_look(self, asked: Round, configuration: int) -> None:
-        if not self._is_current(asked):
+    def _on_look(self, round_: Round, configuration: int) -> None:
+        if not self._is_current(round_):
             return
-        asked.close()
+        round_.close()
         if self.council.configuration != configuration:
             # Only members of the newest council know the standbys, and notify them of a release.
             self._handle(Event.RECONFIGURED)
         else:
-            is_free = asked.tally.is_won and not self._stagger()
-            self._handle(Event.FREE if is_free else Event.TAKEN, asked)
+            is_free = round_.tally.is_won and not self._stagger()
+            self._handle(Event.FREE if is_free else Event.TAKEN, round_)
 
     def _prepare(self) -> None:
         """Ask for promises; a held lease stays valid meanwhile."""
@@ -322,20 +322,20 @@ class Lessee:
         self._claimed = ballot = self.council.next_ballot()
         kinds = (Kind.GRANTED, Kind.SEALED)
         question = ballot.counter, self.council.ttl
-        self._round = asked = self.council.round("lease.prepare", *question, kinds=kinds, short=self._short)
-        asked.outcome.addCallback(self._on_promises, self.council.configuration)
+        self._round = round_ = self.council.round("lease.prepare", *question, kinds=kinds, short=self._short)
+        round_.outcome.addCallback(self._on_promises, self.council.configuration)
 
-    def _on_promises(self, asked: Round, configuration: int) -> None:
-        if not self._is_current(asked):
+    def _on_promises(self, round_: Round, configuration: int) -> None:
+        if not self._is_current(round_):
             return
         if self.council.configuration != configuration:
             return self._handle(Event.RECONFIGURED)
-        if not asked.tally.is_won:
-            return self._on_failure(asked)
-        asked.close()
-        wait = asked.free_in() - LEAD if self.lease is None else 0.0
-        if asked.tally.to_complete is not None:
-            self._handle(Event.UNFINISHED, asked)
+        if not round_.tally.is_won:
+            return self._on_failure(round_)
+        round_.close()
+        wait = round_.free_in() - LEAD if self.lease is None else 0.0
+        if round_.tally.to_complete is not None:
+            self._handle(Event.UNFINISHED, round_)
         elif wait > 0.0:
             # The lease is about to expire, or the robot of its last holder to stop.
             self._handle(Event.EARLY_PROMISES, delay=wait)
@@ -351,51 +351,51 @@ class Lessee:
 
     def _propose(self, ballot: Ballot, token: int) -> None:
         question = ballot.counter, token, self.council.ttl
-        self._round = asked = self.council.round("lease.propose", *question, short=self._short)
-        asked.outcome.addCallback(self._on_grants, ballot, token)
+        self._round = round_ = self.council.round("lease.propose", *question, short=self._short)
+        round_.outcome.addCallback(self._on_grants, ballot, token)
 
-    def _on_grants(self, asked: Round, ballot: Ballot, token: int) -> None:
-        if not self._is_current(asked):
+    def _on_grants(self, round_: Round, ballot: Ballot, token: int) -> None:
+        if not self._is_current(round_):
             return
-        deadline = self._deadline_of(asked) if asked.tally.is_won else 0.0
+        deadline = self._deadline_of(round_) if round_.tally.is_won else 0.0
         if deadline <= self._clock.seconds():
-            return self._on_failure(asked)
+            return self._on_failure(round_)
         self._held = _Held(token, deadline, ballot)
         # The device's clock may be slower than this client's.
         self._robot_stops_at = deadline + self._stop_time + self.council.ttl * CLOCK_MARGIN
         # A member that may not grant anything yet does not need another ballot.
-        others = [reply for reply in asked.tally.replies.values() if reply.kind not in (Kind.GRANTED, Kind.QUIET)]
+        others = [reply for reply in round_.tally.replies.values() if reply.kind not in (Kind.GRANTED, Kind.QUIET)]
         self._handle(Event.PARTIAL_GRANTS if others else Event.GRANTS)
 
     def _deadline_of(self, won: Round) -> float:
         """Return the time, on the own clock, by which the robot must stand still."""
         return won.sent_at + self.council.ttl * (1.0 - CLOCK_MARGIN) - self._stop_time
 
-    def _is_current(self, asked: Round) -> bool:
+    def _is_current(self, round_: Round) -> bool:
         """Process a round; return whether it is the newest one and the task has not ended."""
-        self.council.hear(asked)
-        if self._round is not asked:
+        self.council.hear(round_)
+        if self._round is not round_:
             return False
-        over = [reply for reply in asked.tally.replies.values() if reply.kind is Kind.OVER]
+        over = [reply for reply in round_.tally.replies.values() if reply.kind is Kind.OVER]
         if len(over) >= majority(len(self.council.members)):
             self._handle(Event.ENDED)
         return not self.is_over
 
-    def _on_failure(self, asked: Round) -> None:
-        asked.close()
+    def _on_failure(self, round_: Round) -> None:
+        round_.close()
         if self.lease is None:
-            self._handle(Event.REJECTED, asked)
+            self._handle(Event.REJECTED, round_)
         else:
             # A member that has promised a higher ballot needs a new one; there is time for it before the deadline.
-            is_outbid = any(reply.kind is Kind.OUTBID for reply in asked.tally.replies.values())
+            is_outbid = any(reply.kind is Kind.OUTBID for reply in round_.tally.replies.values())
             self._handle(Event.OUTBID if is_outbid else Event.KEPT)
 
     # -- times ------------------------------------------------------------------------------------------------------
 
-    def _estimate_end(self, asked: Round) -> None:
+    def _estimate_end(self, round_: Round) -> None:
         """Estimate the end of the lease from a failed round, and set the timer."""
-        is_outbid = any(reply.kind is Kind.OUTBID for reply in asked.tally.replies.values())
-        free_in = asked.free_in()
+        is_outbid = any(reply.kind is Kind.OUTBID for reply in round_.tally.replies.values())
+        free_in = round_.free_in()
         if is_outbid and free_in == math.inf:
             free_in = 0.0  # the other members did not answer; under a higher ballot they may
         self._standby.ends_at, self._standby.is_outbid = self._clock.seconds() + free_in, is_outbid

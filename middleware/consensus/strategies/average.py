@@ -31,7 +31,7 @@ class Average(Nearest):
         return led_by(self.name, order, counted, f"{self.name} of {len(order)}", value=value)
 
     def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
-        """Return the newest value of each agent, for the first task by name.
+        """Return the newest value of each agent, for the task whose id sorts first.
 
         If the values have different numbers of coordinates, only those with the fewest count.
         """

@@ -28,23 +28,23 @@ class Cbba(Sharing):
         items = listed(items)
         wanted = {item.task for item in items}
         counted = [r for r in standing(contacts) if r.task in wanted]
-        room = capacities(counted)
-        costs: dict[str, dict[str, int]] = {agent: {} for agent in room}
+        capacity_left = capacities(counted)
+        costs: dict[str, dict[str, int]] = {agent: {} for agent in capacity_left}
         for report in counted:
             costs[report.agent][report.task] = exact(report.cost)
-        owners = exchanged(greedy(costs, room), costs, room)
+        owners = exchanged(greedy(costs, capacity_left), costs, capacity_left)
         return shared_out(self.name, counted, items, {task: [agent] for task, agent in owners.items()})
 
 
 def greedy(costs: Mapping[str, Mapping[str, float]], capacities: Mapping[str, int]) -> dict[str, str]:
     """Return the agent of each task: always the cheapest remaining pair is assigned next; ties are broken by id."""
-    room = dict(capacities)
+    capacity_left = dict(capacities)
     owner: dict[str, str] = {}
     pairs: Iterable[tuple[float, str, str]] = sorted((c, a, t) for a, row in costs.items() for t, c in row.items())
     for _, agent, task in pairs:
-        if task not in owner and room.get(agent, 1) > 0:
+        if task not in owner and capacity_left.get(agent, 1) > 0:
             owner[task] = agent
-            room[agent] = room.get(agent, 1) - 1
+            capacity_left[agent] = capacity_left.get(agent, 1) - 1
     return owner
 
 
@@ -57,12 +57,15 @@ def exchanged(
     gap between a greedy and an optimal assignment.
     """
     owner = dict(sorted(owners.items()))
-    held = Counter(owner.values())
-    room = {agent: capacities.get(agent, 1) - held[agent] for agent in costs}
-    free = {agent for agent, places in room.items() if places > 0}
+    task_counts = Counter(owner.values())
+    capacity_left = {agent: capacities.get(agent, 1) - task_counts[agent] for agent in costs}
+    free = {agent for agent, places in capacity_left.items() if places > 0}
     known = {agent: sorted(costs[agent].keys() & owner.keys()) for agent in costs}
     for _ in range(SWEEPS):
-        changed = [_move_task(task, owner, costs, room, free) | _swap_task(task, owner, costs, known) for task in owner]
+        changed = [
+            _move_task(task, owner, costs, capacity_left, free) | _swap_task(task, owner, costs, known)
+            for task in owner
+        ]
         if not any(changed):
             break
     return owner
@@ -72,7 +75,7 @@ def _move_task(
     task: str,
     owner: dict[str, str],
     costs: Mapping[str, Mapping[str, int]],
-    room: dict[str, int],
+    capacity_left: dict[str, int],
     free: set[str],
 ) -> bool:
     """Assign the task to the agent with the lowest cost among the agents with capacity left (``free``)."""
@@ -83,8 +86,8 @@ def _move_task(
     then = min(offers)[1]
     owner[task] = then
     for agent, more in ((now, 1), (then, -1)):
-        room[agent] += more
-        (free.add if room[agent] > 0 else free.discard)(agent)
+        capacity_left[agent] += more
+        (free.add if capacity_left[agent] > 0 else free.discard)(agent)
     return True
 
 
@@ -92,16 +95,16 @@ def _swap_task(
     task: str, owner: dict[str, str], costs: Mapping[str, Mapping[str, int]], known: Mapping[str, list[str]]
 ) -> bool:
     """Swap the task for the one that lowers the total cost most; ``known`` has the tasks that each agent bid for."""
-    mine = owner[task]
-    row = costs[mine]
+    own_agent = owner[task]
+    row = costs[own_agent]
     least, best = 0, ""
-    for other in known[mine]:
-        theirs = owner[other]
-        if theirs != mine and task in costs[theirs]:
-            gain = row[other] + costs[theirs][task] - row[task] - costs[theirs][other]
+    for other in known[own_agent]:
+        other_agent = owner[other]
+        if other_agent != own_agent and task in costs[other_agent]:
+            gain = row[other] + costs[other_agent][task] - row[task] - costs[other_agent][other]
             if gain < least:
                 least, best = gain, other
     if not best:
         return False
-    owner[task], owner[best] = owner[best], mine
+    owner[task], owner[best] = owner[best], own_agent
     return True

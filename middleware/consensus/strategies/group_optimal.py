@@ -29,11 +29,11 @@ class GroupOptimal(Sharing):
         items = listed(items)
         slots = {item.task: item.slots for item in items}
         counted = [r for r in standing(contacts) if r.task in slots]
-        room = capacities(counted)
+        capacity_left = capacities(counted)
         rows = [task for task, places in slots.items() for _ in range(places)]
         bids = cheapest(counted, self.bids)
         while True:
-            owners = _solve(rows, room, bids)
+            owners = _solve(rows, capacity_left, bids)
             uncovered = {task for task, places in slots.items() if len(owners.get(task, ())) < places}
             more = {(r.task, r.agent): exact(r.cost) for r in counted if r.task in uncovered}
             if more.items() <= bids.items():
@@ -53,9 +53,9 @@ def cheapest(contacts: Iterable[Report], most: int) -> dict[tuple[str, str], int
     }
 
 
-def _solve(rows: list[str], room: dict[str, int], bids: dict[tuple[str, str], int]) -> dict[str, list[str]]:
+def _solve(rows: list[str], capacity_left: dict[str, int], bids: dict[tuple[str, str], int]) -> dict[str, list[str]]:
     """Return the agents of each task; each agent at most once per task."""
-    columns = [agent for agent, places in room.items() for _ in range(min(places, len(rows)))]
+    columns = [agent for agent, places in capacity_left.items() for _ in range(min(places, len(rows)))]
     of_agent: dict[str, list[int]] = {}
     for column, agent in enumerate(columns):
         of_agent.setdefault(agent, []).append(column)

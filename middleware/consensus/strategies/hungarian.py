@@ -81,20 +81,20 @@ def _augment(costs: Costs, prices: list[float], owner: list[int], row: int) -> N
     scanned: list[int] = []
     while True:
         reached = min(unscanned, key=length.__getitem__)
-        so_far = length[reached]
+        shortest = length[reached]
         if owner[reached] < 0:
             break
         unscanned.remove(reached)
         scanned.append(reached)
         through = owner[reached]
         line = costs[through]
-        base = so_far - line[reached] + prices[reached]
+        base = shortest - line[reached] + prices[reached]
         for column in unscanned:
-            if (there := base + line[column] - prices[column]) < length[column]:
-                length[column] = there
+            if (candidate_length := base + line[column] - prices[column]) < length[column]:
+                length[column] = candidate_length
                 before[column] = through
     for column in scanned:
-        prices[column] += length[column] - so_far
+        prices[column] += length[column] - shortest
     where = {owner[column]: column for column in scanned}
     while True:
         through = before[reached]
@@ -127,25 +127,25 @@ def first_of_equals(costs: Costs, columns: Sequence[int], prices: Sequence[float
 
 def _exchange_columns(row: int, wanted: int, columns: list[int], owner: dict[int, int], tight: list[list[int]]) -> bool:
     """Give ``wanted`` to ``row`` by a cycle of exchanges with later rows; returns False if there is no such cycle."""
-    came = {wanted: row}
+    reached_from = {wanted: row}
     line = [wanted]
     rows = len(tight) - 1
     has_expanded_unassigned = False
     for column in line:
         if column == columns[row]:
             while True:
-                through = came[column]
-                left, columns[through], owner[column] = columns[through], column, through
+                through = reached_from[column]
+                freed, columns[through], owner[column] = columns[through], column, through
                 if through == row:
                     return True
-                column = left
+                column = freed
         holder = owner[column]
         if holder >= rows and has_expanded_unassigned:
             continue  # all unassigned columns have the same exchanges: expand only the first
         has_expanded_unassigned |= holder >= rows
         if holder > row:
             for other in tight[min(holder, rows)]:
-                if other not in came:
-                    came[other] = holder
+                if other not in reached_from:
+                    reached_from[other] = holder
                     line.append(other)
     return False

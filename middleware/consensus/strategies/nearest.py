@@ -45,7 +45,7 @@ class Nearest:
 def best_of(contacts: Sequence[Report], rank: Callable[[Report], float]) -> list[Report]:
     """Return the best reports by ``rank``, one per agent, the best first.
 
-    Of several tasks only the first by name counts.
+    Of several tasks only the one whose id sorts first counts.
     """
     counted = standing(contacts, rank)
     return sorted((r for r in counted if r.task == counted[0].task), key=lambda r: (rank(r), r.agent))[:KEPT]

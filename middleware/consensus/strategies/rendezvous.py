@@ -52,11 +52,11 @@ def centre(points: Sequence[Point]) -> Point:
         return ((places[0][0] + places[-1][0]) / 2.0,)
     if len(places[0]) == 2:
         return _clamp(_smallest_circle(places)[0], places)
-    here = mean(places, [1.0] * len(places))
+    estimate = mean(places, [1.0] * len(places))
     for step in range(1, STEPS + 1):  # Badoiu and Clarkson 2003
-        far = max(places, key=lambda p: math.dist(here, p))
-        here = tuple(a + (b - a) / (step + 1) for a, b in zip(here, far, strict=True))
-    return here
+        far = max(places, key=lambda p: math.dist(estimate, p))
+        estimate = tuple(a + (b - a) / (step + 1) for a, b in zip(estimate, far, strict=True))
+    return estimate
 
 
 def median(points: Sequence[Point], weights: Sequence[float]) -> Point:
@@ -64,16 +64,16 @@ def median(points: Sequence[Point], weights: Sequence[float]) -> Point:
     pairs = sorted(zip(points, weights, strict=True))
     places, shares = [p for p, _ in pairs], [w for _, w in pairs]
     best = min(places, key=lambda p: (_total_distance(p, places, shares), p))
-    here = mean(places, shares)
+    estimate = mean(places, shares)
     for _ in range(STEPS):
-        near = [w / max(math.dist(here, p), SLACK) for p, w in pairs]
-        here = mean(places, near)
+        near = [w / max(math.dist(estimate, p), SLACK) for p, w in pairs]
+        estimate = mean(places, near)
     # If the median is one of the places, the iterations converge to it slowly.
-    return best if _total_distance(best, places, shares) <= _total_distance(here, places, shares) else here
+    return best if _total_distance(best, places, shares) <= _total_distance(estimate, places, shares) else estimate
 
 
-def _total_distance(here: Point, places: Sequence[Point], weights: Sequence[float]) -> float:
-    return math.fsum(w * math.dist(here, p) for p, w in zip(places, weights, strict=True))
+def _total_distance(estimate: Point, places: Sequence[Point], weights: Sequence[float]) -> float:
+    return math.fsum(w * math.dist(estimate, p) for p, w in zip(places, weights, strict=True))
 
 
 def _smallest_circle(places: Sequence[Point]) -> tuple[Point, float]:

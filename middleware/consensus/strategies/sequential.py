@@ -52,10 +52,10 @@ def ways_of(contacts: Sequence[Report], items: Sequence[Item]) -> dict[str, list
     sizes = {len(place) for place in (*starts.values(), *places.values())}
     if len(sizes) != 1 or 0 in sizes:
         return None
-    room = capacities(counted)
-    wanted = {agent: set(places) if "" in tasks else tasks & places.keys() for agent, tasks in able.items()}
-    routes = _run_auction(starts, places, room, wanted)
-    _improve_routes(routes, starts, places, room, wanted)
+    capacity_left = capacities(counted)
+    biddable = {agent: set(places) if "" in tasks else tasks & places.keys() for agent, tasks in able.items()}
+    routes = _run_auction(starts, places, capacity_left, biddable)
+    _improve_routes(routes, starts, places, capacity_left, biddable)
     return routes
 
 
@@ -77,29 +77,34 @@ def insertion(start: Place, route: Sequence[Place], place: Place) -> tuple[float
 
 
 def _run_auction(
-    starts: Mapping[str, Place], places: Mapping[str, Place], room: Mapping[str, int], wanted: Mapping[str, set[str]]
+    starts: Mapping[str, Place],
+    places: Mapping[str, Place],
+    capacity_left: Mapping[str, int],
+    biddable: Mapping[str, set[str]],
 ) -> dict[str, list[str]]:
     routes: dict[str, list[str]] = {agent: [] for agent in sorted(starts)}
-    left = set(places)
+    unsold = set(places)
     bids = [
         (math.dist(starts[agent], places[task]), agent, task, 0)
         for agent in routes
-        if room[agent] > 0
-        for task in wanted[agent]
+        if capacity_left[agent] > 0
+        for task in biddable[agent]
     ]
     heapq.heapify(bids)
-    while left and bids:
+    while unsold and bids:
         _, agent, task, sold = heapq.heappop(bids)
         route = routes[agent]
-        if task not in left or sold != len(route) or sold >= room[agent]:
+        if task not in unsold or sold != len(route) or sold >= capacity_left[agent]:
             continue  # bid made before the agent's route changed
-        here = [places[t] for t in route]
-        route.insert(insertion(starts[agent], here, places[task])[1], task)
-        left.discard(task)
-        if len(route) < room[agent]:
-            here = [places[t] for t in route]
-            for other in left & wanted[agent]:
-                heapq.heappush(bids, (insertion(starts[agent], here, places[other])[0], agent, other, len(route)))
+        route_places = [places[t] for t in route]
+        route.insert(insertion(starts[agent], route_places, places[task])[1], task)
+        unsold.discard(task)
+        if len(route) < capacity_left[agent]:
+            route_places = [places[t] for t in route]
+            for other in unsold & biddable[agent]:
+                heapq.heappush(
+                    bids, (insertion(starts[agent], route_places, places[other])[0], agent, other, len(route))
+                )
     return routes
 
 
@@ -107,19 +112,19 @@ def _improve_routes(
     routes: dict[str, list[str]],
     starts: Mapping[str, Place],
     places: Mapping[str, Place],
-    room: Mapping[str, int],
-    wanted: Mapping[str, set[str]],
+    capacity_left: Mapping[str, int],
+    biddable: Mapping[str, set[str]],
 ) -> None:
     """Move single tasks to where they cost less, and reverse route segments, until nothing improves."""
     owners = {task: agent for agent, route in routes.items() for task in route}
     bidders: dict[str, list[str]] = {task: [] for task in sorted(owners)}
     for agent in routes:
-        for task in wanted[agent] & bidders.keys():
+        for task in biddable[agent] & bidders.keys():
             bidders[task].append(agent)
     for _ in range(SWEEPS):
         is_changed = False
         for task in bidders:
-            is_changed |= _move_task(task, owners, bidders[task], routes, starts, places, room)
+            is_changed |= _move_task(task, owners, bidders[task], routes, starts, places, capacity_left)
         for agent, route in routes.items():
             is_changed |= _reverse_segments(route, starts[agent], places)
         if not is_changed:
@@ -133,7 +138,7 @@ def _move_task(
     routes: dict[str, list[str]],
     starts: Mapping[str, Place],
     places: Mapping[str, Place],
-    room: Mapping[str, int],
+    capacity_left: Mapping[str, int],
 ) -> bool:
     owner = owners[task]
     number = routes[owner].index(task)
@@ -144,10 +149,10 @@ def _move_task(
     best = (saving - NO_GAIN, owner, number)
     for agent in bidders:
         route = routes[agent]
-        if agent != owner and len(route) >= room[agent]:
+        if agent != owner and len(route) >= capacity_left[agent]:
             continue
-        here = [places[t] for t in (rest if agent == owner else route)]
-        growth, index = insertion(starts[agent], here, places[task])
+        route_places = [places[t] for t in (rest if agent == owner else route)]
+        growth, index = insertion(starts[agent], route_places, places[task])
         if growth < best[0]:
             best = (growth, agent, index)
     if best[1:] == (owner, number):

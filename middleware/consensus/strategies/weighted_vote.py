@@ -44,7 +44,7 @@ class WeightedVote(Nearest):
         return led_by(self.name, side, counted, f"{best} of {tally}", choice=best)
 
     def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
-        """Return the newest vote of each agent, for the first task by name."""
+        """Return the newest vote of each agent, for the task whose id sorts first."""
         counted = standing((*a, *b), lambda report: -report.sequence)
         return tuple(r for r in counted if r.task == counted[0].task)
 
