@@ -1,7 +1,7 @@
 """The interface of behaviours: pure code that performs one kind of task with one robot, loaded by name.
 
-A behaviour receives observations and returns actions.  It knows neither peers nor leases: the agent decides whether the
-behaviour may act.
+A behaviour receives observations and returns actions (``drivers.reading``).  It knows neither peers nor leases: the
+agent decides whether the behaviour may act.
 """
 
 from __future__ import annotations
@@ -52,10 +52,10 @@ class Behaviour(Protocol):
         """The cost of the task for this robot, at least 0 (metres, for a distance); None while it is unknown."""
 
     def search(self, now: float) -> Action:
-        """Return the next action while the cost is unknown."""
+        """Return the next action while the cost is unknown; the agent holds no lease."""
 
     def hold(self, now: float) -> Action:
-        """Return the next action while another robot acts."""
+        """Return the next action while the cost is known and the agent holds no lease."""
 
     def execute(self, context: Context) -> Action | None:
         """Return the next action of the task; None if the task is done."""

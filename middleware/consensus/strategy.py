@@ -107,21 +107,25 @@ class Consensus:
 class ConsensusAlgorithm(Protocol):
     """The interface of a strategy.  Each method is a pure function: equal reports in any order give an equal result.
 
-    A strategy may also have an attribute ``reads``: the names out of ``READABLE`` of the fields that it uses besides
-    the cost. ``middleware.consensus.conformance`` tests an implementation against all rules.
+    Invalid reports (``refusal``) must not affect any result; ``standing`` removes them.  Ties must be broken equally at
+    every node, for example by uuid.  ``middleware.consensus.conformance`` tests an implementation against all rules.
+
+    A strategy may also have an attribute ``reads``, the names out of ``READABLE`` of the fields that it uses besides
+    the cost, and a method ``find_group`` to decide several tasks at once (``middleware.consensus.item``).
     """
 
     name: str
     version: str
 
     def find(self, contacts: Sequence[Report]) -> Consensus:
-        """Decide from the reports of all agents, including the caller's."""
+        """Decide from the reports of all agents, including the caller's; without reports, assign no agent."""
 
     def improves(self, current: Report, offer: Report, hysteresis: float) -> bool:
         """Return whether ``offer`` is better than ``current`` by more than ``hysteresis``.
 
         ``hysteresis`` is a share of the cost (0.1: 10 %).
         ``current`` is the report of the agent that acts now; if True, the task is reassigned to the agent of ``offer``.
+        An equal or invalid offer is never better.
         """
 
     def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
