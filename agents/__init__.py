@@ -1,5 +1,6 @@
-"""The minds: observe, report, confer, execute, give back (thesis, Algorithm 4.5).
+"""Agents: observe, report, decide, execute and release for one device (thesis, Algorithm 4.5).
 
-``loop`` turns observations into actions, ``engagement`` is one task from assignment to end, ``decision`` the pure rule
-between; ``behaviour`` is what a kind of task looks like, with one file a behaviour beside it.
+``loop`` turns observations into actions.  ``engagement`` is an agent's part in one task from assignment to end, and
+``decision`` the pure decision rule.  ``behaviour`` is the interface of behaviours; the built-in ones are in the other
+modules.
 """

@@ -1,7 +1,7 @@
-"""Behaviour: how a body does one kind of task; pure, and loaded by name.
+"""The interface of behaviours: pure code that performs one kind of task with one robot, loaded by name.
 
-A behaviour sees observations and names actions.  It knows neither peers nor leases: whether it may act is decided
-outside.
+A behaviour receives observations and returns actions (``drivers.reading``).  It knows neither peers nor leases: the
+agent decides whether the behaviour may act.
 """
 
 from __future__ import annotations
@@ -28,78 +28,83 @@ VISION = ("cv2", "numpy")
 
 
 class Behaviour(Protocol):
-    """One body at one task.
+    """One robot's execution of one task.
 
-    A behaviour may also have: ``is_safe``, whether the task may change hands now (usually it always may);
-    ``progress``, the share that is done, 0 to 1; ``valid_for``, the seconds for which its cost counts (usually as long
-    as its node lives); ``angle`` and ``take_post``, see ``agents.formation``; ``embody``, which is given what the
-    body can do before the first look, see ``agents.means``; ``close``, called when its agent has left the task.  For
-    strategies that go by it: ``value``, the number or the place that it has to offer (a tuple; metres), ``choice``, the
-    option that it is for, the ``weight`` of both, and
-    ``electorate``, the weight of all that may vote.
+    The constructor gets the task's parameters and a random generator, and raises ``ValueError`` for invalid parameters.
+    A behaviour may also have these attributes:
+
+    - ``is_safe``: whether the task may be reassigned now; default True
+    - ``progress``: the share of the task that is done, 0 to 1
+    - ``valid_for``: seconds for which the cost is valid; default: while the node is present
+    - ``angle`` and ``take_post``: see ``agents.formation``
+    - ``embody``: a method that gets the robot's motion capabilities before the first ``look``, see ``agents.means``
+    - ``close``: a method that is called after the agent has left the task
+
+    Some strategies also read ``value`` (a tuple: a number, or a place in metres), ``choice`` (the option that it votes
+    for), ``weight`` (of both) and ``electorate`` (the total weight of all that may vote).
     """
 
     def look(self, seen: Observation, now: float) -> None:
-        """Take in what the body senses now."""
+        """Process an observation of the robot's sensors; ``now`` is in seconds."""
 
     @property
     def cost(self) -> float | None:
-        """What doing the task would cost this body (metres, for a distance); None while it cannot tell."""
+        """The cost of the task for this robot, at least 0 (metres, for a distance); None while it is unknown."""
 
     def search(self, now: float) -> Action:
-        """What to do to be able to tell."""
+        """Return the next action while the cost is unknown; the agent holds no lease."""
 
     def hold(self, now: float) -> Action:
-        """What to do while another acts."""
+        """Return the next action while the cost is known and the agent holds no lease."""
 
     def execute(self, context: Context) -> Action | None:
-        """What to do next to get it done; None when it is done."""
+        """Return the next action of the task; None if the task is done."""
 
 
 def behaviour_for(
     task: Task, rng: random.Random, deployed: Deployed | None = None, means: Means | None = None
 ) -> Behaviour:
-    """The behaviour for ``task.kind``: a built-in one, or an entry point of ``swarm_node.behaviours``.
+    """Create the behaviour for ``task.kind``: a built-in one, or an entry point of ``swarm_node.behaviours``.
 
-    ``deployed:x`` is the module ``x`` that an operator pushed, among those in ``deployed``.  Where there are ``means``
-    the behaviour is told what its body can do.
+    ``deployed:x`` is the module ``x`` in ``deployed``, which an operator deployed to the team.  If ``means`` is given,
+    it is passed to the behaviour's ``embody``.
 
-    A task comes from the wire, so its kind is looked up among what is installed here and never imported as it stands.
-    Raises ``UnknownTask``, which names those there are or says what is wrong with the task's parameters, and
-    ``MissingExtra`` where the behaviour's libraries are not installed.
+    A task comes from the network, so its kind selects among installed behaviours and is never an import path.  Raises
+    ``UnknownTask`` if the kind is unknown or the parameters are invalid, and ``MissingExtra`` if the behaviour's
+    libraries are not installed.
     """
-    made = _deployed(task, rng, deployed or {}) if is_deployed(task.kind) else _installed(task, rng)
-    embody = getattr(made, "embody", None)
+    behaviour = _create_deployed(task, rng, deployed or {}) if is_deployed(task.kind) else _create_installed(task, rng)
+    embody = getattr(behaviour, "embody", None)
     if means is not None and embody is not None:
         embody(means)
-    return made
+    return behaviour
 
 
-def _installed(task: Task, rng: random.Random) -> Behaviour:
+def _create_installed(task: Task, rng: random.Random) -> Behaviour:
     target = KINDS.get(task.kind)
     if target is None:
-        from importlib.metadata import entry_points  # heavy, and most nodes never come here
+        from importlib.metadata import entry_points  # slow to import, and rarely needed
 
         found = {point.name: point.value for point in entry_points(group=ENTRY_POINTS)}
         target = found.get(task.kind)
         if target is None:
             known = ", ".join(sorted(KINDS | found))
-            raise UnknownTask(f"no behaviour for a task of kind {task.kind!r}; there are {known}")
+            raise UnknownTask(f"no behaviour for tasks of kind {task.kind!r}; known kinds: {known}")
     module, _, attribute = target.partition(":")
     try:
-        make = getattr(importlib.import_module(module), attribute)
+        factory = getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError) as error:
         if (getattr(error, "name", None) or "").split(".")[0] in VISION:
             raise MissingExtra(f"the behaviour for {task.kind!r}", "vision") from error
         raise UnknownTask(f"the behaviour for {task.kind!r} cannot be loaded: {error}") from error
     try:
-        made: Behaviour = make(task.parameters, rng)
+        behaviour: Behaviour = factory(task.parameters, rng)
     except (TypeError, ValueError, AttributeError, LookupError) as error:
-        raise UnknownTask(f"a task of kind {task.kind!r} cannot have these parameters: {error}") from error
-    return made
+        raise UnknownTask(f"invalid parameters of a task of kind {task.kind!r}: {error}") from error
+    return behaviour
 
 
-def _deployed(task: Task, rng: random.Random, deployed: Deployed) -> Behaviour:
-    from agents.guarded import Guarded  # most nodes never come here
+def _create_deployed(task: Task, rng: random.Random, deployed: Deployed) -> Behaviour:
+    from agents.guarded import Guarded  # rarely needed
 
     return Guarded(maker_of(BEHAVIOUR, task.kind, deployed)(task.parameters, rng), STAND)

@@ -1,4 +1,4 @@
-"""Catalogue: the predefined tasks that a person can choose from (thesis, Algorithm 4.4: ``tasks[choice]``)."""
+"""The predefined tasks that an operator can choose from (thesis, Algorithm 4.4: ``tasks[choice]``)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from middleware.tasks.task import Task
 
 DEMO = "find-red-target"
 STOP = 0.1
-"""Seconds in which a dog that turns at 1.2 rad/s, or walks, stands still."""
+"""Seconds that a dog needs to stop from walking or from a turn at 1.2 rad/s."""
 
 TASKS = {
     DEMO: Task(
@@ -29,7 +29,7 @@ TASKS = {
         waiting_period=1.0,
         stop_time=STOP,
     ),
-    # Whatever sees can do it: a dog turns by itself, a phone is turned by its visitor.
+    # Any device with a camera can do it: a dog turns itself, a phone is turned by its user.
     "watch-target": Task(
         task_id="",
         kind="watch-target",
@@ -50,8 +50,8 @@ TASKS = {
 
 
 def task_named(name: str, task_id: str, created: float) -> Task:
-    """The predefined task ``name`` as a new task; raises ``UnknownTask``, which names those that there are."""
+    """Return the predefined task ``name`` as a new task; raises ``UnknownTask``, whose text lists the known names."""
     template = TASKS.get(name)
     if template is None:
-        raise UnknownTask(f"no predefined task is called {name!r}; there are {', '.join(sorted(TASKS))}")
+        raise UnknownTask(f"no predefined task {name!r}; known tasks: {', '.join(sorted(TASKS))}")
     return replace(template, task_id=task_id, created=created)

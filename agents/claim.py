@@ -1,4 +1,4 @@
-"""Claim: the body and the lease that one agent has for one task, or asks for."""
+"""An agent's claim on a task's lease, and the robot's fencing token."""
 
 from __future__ import annotations
 
@@ -11,18 +11,19 @@ from middleware.entangled.contact import Contact
 from middleware.entangled.errors import EntangledError
 
 STANDBYS = 2
-"""Agents that wait and are ready to take over at once: each asks the council now and then."""
+"""Number of standbys: agents that poll the quorum members to take over at once."""
 INSISTING_S = 1.0
-"""An agent that is to act, and has no lease, reports again after this time: the holder may think that it gave up."""
+"""Seconds after which an assigned agent without a lease reports again, since the holder may have missed its report."""
 
 
 class Claim:
-    """One agent's claim; without a ``lessee`` it has no body for the task, and claims nothing.
+    """One agent's claim; without a ``lessee`` the agent has no robot for the task and claims nothing.
 
-    ``is_lent`` says that another task of the group has the body, so that the agent reports and decides all the same.
-    ``token`` is the highest token that the body has obeyed so far, ``standbys`` the uuids of those next in line, and
-    ``successors`` are the members of the council that is to follow.  ``released`` fires when the council knows that the
-    lease was handed over.
+    - ``is_lent``: another task of the group uses the robot; the agent still reports and decides
+    - ``token``: the highest fencing token that the robot has obeyed
+    - ``standbys``: the uuids of the standbys, the best first
+    - ``successors``: the members of the next quorum
+    - ``released``: fires when the quorum members know that the lease was handed over
     """
 
     def __init__(self, token: int) -> None:
@@ -33,23 +34,23 @@ class Claim:
         self.successors: tuple[Contact, ...] = ()
         self.released: Deferred[object] = succeed(None)
         self._insists_at = 0.0
-        self._moved_by = 0.0
-        self._stands_at = 0.0
+        self._move_ends_at = 0.0
+        self._stopped_at = 0.0
 
     @property
     def lease(self) -> Lease | None:
-        """The lease if it is held now."""
+        """The lease if it is held now, otherwise None."""
         return None if self.lessee is None else self.lessee.lease
 
     def raise_token(self, token: int) -> None:
-        """Take in that the body has obeyed ``token``: nothing older than that does it obey now."""
+        """Record that the robot has obeyed ``token``; it rejects lower ones from now on."""
         self.token = max(self.token, token)
         if self.lessee is not None:
             self.lessee.outrank(self.token)
 
     def is_moving(self, now: float) -> bool:
-        """Whether the lease is on its way to another council, and may still come back."""
-        return self.lease is None and now < self._moved_by
+        """Return whether the lease is moving to another quorum, and may still return."""
+        return self.lease is None and now < self._move_ends_at
 
     def want(self) -> None:
         """Claim the lease, or keep it."""
@@ -57,13 +58,13 @@ class Claim:
             self.lessee.want()
 
     def begin(self, now: float) -> None:
-        """Claim the lease, and begin to wait for it."""
+        """Claim the lease and start the timer of ``insist``."""
         if self.lessee is not None:
             self.lessee.want()
             self._insists_at = now + INSISTING_S
 
     def insist(self, now: float) -> bool:
-        """Claim the lease; whether the others are to be told so again."""
+        """Claim the lease; returns whether the report is due to be sent again."""
         if self.lessee is None or now < self._insists_at:
             self.want()
             return False
@@ -71,25 +72,25 @@ class Claim:
         return True
 
     def stand_by(self, rank: int) -> None:
-        """Be ready to take over at once, where few are before this agent (``rank`` is from 1; 0: it is in no line)."""
+        """Poll as a standby of this ``rank`` (from 1), or stop claiming the lease (0)."""
         if self.lessee is not None and rank > 0:
             self.lessee.stand_by(rank)
         elif self.lessee is not None:
             self.lessee.release()
 
     def stop(self, moves_for: float, now: float) -> None:
-        """Take in that the body was stopped, and may still move for some seconds because it did not hear that."""
-        self._stands_at = now + moves_for
+        """Record that the robot was stopped but may move for ``moves_for`` more seconds, because it did not confirm."""
+        self._stopped_at = now + moves_for
 
     def release(self, now: float, standbys: Sequence[Contact] = ()) -> Deferred[object]:
-        """Give the lease back, or stop claiming it; with the seconds for which the body may still move."""
+        """Release the lease, or stop claiming it; other agents wait while the robot may still move."""
         if self.lessee is None:
             return succeed(None)
-        return self.lessee.release(standbys, max(0.0, self._stands_at - now))
+        return self.lessee.release(standbys, max(0.0, self._stopped_at - now))
 
     def move(self, now: float, ttl: float) -> None:
-        """Have the council changed; the lease comes back within ``ttl``, or is lost."""
+        """Change the quorum to ``successors``; the lease is granted again within ``ttl`` seconds, or is lost."""
         members, self.successors = self.successors, ()
-        self._moved_by = now + ttl
+        self._move_ends_at = now + ttl
         if self.lessee is not None:
             self.lessee.move(members).addErrback(lambda failure: failure.trap(EntangledError))

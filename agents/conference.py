@@ -1,4 +1,4 @@
-"""Conference: the agents at one task confer: what all have reported, in which round, and who should act; pure."""
+"""The agents at one task: their reports, the round of the decision, and the decision itself; pure."""
 
 from __future__ import annotations
 
@@ -16,17 +16,16 @@ from middleware.directory.presence import EXECUTING, IDLE
 from middleware.tasks.task import Member, Task, is_bid, is_stale
 
 LINGERING = 3.0
-"""Seconds for which a late report of who left is still known to be old."""
+"""Seconds for which a late report of a departed agent is recognised as old."""
 Basis = tuple[object, ...]
-"""Everything that a decision depends on: who is present, what they bid, who holds which lease, which task it is."""
+"""All inputs of a decision: the present members, their bids, the leases, and the task."""
 
 
 class Epoch:
-    """The rounds of one task, as one participant counts them.
+    """The round counter of one task at one participant.
 
-    All participants raise to the highest number heard, as clocks of Lamport do, so a number that was left behind never
-    comes back.  The first that sees that a decision has to be taken anew raises it by one; those that come to the same
-    decision join that round and do not open another.
+    All participants raise their counter to the highest number received, as Lamport clocks do, so a round never returns.
+    The first participant that has to decide again starts a new round; participants with the same decision join it.
     """
 
     def __init__(self) -> None:
@@ -35,11 +34,11 @@ class Epoch:
         self._decided_in = -1
 
     def hear(self, number: int) -> None:
-        """Raise to a number that another has reached."""
+        """Raise the counter to a number received from another participant."""
         self.number = max(self.number, number)
 
     def decide(self, basis: Basis, assigned: str, digest: str, others: Collection[Member]) -> int:
-        """The round of the decision taken now, which names ``assigned`` from reports with ``digest``."""
+        """Return the round of a decision that assigns ``assigned`` from reports with ``digest``."""
         if self._basis is not None and basis != self._basis and self._decided_in >= 0:
             is_open = self.number > self._decided_in and any(
                 other.epoch == self.number and other.assigned == assigned and other.digest == digest for other in others
@@ -51,130 +50,130 @@ class Epoch:
         return self.number
 
 
-def is_older(told: Member, known: Member | None) -> bool:
-    """Whether a report was made before one that is known of the same participant, and so says nothing any more."""
-    return known is not None and (told.epoch, told.serial) < (known.epoch, known.serial)
+def is_older(report: Member, known: Member | None) -> bool:
+    """Return whether ``report`` is older than the known report of the same participant."""
+    return known is not None and (report.epoch, report.serial) < (known.epoch, known.serial)
 
 
 class Circle:
-    """The participants other than ``uuid``, as their reports tell, which come late, twice and in any order.
+    """The reports of the participants other than ``uuid``, which may arrive late, twice and in any order.
 
-    Of each other participant only the newest report counts, for as long as it says, and those that are no longer
-    present are forgotten.
+    Of each participant the newest report counts, until it expires; departed participants are forgotten.
     """
 
     def __init__(self, uuid: str) -> None:
         self._uuid = uuid
-        self._known: dict[str, Member] = {}
-        self._came: dict[str, float] = {}
-        self._left: dict[str, tuple[Member, float]] = {}
+        self._reports: dict[str, Member] = {}
+        self._arrived_at: dict[str, float] = {}
+        self._departed: dict[str, tuple[Member, float]] = {}
         self._dismissed: dict[str, Member] = {}
         self.echo: Member | None = None
-        """The newest report of this participant itself that came back: after a restart it is an older life's."""
+        """This participant's own newest report, if it came back: after a restart it is from the previous run."""
 
     def __len__(self) -> int:
-        """How many others are present."""
-        return len(self._known)
+        """Return the number of other participants."""
+        return len(self._reports)
 
     def hear(self, members: Sequence[Member], now: float) -> None:
-        """Take in who is present, and what they report."""
+        """Process the list of present participants and their reports."""
         known: dict[str, Member] = {}
-        came: dict[str, float] = {}
-        self._left = {uuid: (member, at) for uuid, (member, at) in self._left.items() if now - at < LINGERING}
-        for told in members:
-            if told.uuid == self._uuid:
-                self.echo = told
+        arrived_at: dict[str, float] = {}
+        self._departed = {uuid: (member, at) for uuid, (member, at) in self._departed.items() if now - at < LINGERING}
+        for report in members:
+            if report.uuid == self._uuid:
+                self.echo = report
                 continue
-            before = known.get(told.uuid, self._known.get(told.uuid))
-            if before is None and told.uuid in self._left and is_older(told, self._left[told.uuid][0]):
+            before = known.get(report.uuid, self._reports.get(report.uuid))
+            if before is None and report.uuid in self._departed and is_older(report, self._departed[report.uuid][0]):
                 continue
-            is_news = before is None or (told != before and not is_older(told, before))
-            known[told.uuid] = told if is_news or before is None else before
-            came[told.uuid] = now if is_news else self._came[told.uuid]
-        self._left.update((uuid, (member, now)) for uuid, member in self._known.items() if uuid not in known)
-        self._known, self._came = known, came
+            is_news = before is None or (report != before and not is_older(report, before))
+            known[report.uuid] = report if is_news or before is None else before
+            arrived_at[report.uuid] = now if is_news else self._arrived_at[report.uuid]
+        self._departed.update((uuid, (member, now)) for uuid, member in self._reports.items() if uuid not in known)
+        self._reports, self._arrived_at = known, arrived_at
         self._dismissed = {uuid: was for uuid, was in self._dismissed.items() if known.get(uuid) == was}
 
     def dismiss(self, uuid: str) -> None:
-        """Count what ``uuid`` said for nothing until it says something new: it gave up what it had."""
-        if uuid in self._known:
-            self._dismissed[uuid] = self._known[uuid]
+        """Ignore the last report of ``uuid`` until a new one arrives: it gave up the task."""
+        if uuid in self._reports:
+            self._dismissed[uuid] = self._reports[uuid]
 
     def members(self, now: float) -> list[Member]:
-        """The others with what counts now, in the order of their uuids: a bid that is none or stale is left out."""
-        return [self._sound(self._known[uuid], now) for uuid in sorted(self._known)]
+        """Return the others, sorted by uuid; invalid and stale costs are removed."""
+        return [self._valid_report(self._reports[uuid], now) for uuid in sorted(self._reports)]
 
     @property
     def epoch(self) -> int:
-        """The highest round that any of them has reached."""
-        return max((member.epoch for member in self._known.values()), default=0)
+        """The highest round of any other participant."""
+        return max((member.epoch for member in self._reports.values()), default=0)
 
-    def _sound(self, member: Member, now: float) -> Member:
+    def _valid_report(self, member: Member, now: float) -> Member:
         if member.uuid in self._dismissed:
             return replace(member, cost=None, available=False, status=IDLE)
-        since = now - self._came[member.uuid]
+        since = now - self._arrived_at[member.uuid]
         is_sound = is_bid(member.cost) and not is_stale(member, since) and math.isfinite(since)
         return member if member.cost is None or is_sound else replace(member, cost=None)
 
 
 PAUSE = 1.0
-"""Seconds between two accounts of a decision of which nothing changed but the reports."""
+"""Minimum seconds between two records of a decision in which only the reports changed."""
 
 
 class Account:
-    """One agent's accounts of its decisions about ``task``."""
+    """One agent's records of its decisions about ``task``."""
 
     def __init__(self, task: Task, strategy: ConsensusAlgorithm) -> None:
         self._task = task
         self._strategy = strategy
         self._token = 0
-        self._judged: tuple[object, ...] = ()
-        self._given_at = 0.0
+        self._recorded: tuple[object, ...] = ()
+        self._recorded_at = 0.0
 
     def of(self, decision: Decision, me: Member, others: Sequence[Member], token: int, now: float) -> Verdict | None:
-        """The verdict that is due now, if any; ``token`` is that of the lease which this agent holds, or 0."""
+        """Return the decision record that is due now, or None; ``token`` is the fencing token of a held lease, or 0."""
         members = [me, *others]
         tokens = [m.token for m in members if m.status == EXECUTING]
         self._token = max(self._token, *(m.token for m in members))
-        # The epoch is the token under which the task is done, or is to be done next.
+        # The epoch is the token under which the task is done, or will be done next.
         epoch = max(tokens, default=self._token + 1)
-        judged = (epoch, decision.assigned, token, len(members), decision.digest)
-        is_new, is_due = judged[:-1] != self._judged[:-1], now - self._given_at >= PAUSE
-        if judged == self._judged or not (is_new or is_due) or not (decision.assigned or self._judged):
+        state_key = (epoch, decision.assigned, token, len(members), decision.digest)
+        is_new, is_due = state_key[:-1] != self._recorded[:-1], now - self._recorded_at >= PAUSE
+        if state_key == self._recorded or not (is_new or is_due) or not (decision.assigned or self._recorded):
             return None
-        self._judged = judged
+        self._recorded = state_key
         if decision.consensus is None:
             return None
-        self._given_at = now
+        self._recorded_at = now
         rule = decision.consensus.strategy or self._strategy.name
         version = str(getattr(self._strategy, "version", "")) if rule == self._strategy.name else ""
-        given = (self._task.task_id, epoch, me, others, rule, version)
+        identification = (self._task.task_id, epoch, me, others, rule, version)
         found, view = decision.consensus, view_of(self._strategy)
-        verdict = verdict_from(*given, found, decision.assigned, self._task.hysteresis, token, view)
+        verdict = verdict_from(*identification, found, decision.assigned, self._task.hysteresis, token, view)
         return verdict if verdict.is_witness else None
 
 
 class Conference:
-    """One agent's view of ``task``; ``uuid`` is the agent's own, ``division`` that of the task's group, if any.
+    """One agent's view of ``task``.
 
-    ``panel`` says whose records stand for all: an agent that is not of it decides as these do, without itself.
+    ``uuid`` is the agent's own, ``division`` the task's group or None.  ``panel`` are the reporters of a large team; an
+    agent that is not one of them decides from their reports without its own.
     """
 
     def __init__(self, task: Task, uuid: str, strategy: ConsensusAlgorithm, panel: Panel) -> None:
         self.division: Division | None = None
         self._strategy = strategy
         self._panel = panel
-        self._account = Account(task, strategy)
+        self._records = Account(task, strategy)
         self._uuid = uuid
-        self._circle = Circle(uuid)
+        self._participants = Circle(uuid)
         self._epoch = Epoch()
         self._first_report_at: float | None = None
         self._is_new = True
         self._fault = ""
 
     def __len__(self) -> int:
-        """How many others are present."""
-        return len(self._circle)
+        """Return the number of other participants."""
+        return len(self._participants)
 
     @property
     def epoch(self) -> int:
@@ -182,48 +181,51 @@ class Conference:
         return self._epoch.number
 
     def others(self, now: float) -> list[Member]:
-        """The others with what counts now."""
-        return self._circle.members(now)
+        """Return the others with their valid reports."""
+        return self._participants.members(now)
 
     def counts(self, now: float) -> bool:
-        """Whether the others know of this agent."""
+        """Return whether this agent's report is visible to the others."""
         return self._panel.counts(now)
 
     def hear(self, members: Sequence[Member], me: Member, now: float) -> Member:
-        """Take in who is present and what they report; the own report ``me``, counted on from where it is known."""
-        self._circle.hear(members, now)
-        # Who comes is the first to know it: it opens a round, in which nothing that it said in an older life counts.
-        self._epoch.hear(self._circle.epoch + (self._is_new and bool(self._circle)))
-        self._is_new = self._is_new and not self._circle
-        echo = self._circle.echo
+        """Process the present members and their reports; return ``me`` with its counters advanced if necessary."""
+        self._participants.hear(members, now)
+        # A new participant starts a round, so that its reports from an earlier run no longer count.
+        self._epoch.hear(self._participants.epoch + (self._is_new and bool(self._participants)))
+        self._is_new = self._is_new and not self._participants
+        echo = self._participants.echo
         if echo is None or (echo.epoch, echo.serial) <= (me.epoch, me.serial):
             return me
-        # An older life of this agent got that far: the others ignore what comes before it.
+        # An earlier run of this agent reached a higher count; the others ignore lower ones.
         self._epoch.hear(echo.epoch)
         return replace(me, epoch=echo.epoch, serial=echo.serial)
 
     def decide(self, task: Task, me: Member, now: float, is_successor: bool = False) -> Decision:
-        """Who should act, of all that have reported (``me`` included).
+        """Decide from all reports, including ``me``.
 
-        An agent that stood by and was given the lease ``is_successor``: the assigned agent has given up, and the news
-        of that is on its way, so its reports count for nothing until it sends a new one.
+        ``is_successor`` is True for a standby that was granted the lease: the assigned agent has given up and its
+        notice is still on its way, so its reports are ignored until a new one arrives.
         """
         decision = self._decide(task, me, now)
         for _ in range(len(self) if is_successor else 0):
             if decision.assigned is None or decision.assigned == self._uuid:
                 break
-            self._circle.dismiss(decision.assigned)
+            self._participants.dismiss(decision.assigned)
             decision = self._decide(task, me, now)
         return decision
 
     def new_fault(self, decision: Decision) -> str:
-        """The fault of the strategy, unless the decision before had the same; empty without a fault."""
+        """Return the strategy's fault if it differs from the previous decision's, otherwise ""."""
         before, self._fault = self._fault, decision.fault
         return "" if before == decision.fault else decision.fault
 
     def account(self, decision: Decision, me: Member, token: int, now: float) -> Verdict | None:
-        """The verdict on ``decision`` that is due now, if any; ``token`` is that of the lease held, or 0."""
-        return self._account.of(decision, me, self.others(now), token, now)
+        """Return the record of ``decision`` that is due now, or None.
+
+        ``token`` is the fencing token of a held lease, or 0.
+        """
+        return self._records.of(decision, me, self.others(now), token, now)
 
     def _decide(self, task: Task, me: Member, now: float) -> Decision:
         others = self.others(now)
@@ -242,7 +244,7 @@ class Conference:
         return decision
 
     def is_first(self, now: float) -> bool:
-        """Whether it falls to this agent to say what all know: nobody acts, and no uuid here is lower."""
+        """Return whether this agent acts for all: no agent executes the task, and its uuid is the lowest."""
         others = self.others(now)
         return (
             self.counts(now)

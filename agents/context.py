@@ -1,4 +1,4 @@
-"""Context: under which right a body acts."""
+"""The lease and the agreement under which a behaviour acts."""
 
 from __future__ import annotations
 
@@ -7,13 +7,15 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Context:
-    """Under which right a body acts ``now``: the lease's ``token``, and its ``deadline`` on the same clock.
+    """The lease and the agreement under which a behaviour acts at the time ``now``.
 
-    ``is_resumed`` says that the token is the one of the call before, so that nobody acted in between: go on.  With a
-    new token, held since ``began``, another may have acted: what was done so far is still remembered, and may be void.
-
-    ``value`` is the number or place that all agreed on, ``choice`` the option, where the task's strategy finds one.
-    Under one token it stays while it is open again, as it is when somebody comes who has not voted yet.
+    - ``token``: the lease's fencing token
+    - ``deadline``: the end of the lease, on the clock of ``now``
+    - ``began``: the time of the first call with this token
+    - ``is_resumed``: the token is the same as in the previous call, so no other agent has acted in between.
+      With a new token another agent may have acted, and earlier results may be void.
+    - ``value``, ``choice``: the agreed number or place, or the option that won the vote, if the strategy finds one.
+      They persist under one token while a decision is open again, for example after a new agent has joined.
     """
 
     now: float

@@ -1,7 +1,7 @@
-"""Decision: the rule between reports and deeds (Algorithm 4.5, revised); pure.
+"""The decision rule between reports and actions (Algorithm 4.5, revised); pure.
 
-The reports of all present members go in; who is assigned comes out, or why there is nobody yet.  It is taken again at
-every change: a member that left or came, a report, an assigned agent that goes.
+The input is the reports of all present members; the output is the assigned agent, or the reason why there is none yet.
+An agent decides again after each change: a member joins or leaves, or a report arrives.
 """
 
 from __future__ import annotations
@@ -16,16 +16,20 @@ from middleware.directory.presence import EXECUTING
 from middleware.tasks.task import Member
 
 REASON = 100
-"""Characters of a strategy's reason for naming nobody: it travels in each report."""
+"""Maximum characters of a strategy's reason for assigning no agent: each report carries it."""
 
 
 @dataclass(frozen=True)
 class Decision:
-    """Who is ``assigned`` (a uuid, or None), a ``digest`` of the reports used, and ``why`` in a person's words.
+    """The result of one decision.
 
-    ``order`` are all who could act, the assigned one first and then those that stand by; ``basis`` is everything that
-    the decision was computed from, so that an equal basis gives an equal decision; ``fault`` says how the strategy
-    failed where it did, and the nearest was taken instead; ``consensus`` is what was found before the hysteresis.
+    - ``assigned``: the uuid of the agent that should act, or None
+    - ``digest``: the digest of the reports used
+    - ``why``: the reason, for display
+    - ``order``: all agents that could act: the assigned one, then the standbys
+    - ``basis``: all inputs of the decision; an equal basis gives an equal decision
+    - ``fault``: the strategy's failure, if the fallback ``nearest`` decided instead
+    - ``consensus``: the strategy's decision before the hysteresis was applied
     """
 
     assigned: str | None
@@ -45,21 +49,21 @@ def decide(
     since_first: float | None,
     has_word: bool | None = None,
 ) -> Decision:
-    """The consensus point of ``members``, as ``strategy`` finds it (a foreign one from behind its guard).
+    """Decide from the reports of ``members`` with ``strategy`` (a third-party one must be guarded).
 
-    A strategy that goes by more than these reports has it in ``basis``.
+    A strategy that reads more than these reports lists it in its ``basis``.
 
-    ``since_first`` is the seconds since the first report was seen, None when there is none.  Within the waiting period
-    nobody is assigned, unless everybody has reported (or has no body free to do so), or somebody acts already; whoever
-    acts keeps the task until another is better by the ``hysteresis``.
+    ``since_first`` is the number of seconds since the first report, None without reports.  Within the waiting period no
+    agent is assigned, unless all available members have reported or an agent already acts.  The acting agent keeps the
+    task until another is better by ``hysteresis``.
 
-    Where the members are only a panel of all, ``has_word`` says whether the council has announced who is the best of
-    all: until then nobody is assigned, for a while longer.
+    If ``members`` are only the reporters of a large team, ``has_word`` says whether the quorum members have announced
+    the best agent of all; until then, for a limited time, no agent is assigned.
     """
     present = {m.uuid: m for m in members}
     view = view_of(strategy)
     reports = {m.uuid: report for m in present.values() if (report := view.report(m)) is not None}
-    acting = sorted((m for m in present.values() if m.status == EXECUTING and m.uuid in reports), key=_precedence)
+    acting = sorted((m for m in present.values() if m.status == EXECUTING and m.uuid in reports), key=_acting_order)
     basis: tuple[object, ...] = (
         tuple(sorted(present)),
         tuple(sorted(reports.values(), key=lambda report: report.agent)),
@@ -67,15 +71,15 @@ def decide(
         *getattr(strategy, "basis", ()),
     )
     if not reports or since_first is None:
-        return Decision(None, "", "nobody has reported yet", basis=basis)
+        return Decision(None, "", "no agent has reported yet", basis=basis)
     missing = sorted(m.name for m in present.values() if m.uuid not in reports and m.available)
     if has_word is not None:
         if not (has_word or acting) and since_first < waiting_period + PATIENCE:
-            return Decision(None, "", "waiting for the council", basis=basis)
+            return Decision(None, "", "waiting for the quorum members", basis=basis)
     elif missing and since_first < waiting_period and not acting:
         return Decision(None, "", f"waiting for {', '.join(missing)}", basis=basis)
     holder = reports[acting[0].uuid] if acting else None
-    consensus, best = _chosen(list(reports.values()), holder, strategy, hysteresis)
+    consensus, best = _choose(list(reports.values()), holder, strategy, hysteresis)
     fault = consensus.reason if consensus.strategy not in ("", strategy.name) else ""
     if best is None:
         why_not = consensus.reason[:REASON] or "no report counts"
@@ -89,10 +93,10 @@ def decide(
     return Decision(best, consensus.digest, f"{why}; {fault}" if fault else why, order, basis, fault, consensus)
 
 
-def _chosen(
+def _choose(
     reports: Sequence[Report], holder: Report | None, strategy: ConsensusAlgorithm, hysteresis: float
 ) -> tuple[Consensus, str | None]:
-    """What the strategy finds, and who should act: whoever does already, unless another is clearly better."""
+    """Return the decision of the strategy, and the agent that should act: the holder unless another improves on it."""
     consensus = strategy.find(list(reports))
     best = next((r for r in reports if r.agent == consensus.assigned_agent), None)
     if holder is not None and (best is None or not strategy.improves(holder, best, hysteresis)):
@@ -100,6 +104,9 @@ def _chosen(
     return consensus, None if best is None else best.agent
 
 
-def _precedence(member: Member) -> tuple[int, float, str]:
-    """Of several that say to act the one with the newest token does, the others do not know yet."""
+def _acting_order(member: Member) -> tuple[int, float, str]:
+    """Of several agents that report to act, the one with the newest fencing token does.
+
+    The others do not know it yet.
+    """
     return -member.token, member.cost or 0.0, member.uuid

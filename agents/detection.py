@@ -1,7 +1,7 @@
-"""Detection: the target is looked for in the newest picture only, and outside of the reactor's thread.
+"""Search the newest camera picture for the target, outside the reactor's thread.
 
-To decode a picture takes milliseconds to a second.  ``Run`` says where that happens: ``run_in_thread`` gives the
-reactor's thread pool, and with virtual time ``run_now``, so that a run can be replayed.
+Decoding a picture takes milliseconds to a second.  ``run_in_thread`` decodes in the reactor's thread pool; with virtual
+time ``run_now`` keeps runs reproducible.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from twisted.internet.threads import deferToThreadPool
 from twisted.logger import Logger
 
 Run = Callable[[Callable[[], Any]], Deferred[Any]]
-"""Calls a function, now or in a thread; fires with its result in the reactor's thread."""
+"""Calls a function, now or in a thread, and fires with its result in the reactor's thread."""
 
 
 def run_now(function: Callable[[], Any]) -> Deferred[Any]:
-    """Call the function at once."""
+    """Call the function immediately."""
     return maybeDeferred(function)
 
 
 def run_in_thread(clock: object) -> Run:
-    """Use the thread pool of ``clock`` where that is a reactor with threads, else ``run_now``."""
+    """Return a ``Run`` with the thread pool of ``clock``, or ``run_now`` if the clock has no threads."""
     if not IReactorThreads.providedBy(clock):
         return run_now
     reactor: Any = clock
@@ -32,30 +32,30 @@ def run_in_thread(clock: object) -> Run:
 
 
 class Detector:
-    """Runs one detection at a time; of the pictures that wait meanwhile only the newest is kept."""
+    """Run one detection at a time; of the waiting pictures only the newest is kept."""
 
     _log = Logger()
 
     def __init__(self, run: Run = run_now) -> None:
         self.run = run
         self.dropped = 0
-        """Pictures that gave way to a newer one."""
+        """Number of pictures that were replaced by a newer one."""
         self._is_running = False
         self._waiting: tuple[Callable[[], Any], Callable[[Any], None]] | None = None
 
     def detect(self, find: Callable[[], Any], found: Callable[[Any], None]) -> None:
-        """Have ``find`` called, and ``found`` with its result; never, where a newer picture comes before its turn."""
+        """Call ``find``, then ``found`` with its result; skipped if a newer picture arrives before its turn."""
         if self._is_running:
             self.dropped += self._waiting is not None
             self._waiting = (find, found)
             return
         self._is_running = True
-        self.run(find).addCallback(found).addErrback(self._failed).addCallback(self._ended)
+        self.run(find).addCallback(found).addErrback(self._log_failure).addCallback(self._run_next)
 
-    def _failed(self, failure: Any) -> None:
-        self._log.failure("a picture could not be searched", failure)
+    def _log_failure(self, failure: Any) -> None:
+        self._log.failure("searching a picture failed", failure)
 
-    def _ended(self, _: object) -> None:
+    def _run_next(self, _: object) -> None:
         self._is_running = False
         waiting, self._waiting = self._waiting, None
         if waiting is not None:

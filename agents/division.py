@@ -1,9 +1,9 @@
-"""Division: the open tasks of one group, divided together among those that can do them; pure.
+"""Assign the open tasks of a group together among the able agents; pure.
 
-Each agent divides them for itself, out of what all have reported on all of them, and takes from that who is to act in
-each task.  So the digest of a decision is that of all these reports, not only of those on its own task.  Whoever acts
-already is counted for its task alone, and cheaper by the task's hysteresis, so that a task changes hands here exactly
-where it would by itself.
+Each agent computes the assignment from the reports on all tasks of the group, and uses the part about each task.  The
+digest of a decision therefore covers the reports on all these tasks.  An agent that acts counts for its task alone, at
+a cost reduced by the task's hysteresis, so that a task is reassigned under the same condition as a task without a
+group.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from middleware.directory.presence import EXECUTING
 from middleware.tasks.task import Member, Task
 
 GATHERING = 1.0
-"""Seconds for which no task may have come to a group before it is divided: they are submitted one after the other."""
+"""Seconds without a new task before a group is divided, because tasks are submitted one after another."""
 
 Key = tuple[str, str, str]
 Members = Callable[[float], Sequence[Member]]
-"""Who takes part in a task with what counts at a moment, oneself included."""
+"""Returns the members of a task, including the agent itself, with their valid reports at a time."""
 
 
 def group_of(task: Task) -> Key | None:
-    """What tasks have in common that are divided together; None for a task by itself.
+    """Return the key of the tasks that are assigned together with ``task``; None for a task without a group.
 
-    Beside the group that is the strategy, and the requirements: so whoever takes part in one takes part in all, and
-    knows what is reported on all of them.
+    The key has the group, the strategy and the requirements, so every agent that takes part in one of these tasks takes
+    part in all, and knows the reports on all.
     """
     if not task.group:
         return None
@@ -40,70 +40,76 @@ def group_of(task: Task) -> Key | None:
 
 
 class Division:
-    """The tasks of one group as one agent knows them, and their ``strategy``."""
+    """The tasks of one group as one agent knows them."""
 
     def __init__(self, strategy: Guard) -> None:
         self.strategy = strategy
         self._tasks: dict[str, tuple[Task, Members]] = {}
-        self._came_at = -math.inf
-        self._known: tuple[object, ...] = ()
+        self._last_joined_at = -math.inf
+        self._inputs: tuple[object, ...] = ()
         self._points: Mapping[str, Consensus] = {}
 
     def join(self, task: Task, members: Members, now: float) -> None:
-        """Divide ``task`` with the others."""
+        """Add ``task`` to the group; ``members`` returns its members."""
         if task.task_id not in self._tasks:
-            self._came_at = now
+            self._last_joined_at = now
         self._tasks[task.task_id] = task, members
 
     def leave(self, task_id: str) -> None:
-        """Divide it no more: it is over, or rests."""
+        """Remove a task that is over or paused."""
         self._tasks.pop(task_id, None)
 
     def share(self, task: Task, now: float, since: float | None) -> Share:
-        """How the strategy sees ``task``, whose first report came ``since`` seconds ago, among the others."""
+        """Return a strategy for ``task`` that decides it together with the group.
+
+        ``since`` is the number of seconds since the task's first report, None without reports.
+        """
         view = view_of(self.strategy)
         members = {name: list(known(now)) for name, (_, known) in sorted(self._tasks.items())}
-        acting = {m.uuid: name for name, here in members.items() for m in here if m.status == EXECUTING}
+        acting = {m.uuid: name for name, task_members in members.items() for m in task_members if m.status == EXECUTING}
         reports: list[Report] = []
         missing: set[str] = set()
-        for name, here in members.items():
-            rest = [m for m in here if acting.get(m.uuid, name) == name]
-            held = any(m.uuid in acting for m in rest)
+        for name, task_members in members.items():
+            rest = [m for m in task_members if acting.get(m.uuid, name) == name]
+            has_acting = any(m.uuid in acting for m in rest)
             for member in rest:
                 report = view.report(member)
                 if report is not None:
                     reports.append(replace(report, task=name))
-                elif member.available and not held:
+                elif member.available and not has_acting:
                     missing.add(member.name)
         is_early = since is None or since < task.waiting_period
         why = ""
-        if now - self._came_at < GATHERING:
+        if now - self._last_joined_at < GATHERING:
             why = "waiting for the rest of the group"
         elif missing and is_early:
             why = f"waiting for {', '.join(sorted(missing))}"
         return Share(self, task.task_id, tuple(reports), acting, why)
 
     def divided(self, reports: tuple[Report, ...], acting: Mapping[str, str]) -> Mapping[str, Consensus]:
-        """The consensus point of each task."""
-        counted = tuple(self._kept(report) if acting.get(report.agent) == report.task else report for report in reports)
+        """Return the decision of each task."""
+        counted = tuple(
+            self._discount(report) if acting.get(report.agent) == report.task else report for report in reports
+        )
         items = tuple(sorted(self._tasks))
-        if (reports, counted, items) != self._known:
+        if (reports, counted, items) != self._inputs:
             points = self.strategy.find_group(counted, [Item(name) for name in items])
             digest = digest_of(reports)
             self._points = {point.task: replace(point, digest=digest) for point in points}
-            self._known = reports, counted, items
+            self._inputs = reports, counted, items
         return self._points
 
-    def _kept(self, report: Report) -> Report:
-        """The report of who acts: another has to be better than this."""
+    def _discount(self, report: Report) -> Report:
+        """Reduce the cost of an acting agent's report by the hysteresis."""
         task, _ = self._tasks[report.task]
         return replace(report, cost=report.cost * max(0.0, 1.0 - task.hysteresis))
 
 
 class Share:
-    """The strategy of a group, asked about one of its tasks: a strategy as a decision knows it.
+    """The strategy of a group, restricted to one of its tasks: the interface that ``decide`` uses.
 
-    ``basis`` is what it goes by beside the reports on its own task; ``why`` says why nobody is named yet, if so.
+    ``basis`` has its inputs besides the reports on this task; ``why`` is the reason why no agent is assigned yet, or
+    "".
     """
 
     def __init__(
@@ -120,7 +126,7 @@ class Share:
         self._why = why
 
     def find(self, contacts: Sequence[Report]) -> Consensus:
-        """The consensus point of its task, where all are divided."""
+        """Decide the task together with its group."""
         if self._why:
             acting = sorted((r.cost, r.agent) for r in contacts if self._acting.get(r.agent) == self._task_id)
             holder = acting[0][1] if acting else None

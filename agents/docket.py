@@ -1,7 +1,7 @@
-"""Docket: the tasks that one agent knows, which of them has its body, and those that are over; pure.
+"""The tasks that one agent knows: the open ones in order of urgency, and the finished ones; pure.
 
-Who has an outcome never starts again, whatever is heard of it later: its tombstone is kept for longer than any lease
-lives and any node may be away, and as long as the task is listed.
+A task that is over never starts again, even if a late record of it arrives: its tombstone is kept longer than any lease
+and any tolerated absence of a node, and at least while the task is listed.
 """
 
 from __future__ import annotations
@@ -12,47 +12,47 @@ from middleware.entangled.record import TOLERATED_ABSENCE
 from middleware.tasks.task import MAX_LEASE_TTL, Task
 
 KEPT = TOLERATED_ABSENCE + MAX_LEASE_TTL
-"""Seconds for which the end of a task is remembered at least."""
+"""Minimum seconds for which the end of a task is remembered."""
 MOST = 16
-"""So many open tasks are followed at a time; the others wait."""
+"""Maximum number of open tasks that are followed at once; the others wait."""
 
 
 def precedence(task: Task) -> tuple[int, float, str]:
-    """The order in which tasks have a body: the highest priority, then the oldest."""
+    """Return the sort key of urgency: the highest priority first, then the oldest."""
     return -task.priority, task.created, task.task_id
 
 
 class Docket:
-    """The tasks that a body can do."""
+    """The tasks that a robot can do."""
 
     def __init__(self) -> None:
         self._open: dict[str, Task] = {}
         self._tombstones: dict[str, float] = {}
 
     def is_new(self, task_id: str) -> bool:
-        """Whether nothing is known of the task."""
+        """Return whether the task is neither open nor known to be over."""
         return task_id not in self._open and task_id not in self._tombstones
 
     def add(self, task: Task) -> bool:
-        """Take in an open task, or one that was changed; False where its end is known."""
+        """Add or update an open task; False if the task is over."""
         if task.task_id in self._tombstones:
             return False
         self._open[task.task_id] = task
         return True
 
     def bury(self, task_id: str, now: float) -> None:
-        """The task is over, or nothing for this agent."""
+        """Record that the task is over, or not for this agent."""
         self._open.pop(task_id, None)
         self._tombstones[task_id] = now
 
     def forget(self, listed: Collection[str], now: float) -> None:
-        """Let tombstones go that nobody needs any more."""
+        """Remove tombstones that are no longer needed."""
         for task_id, buried in list(self._tombstones.items()):
             if task_id not in listed and now - buried > KEPT:
                 del self._tombstones[task_id]
 
     def followed(self) -> list[Task]:
-        """The open tasks that are followed now, the first of them the most urgent."""
+        """Return the open tasks that are followed now, the most urgent first."""
         return sorted(self._open.values(), key=precedence)[:MOST]
 
     @property
@@ -62,7 +62,7 @@ class Docket:
 
 
 def next_task(tasks: Iterable[Task], current: Task | None, may_be_put_aside: bool) -> Task | None:
-    """The task of ``tasks`` that is to have the body, which ``current`` (one of them, or None) has now."""
+    """Return the task that should get the robot; ``current`` (one of ``tasks``, or None) has it now."""
     first = min(tasks, key=precedence, default=None)
     if current is None or first is None or may_be_put_aside and first.priority > current.priority:
         return first

@@ -1,8 +1,9 @@
-"""Engagement: one agent's part in one task, from assignment to end (Algorithm 4.5, revised).
+"""One agent's part in one task, from assignment to end (Algorithm 4.5, revised).
 
-Selection and commitment are two things here: ``decide`` says who should act, the lease who may.  Nothing is executed
-without a lease that is valid now; when the decision or the lease goes elsewhere, the body stops first and the lease is
-given back after.  Each turn finds one event, ``agents.state`` has what follows from it, and the effects are done here.
+Selection and commitment are separate: ``decide`` selects the agent that should act, and the lease gives it the right to
+act.  An agent executes only under a valid lease.  When the decision or the lease changes, the agent first stops the
+robot, then releases the lease.  Each turn determines one event; the table in ``agents.state`` gives its effects, which
+are performed here.
 """
 
 from __future__ import annotations
@@ -35,21 +36,21 @@ from middleware.tasks.order import PAUSE, Order
 from middleware.tasks.task import COMPLETED, FAILED, Member, Result, Task
 
 SEARCH_TTL = 0.5
-"""Seconds for which a motion that needs no lease (to look around) is allowed at a time."""
+"""Seconds for which a motion without a lease (looking around) is permitted at a time."""
 SETTLED = State.RELEASING, State.DONE
 NOBODY = Decision(None, "", "")
 
 
 @dataclass(frozen=True)
 class Deed:
-    """What the body is to do, and the permit under which it may."""
+    """An action for the robot and its permit."""
 
     action: Action
     permit: Permit
 
 
 class Ports(Protocol):
-    """The ways out of an engagement."""
+    """The outputs of an engagement."""
 
     def tell(self, member: Member) -> None:
         """Publish this agent's report."""
@@ -58,23 +59,24 @@ class Ports(Protocol):
         """Record the outcome."""
 
     def say(self, text: str) -> None:
-        """Write a line for people."""
+        """Write a line to the device's log on the page."""
 
     def halt(self) -> float:
-        """Stop the body now; the seconds for which it may still move because it does not hear that."""
+        """Stop the robot; return the seconds for which it may still move if it does not respond."""
 
     def justify(self, verdict: Verdict) -> None:
-        """Publish why the agent decided so."""
+        """Publish the record of a decision."""
 
     def reached(self, uuids: Sequence[str]) -> Sequence[Contact]:
-        """The contacts of the agents with these uuids, as far as they are known."""
+        """Return the known contacts of the agents with these uuids."""
 
 
 class Engagement:
-    """One agent at one task.
+    """One agent's part in one task.
 
-    ``age`` is how old the task was ``now``, when the agent took it up; ``token`` is the highest that its body has
-    obeyed so far.  The agent only listens until its body is given to this task, or to another of the task's group.
+    ``age`` is the age of the task in seconds at ``now``, when the agent joined it; ``token`` is the highest fencing
+    token that the robot has obeyed.  Until the robot is assigned to this task, or to another one of its group, the
+    agent only listens.
     """
 
     def __init__(
@@ -100,12 +102,12 @@ class Engagement:
         self._execution = Execution(behaviour, task.stall_limit)
         self._conference = Conference(task, me.uuid, strategy, panel)
         self._formation = Formation(me.uuid, behaviour)
-        self._began = now
+        self._joined_at = now
         self._age = age
 
     @property
     def lessee(self) -> Lessee | None:
-        """The client of the task's lease; None while the body is not this task's."""
+        """The client of the task's lease; None while another task has the robot."""
         return self.claim.lessee
 
     @property
@@ -115,34 +117,34 @@ class Engagement:
 
     @property
     def is_acting(self) -> bool:
-        """Whether the body acts for this task, or is about to."""
+        """Whether the robot acts for this task or is about to."""
         return self.course.state in (State.CLAIMING, State.EXECUTING)
 
     @property
     def may_be_put_aside(self) -> bool:
-        """Whether the body may go to another task of a higher priority now."""
+        """Whether the robot may be given to a task of higher priority now."""
         if self.course.state is State.RELEASING:
             return False
         return not self.is_acting or (self.task.preemptible and self._execution.is_safe)
 
     @property
     def division(self) -> Division | None:
-        """What divides the task together with others, where it is of a group."""
+        """The group with which the task is assigned, or None."""
         return self._conference.division
 
     def keeps_council(self, now: float) -> bool:
-        """Whether it falls to this agent to look after the council: it acts, or is the first while nobody does."""
-        return self.course.state not in SETTLED and self._may_fail(now)
+        """Return whether this agent maintains the quorum: it acts, or it is the first while no agent acts."""
+        return self.course.state not in SETTLED and self._may_end_task(now)
 
-    # -- what comes in ----------------------------------------------------------------------------------------------
+    # -- inputs -----------------------------------------------------------------------------------------------------
 
     def join(self, division: Division, now: float) -> None:
-        """Have the task divided together with others."""
+        """Decide the task together with its group."""
         self._conference.division = division
         division.join(self.task, lambda now: [self.me, *self._conference.others(now)], now)
 
     def heard(self, members: list[Member], outcome: Result | None, now: float) -> None:
-        """Take in who is present and what they report, and how the task ended.  An outcome absorbs all that follows."""
+        """Process the present members, their reports, and the outcome if there is one; the outcome is final."""
         if outcome is not None and (self.result is None or outcome.rank > self.result.rank):
             self.result = outcome
             self.on(Event.OUTCOME, now)
@@ -153,50 +155,50 @@ class Engagement:
             self.lessee.suspect()
         left = self._formation.hear(self._conference.others(now))
         if left and self._conference.counts(now):
-            self._ports.say(f"one left, {len(self._conference) + 1} here: spreads out")
+            self._ports.say(f"a member left, {len(self._conference) + 1} remain: changes its place in the formation")
 
     def ordered(self, order: Order | None) -> None:
-        """Take in what an operator wants of the task."""
+        """Process the operator's newest order for the task."""
         was_paused, self.is_paused = self.is_paused, order is not None and order.word == PAUSE
         if order is not None and was_paused != self.is_paused and not self.is_over:
             self._ports.say(f"{'paused' if self.is_paused else 'resumed'} by {order.by}")
 
     def renewed(self, task: Task) -> None:
-        """Take in what the records of the task say now; of its councils the newest stays."""
+        """Process a changed record of the task; the newest quorum is kept."""
         self.task = task.with_newer_council(self.task)
         if self.lessee is not None:
             self.lessee.council.learn(self.task.charter)
 
     def hand_council(self, members: Sequence[Contact]) -> None:
-        """Have ``members`` be the council of the task that it acts for, when the body comes to a safe point."""
+        """Change the quorum of the task to ``members`` at the behaviour's next safe point."""
         self.claim.successors = tuple(members)
 
     def set_load(self, load: int) -> None:
-        """Take in the number of tasks that the agent has."""
+        """Set the number of tasks that the agent has."""
         self._reporter.load = load
 
     def look(self, seen: Observation, now: float) -> None:
-        """Take in what the body senses, and report when it is new to the others."""
+        """Process an observation, and report changes."""
         self._execution.look(seen, now)
         if not self._is_free or self.is_over or self._execution.has_stalled(now):
             return
-        # In a group somebody is free now and then: what is nearly done must not look as far away as at its beginning.
+        # In a group the robot is free between tasks, so a task that is nearly done must report its reduced cost.
         is_acting = self.course.state is State.EXECUTING and self.division is None
         news = self._reporter.news(self.me, is_acting, seen, now)
         if news is not None:
             if "cost" in news:
                 cost = news["cost"]
-                self._ports.say("lost sight of it" if cost is None else f"reports {cost:.2f} m")
+                self._ports.say("has lost the target" if cost is None else f"reports {cost:.2f} m")
             self._publish(again=True, **news)
 
-    # -- the body ---------------------------------------------------------------------------------------------------
+    # -- the robot --------------------------------------------------------------------------------------------------
 
     def take_body(self, lessee: Lessee, token: int) -> None:
-        """Have the body for this task, which has obeyed ``token``; ``lessee`` claims the task's lease."""
+        """Assign the robot to this task; it has obeyed ``token``, and ``lessee`` is the client of the task's lease."""
         self.claim.lessee, self.claim.token = lessee, token
 
     def lend_body(self, is_lent: bool, now: float) -> None:
-        """Take in whether another task of the group has the body; where this task has it, it does not act."""
+        """Record whether another task of the group has the robot; if this task had it, it stops acting."""
         if is_lent and self.lessee is not None:
             if self.course.state in SETTLED:
                 return  # the lease is kept until the outcome is known
@@ -205,21 +207,21 @@ class Engagement:
         self.claim.is_lent = is_lent
 
     def put_aside(self, why: str, now: float) -> None:
-        """Leave the body to another task: stop it where it acts, give the lease back, and say that it is not free."""
+        """Give the robot to another task: stop it, release the lease, and report that the agent is not available."""
         if self.course.state not in SETTLED:
             self.on(Event.NO_BODY, now, replace(NOBODY, why=why))
             self.claim.lessee = None
 
     def lose_body(self) -> None:
-        """Take the report back: the body does not answer, so nobody waits for it.  The next look reports again."""
+        """Withdraw the report, because the robot does not respond; the next observation reports again."""
         if self.me.available and not self.is_over:
             self._ports.say("has lost its robot")
             self._publish(cost=None, available=False)
 
     def abandon(self, now: float) -> Deferred[object]:
-        """Leave the task: stop the body where it acts, and give the lease back, for good where the task is done.
+        """Leave the task: stop the robot if it acts, and release the lease.
 
-        Fires when the council knows.
+        Fires when the quorum members know.
         """
         self.on(Event.LEAVE, now)
         return self.claim.released
@@ -227,11 +229,11 @@ class Engagement:
     # -- one turn ---------------------------------------------------------------------------------------------------
 
     def step(self, now: float) -> Deed | None:
-        """Decide again and say what to do now; None where there is nothing to do for this task."""
+        """Decide again and return the next action; None if there is nothing to do for this task."""
         if self.course.state in SETTLED:
             return None
         lease = self.claim.lease
-        if self._is_late(now) and self.lessee is not None and self._may_fail(now):
+        if self._is_past_deadline(now) and self.lessee is not None and self._may_end_task(now):
             return self.on(Event.EXPIRED if lease else Event.LATE, now, lease=lease)
         if not self._is_free:
             return self.on(Event.NO_BODY, now, replace(NOBODY, why="paused" if self.is_paused else self.me.why))
@@ -265,20 +267,20 @@ class Engagement:
 
     @property
     def _is_free(self) -> bool:
-        """Whether the body is free for the task, or for another of its group."""
+        """Whether the robot is free for the task, or for another of its group."""
         return not self.is_paused and (self.lessee is not None or self.claim.is_lent)
 
-    def _may_fail(self, now: float) -> bool:
-        """Whether it falls to this agent to end the task without success: it acts, or is the first of those present."""
+    def _may_end_task(self, now: float) -> bool:
+        """Return whether this agent may end the task as failed: it acts, or is the first of the present agents."""
         return self.course.state is State.EXECUTING or self._conference.is_first(now)
 
-    def _is_late(self, now: float) -> bool:
-        return 0.0 < self.task.deadline < self._age + now - self._began
+    def _is_past_deadline(self, now: float) -> bool:
+        return 0.0 < self.task.deadline < self._age + now - self._joined_at
 
     # -- events and effects ----------------------------------------------------------------------------------------
 
     def on(self, event: Event, now: float, decision: Decision = NOBODY, lease: Lease | None = None) -> Deed | None:
-        """Take the step of ``event`` and do its effects in their order; the deed for the body, if there is one."""
+        """Apply ``event``, perform its effects in order, and return the resulting action for the robot, if any."""
         order, deed = decision.order, None
         rank = order.index(self.me.uuid) if self.me.uuid in order else 0
         for effect in self.course.go(event, rank if order else None):
@@ -287,22 +289,22 @@ class Engagement:
 
     def _do(self, effect: Effect, now: float, decision: Decision, lease: Lease | None) -> Deed | None:
         claim, ports = self.claim, self._ports
-        match effect:  # the effects of each turn come first
+        match effect:  # the effects of every turn come first
             case Effect.WANT:
                 claim.want()
             case Effect.EXECUTE:
                 assert lease is not None
                 return self._execute(decision, lease, now)
             case Effect.HOLD:
-                return self._stand_by(decision, now)
+                return self._hold(decision, now)
             case Effect.STAND_BY:
-                claim.stand_by(self._place(decision, now))
+                claim.stand_by(self._standby_rank(decision, now))
             case Effect.STOP:
                 claim.stop(ports.halt(), now)
             case Effect.RELEASE:
                 claim.release(now)
             case Effect.GIVE_BACK:
-                ports.say("gives the task back")
+                ports.say("releases the task")
                 claim.release(now)
             case Effect.HAND_OVER:
                 claim.released = claim.release(now, ports.reached(claim.standbys))
@@ -312,7 +314,7 @@ class Engagement:
                 if claim.insist(now):
                     self._publish(again=True)
             case Effect.CHANGE_COUNCIL:
-                ports.say(f"a member of the council is gone: {len(claim.successors)} from now on")
+                ports.say(f"replaces the quorum after the loss of a member: {len(claim.successors)} members")
                 claim.move(now, self.task.lease_ttl)
             case Effect.OFFER:
                 self.me = replace(self.me, available=True)
@@ -320,7 +322,7 @@ class Engagement:
                 nothing: dict[str, Any] = {"cost": None, "assigned": "", "digest": "", "token": 0, "progress": None}
                 self._publish(available=False, why=decision.why, post=None, **nothing)
             case Effect.START:
-                ports.say(f"goes: {decision.why}")
+                ports.say(f"acts: {decision.why}")
             case Effect.COMPLETE:
                 self._conclude(COMPLETED, lease, now)
             case Effect.FAIL:
@@ -341,19 +343,22 @@ class Engagement:
             self.on(Event.FINISHED, now, lease=lease)
         return Deed(STAND if turn.action is None else turn.action, Permit(lease.token, lease.deadline))
 
-    def _stand_by(self, decision: Decision, now: float) -> Deed | None:
-        if self.lessee is None:  # another task of its group has the body
+    def _hold(self, decision: Decision, now: float) -> Deed | None:
+        if self.lessee is None:  # another task of its group has the robot
             self._publish_decision(decision, 0, now)
             return None
         post = None
-        if self._conference.counts(now):  # of a large team those close up who know of each other
+        if self._conference.counts(now):  # only members with a visible report take a place in the formation
             post = self._formation.close_up(self.me, self._conference.others(now), decision.assigned)
         self._publish_decision(decision, 0, now, post=post)
         action = self._execution.stand_by(self.me.cost is None, now)
         return Deed(action, Permit(self.claim.token, now + SEARCH_TTL))
 
-    def _place(self, decision: Decision, now: float) -> int:
-        """The place in the line, from 1, of one of the few that take over at once; who acts now is not one of these."""
+    def _standby_rank(self, decision: Decision, now: float) -> int:
+        """Return the standby rank, from 1, of an agent that is to take over at once; 0 otherwise.
+
+        The assigned agent counts until it acts.
+        """
         if not 0 < self.course.rank <= STANDBYS:
             return 0
         others = self._conference.others(now)
@@ -364,16 +369,16 @@ class Engagement:
         members = [self.me, *self._conference.others(now)]
         bids = sorted((m.name, m.cost) for m in members if m.cost is not None)
         token = 0 if lease is None else lease.token
-        self._ports.conclude(Result(outcome, self.me.name, round(now - self._began, 2), token, tuple(bids), why))
+        self._ports.conclude(Result(outcome, self.me.name, round(now - self._joined_at, 2), token, tuple(bids), why))
 
     def _publish_decision(
         self, decision: Decision, token: int, now: float, progress: float | None = None, post: float | None = None
     ) -> None:
         assigned = decision.assigned or ""
         if assigned and assigned != self.me.assigned and assigned != self.me.uuid:
-            self._ports.say(f"stands by: {decision.why}")
-        told: dict[str, Any] = {"assigned": assigned, "digest": decision.digest, "why": decision.why}
-        self._publish(token=token, progress=progress, post=post, **told)
+            self._ports.say(f"standby: {decision.why}")
+        decided: dict[str, Any] = {"assigned": assigned, "digest": decision.digest, "why": decision.why}
+        self._publish(token=token, progress=progress, post=post, **decided)
         self.claim.standbys = tuple(uuid for uuid in decision.order if uuid != self.me.uuid)[:STANDBYS]
         verdict = self._conference.account(decision, self.me, token, now)
         if verdict is not None:
@@ -381,7 +386,7 @@ class Engagement:
 
     def _publish(self, again: bool = False, **changes: object) -> None:
         changes |= {"status": self.course.state.status, "state": str(self.course)}
-        # A round alone is told with the next report.
+        # a new round alone is sent with the next report
         if again or any(getattr(self.me, name) != value for name, value in changes.items()):
             epoch = self._conference.epoch
             serial = self.me.serial + 1 if epoch == self.me.epoch else 0

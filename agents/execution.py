@@ -1,7 +1,7 @@
-"""Execution: one agent's doing of one task, which outlives interruptions; pure.
+"""One agent's execution of one task, which continues after interruptions; pure.
 
-A behaviour is told under which token it acts.  The same token means "go on"; a new one means that others may have
-acted in between, and the behaviour decides what that means to it.  Whether the doing comes forward is watched here.
+A behaviour is called with the fencing token under which it acts.  The same token means "continue"; with a new token
+other agents may have acted in between, and the behaviour decides the consequences.  Lack of progress is detected here.
 """
 
 from __future__ import annotations
@@ -14,71 +14,74 @@ from agents.context import Context
 from drivers.reading import Action, Observation
 from middleware.consensus.strategy import Consensus
 
-SHARE = 0.01
-"""Less progress than this is none."""
-ASIDE = 1.0
-"""Who is not asked for longer than this was kept from it, and has not stalled meanwhile."""
-TOLD = 0.25
-"""The others are told of each quarter."""
+MIN_PROGRESS = 0.01
+"""Minimum growth of the progress, 0 to 1, that counts."""
+MAX_PAUSE_S = 1.0
+"""Seconds after which a pause between two calls does not count as time without progress."""
+PROGRESS_STEP = 0.25
+"""Progress is reported in steps of this size."""
 
 
 @dataclass(frozen=True)
 class Turn:
-    """What is to be done next (None: it is done), and the share that is done, where the behaviour can tell."""
+    """The next action (None: the task is done), and the progress from 0 to 1 if the behaviour reports it."""
 
     action: Action | None
     progress: float | None
 
 
 class Execution:
-    """The doing of one ``behaviour``; ``stall_limit`` in seconds without progress (0: any time)."""
+    """The execution of one ``behaviour``; ``stall_limit`` is the time in seconds without progress (0: unlimited)."""
 
     def __init__(self, behaviour: Behaviour, stall_limit: float) -> None:
         self._behaviour = behaviour
         self._stall_limit = stall_limit
         self._token = 0
-        self._began = 0.0
-        self._best = -math.inf
+        self._began_at = 0.0
+        self._best_progress = -math.inf
         self._best_at = 0.0
         self._stalled_at = -math.inf
-        self._agreed: tuple[tuple[float, ...], str] = (), ""
-        self._asked_at = 0.0
+        self._agreement: tuple[tuple[float, ...], str] = (), ""
+        self._called_at = 0.0
 
     def look(self, seen: Observation, now: float) -> None:
-        """Take in what the body senses."""
+        """Pass an observation to the behaviour."""
         self._behaviour.look(seen, now)
 
     def stand_by(self, is_searching: bool, now: float) -> Action:
-        """What to do without a lease: search for what the cost depends on, or hold."""
+        """Return the action without a lease: search for the data that the cost depends on, or hold."""
         return self._behaviour.search(now) if is_searching else self._behaviour.hold(now)
 
     def go_on(self, now: float, token: int, deadline: float, consensus: Consensus | None = None) -> Turn:
-        """Do the next bit under the lease of ``token``; ``consensus`` is what all agree on."""
+        """Continue under the lease with ``token``; ``consensus`` is the current decision."""
         is_resumed = token == self._token
-        if now - self._asked_at > ASIDE:
-            self._best_at += now - self._asked_at
-        self._asked_at = now
+        if now - self._called_at > MAX_PAUSE_S:
+            self._best_at += now - self._called_at
+        self._called_at = now
         if not is_resumed:
-            self._token, self._began, self._best, self._best_at = token, now, -math.inf, now
-            self._agreed = (), ""
+            self._token, self._began_at, self._best_progress, self._best_at = token, now, -math.inf, now
+            self._agreement = (), ""
         if consensus is not None and (consensus.value or consensus.choice):
-            self._agreed = consensus.value, consensus.choice
-        action = self._behaviour.execute(Context(now, token, deadline, self._began, is_resumed, *self._agreed))
+            self._agreement = consensus.value, consensus.choice
+        action = self._behaviour.execute(Context(now, token, deadline, self._began_at, is_resumed, *self._agreement))
         progress = getattr(self._behaviour, "progress", None)
         if not isinstance(progress, int | float) or not math.isfinite(progress):
             return Turn(action, None)
         progress = min(1.0, max(0.0, progress))
-        if progress >= self._best + SHARE:
-            self._best, self._best_at = progress, now
+        if progress >= self._best_progress + MIN_PROGRESS:
+            self._best_progress, self._best_at = progress, now
         elif 0.0 < self._stall_limit < now - self._best_at:
             self._stalled_at, self._best_at = now, now
-        return Turn(action, math.floor(max(progress, self._best) / TOLD + 1e-9) * TOLD)
+        return Turn(action, math.floor(max(progress, self._best_progress) / PROGRESS_STEP + 1e-9) * PROGRESS_STEP)
 
     def has_stalled(self, now: float) -> bool:
-        """Whether it came to nothing lately: another is to try, for as long as this one tried in vain."""
+        """Return whether progress stalled within the last ``stall_limit`` seconds.
+
+        In that time another agent may try.
+        """
         return now - self._stalled_at < self._stall_limit
 
     @property
     def is_safe(self) -> bool:
-        """Whether the task may change hands now; a behaviour that does not say is always at a safe point."""
+        """Whether the task may be reassigned now; default True."""
         return bool(getattr(self._behaviour, "is_safe", True))

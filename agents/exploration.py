@@ -1,6 +1,6 @@
-"""Exploration: look all around, walk to a new place where the way is open, or round what is in the way; pure.
+"""Explore an unknown place: look around, walk in an open direction, and go around obstacles; pure.
 
-Knows ranges and the robot's own odometry, and not what is searched for.
+It uses ranges and the robot's odometry only, and knows nothing of the target.
 """
 
 from __future__ import annotations
@@ -15,81 +15,85 @@ TURN_GAIN = 2.2
 LEG = 0.6
 """Metres to walk before looking around again."""
 CLEARANCE = 0.38
-"""Metres ahead at which a leg ends: something is in the way."""
+"""Metres ahead at which a leg ends because of an obstacle."""
 OPEN = 1.5
-"""A way with nothing within this range, the far ranger's, is as open as can be told."""
+"""Range in metres of the far ranger: a direction without an obstacle within it counts as open."""
 AIMED = math.radians(8.0)
 HERE = 0.5
-"""A bump not farther away than that says that its heading is no way from here either."""
+"""Metres within which a bump excludes its heading."""
 BUMPS = 3
 BACK = 0.10
-"""Metres of a detour backwards: nothing looks behind."""
+"""Metres that a detour backs off; no sensor looks behind."""
 BACK_SPEED = 0.08
 DETOUR_LEG = 0.35
 AWAY = math.radians(70.0)
 DETOUR_PATIENCE_S = 4.0
-"""Seconds for each of the three legs of a detour; who is stuck goes on with the next."""
+"""Seconds for each of the three legs of a detour; a stuck robot continues with the next leg."""
 
 Pose = tuple[float, float, float]
 
 
 class Exploration:
-    """One robot's way through an unknown place; ``pose`` is its odometry (x, y in metres, yaw in radians)."""
+    """Exploration by one robot; a ``pose`` is its odometry: x and y in metres, yaw in radians."""
 
     def __init__(self, rng: random.Random, means: Means | None = None) -> None:
         self.means = Means() if means is None else means
         self._rng = rng
         self._side = rng.choice((-1.0, 1.0))
-        self._turned = 0.0
+        self._turned_rad = 0.0
         self._openness: list[tuple[float, float]] = []
         self._heading: float | None = None
         self._leg_from: tuple[float, float] | None = None
         self._bumps: list[Pose] = []
         self.sector: tuple[float, float] | None = None
-        """The middle and the width of the headings that are this robot's to search; None: all."""
+        """The middle and the width of the headings that this robot searches; None: all."""
 
     def saw(self, pose: Pose, turned: float, ahead: float) -> None:
-        """Take in the pose, the turn since the last time, and the range ahead (NaN: nothing within reach)."""
+        """Process the pose, the turn since the last call, and the range ahead (NaN: nothing in range)."""
         if self._heading is None:
-            self._turned += abs(turned)
+            self._turned_rad += abs(turned)
             self._openness.append((OPEN if math.isnan(ahead) else ahead, pose[2]))
 
     def bumped(self, pose: Pose) -> None:
-        """Something was touched at ``pose``: end the leg, and for as long as it is near walk another way."""
+        """Process a bump at ``pose``: end the leg, and avoid its heading while it is near."""
         self._bumps = [*self._bumps, pose][-BUMPS:]
-        self._begin_turn()
+        self._start_looking()
 
     def step(self, pose: Pose, ahead: float) -> Action:
-        """What to do next."""
+        """Return the next action."""
         if self._heading is None:
-            if self._turned < math.tau:
+            if self._turned_rad < math.tau:
                 return self.means.spin(self._side * self.means.look_turn)
-            self._heading = self._most_open(pose)
+            self._heading = self._choose_heading(pose)
         off = math.remainder(self._heading - pose[2], math.tau)
         if self._leg_from is None:
             if (turn := turn_to(self.means, off)) is not None:
                 return turn
             self._leg_from = pose[:2]
         if is_blocked(ahead) or math.dist(self._leg_from, pose[:2]) >= LEG:
-            self._begin_turn()
+            self._start_looking()
             return STAND
         return walk_to(self.means, off)
 
-    def _most_open(self, pose: Pose) -> float:
-        """A heading with room ahead and beside it, in the own sector if there is one; chance decides among the best."""
+    def _choose_heading(self, pose: Pose) -> float:
+        """Return a heading with a large range, in the own sector if possible; chosen at random among the best."""
         seen = self._openness
         if self.sector is not None:
             middle, width = self.sector
             own = [(o, yaw) for o, yaw in seen if abs(math.remainder(yaw - middle, math.tau)) <= width / 2]
             seen = own if any(openness >= CLEARANCE + LEG for openness, _ in own) else seen
-        shut = [bump[2] for bump in self._bumps if math.dist(bump[:2], pose[:2]) <= HERE]
-        free = [one for one in seen if all(abs(math.remainder(one[1] - yaw, math.tau)) > math.pi / 3 for yaw in shut)]
+        blocked_headings = [bump[2] for bump in self._bumps if math.dist(bump[:2], pose[:2]) <= HERE]
+        free = [
+            one
+            for one in seen
+            if all(abs(math.remainder(one[1] - yaw, math.tau)) > math.pi / 3 for yaw in blocked_headings)
+        ]
         seen = free or seen
         best = max(openness for openness, _ in seen)
         return self._rng.choice([yaw for openness, yaw in seen if openness >= 0.95 * best])
 
-    def _begin_turn(self) -> None:
-        self._turned = 0.0
+    def _start_looking(self) -> None:
+        self._turned_rad = 0.0
         self._openness = []
         self._heading = None
         self._leg_from = None
@@ -97,7 +101,7 @@ class Exploration:
 
 
 class Detour:
-    """One robot's way round what it touched, or what stands before it: back off, turn away, walk on a little."""
+    """A detour around an obstacle: back off, turn away, and walk on a little."""
 
     def __init__(self, means: Means) -> None:
         self.means = means
@@ -107,56 +111,59 @@ class Detour:
         self._since = 0.0
 
     def is_on(self, now: float) -> bool:
-        """Whether the robot is on its way round, and looks elsewhere."""
+        """Return whether the robot is on the detour and does not look at the target."""
         return bool(self._legs) and now - self._since <= DETOUR_PATIENCE_S
 
     def begin(self, pose: Pose, side: float, now: float, has_touched: bool) -> None:
-        """Go round on ``side`` (1: left), from ``pose``; who has touched it backs off first."""
+        """Start a detour on ``side`` (1: left) from ``pose``.
+
+        The robot backs off first if it has touched the obstacle.
+        """
         self._legs = ["back", "turn", "walk"] if has_touched else ["turn", "walk"]
         self._heading = pose[2] + side * AWAY
         self._from, self._since = pose, now
 
     def end(self) -> None:
-        """Look where it is now."""
+        """Cancel the detour."""
         self._legs = []
 
     def step(self, pose: Pose, ahead: float, now: float) -> Action | None:
-        """What to do next; None once it is round.  ``ahead`` is the range ahead, NaN: nothing."""
+        """Return the next action; None after the detour.  ``ahead`` is the range ahead (NaN: nothing in range)."""
         while self._legs:
-            action = None if now - self._since > DETOUR_PATIENCE_S else self._on_leg(self._legs[0], pose, ahead)
+            action = None if now - self._since > DETOUR_PATIENCE_S else self._leg_action(self._legs[0], pose, ahead)
             if action is not None:
                 return action
             self._legs.pop(0)
             self._from, self._since = pose, now
         return None
 
-    def _on_leg(self, leg: str, pose: Pose, ahead: float) -> Action | None:
+    def _leg_action(self, leg: str, pose: Pose, ahead: float) -> Action | None:
         off = math.remainder(self._heading - pose[2], math.tau)
-        way = math.dist(pose[:2], self._from[:2])
+        walked = math.dist(pose[:2], self._from[:2])
         if leg == "back":
-            return None if way >= BACK else self.means.go(-BACK_SPEED)
+            return None if walked >= BACK else self.means.go(-BACK_SPEED)
         if leg == "turn":
             return turn_to(self.means, off)
-        if way >= DETOUR_LEG or is_blocked(ahead):
+        if walked >= DETOUR_LEG or is_blocked(ahead):
             return None
         return walk_to(self.means, off)
 
 
 def clipped(value: float, limit: float) -> float:
-    """``value``, or ``limit`` with its sign where it is larger."""
+    """Return ``value``, limited to ``limit`` in magnitude."""
     return max(-limit, min(limit, value))
 
 
 def turn_to(means: Means, off: float) -> Action | None:
-    """Turn on the spot to a heading ``off`` radians to the left; None where the body looks there well enough."""
+    """Turn on the spot to a heading ``off`` radians to the left; None if the robot faces it already."""
     return None if abs(off) <= max(AIMED, means.aim) else means.spin(clipped(TURN_GAIN * off, means.look_turn))
 
 
 def walk_to(means: Means, off: float) -> Action:
-    """Walk on towards a heading ``off`` radians to the left."""
+    """Walk towards a heading ``off`` radians to the left."""
     return means.go(means.walk, clipped(TURN_GAIN * off, means.look_turn))
 
 
 def is_blocked(ahead: float) -> bool:
-    """Whether something stands in the way, by the range ahead (NaN: nothing within reach)."""
+    """Return whether an obstacle is near, by the range ahead (NaN: nothing in range)."""
     return not math.isnan(ahead) and ahead < CLEARANCE

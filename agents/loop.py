@@ -1,4 +1,4 @@
-"""Agent: the mind of one device; it joins the tasks that its body can do and turns what is sensed into what is done."""
+"""The agent of one device: joins the tasks that its robot can do and turns observations into actions."""
 
 from __future__ import annotations
 
@@ -31,17 +31,17 @@ REENGAGE = 0.5
 
 
 class Agent(Service):
-    """One device's agent: one turn a tick, in the order observe, decide, act, publish.
+    """One device's agent; each tick has four steps: observe, decide, act, publish.
 
-    It takes part in every open task that its body can do.  One of them has the body; the others are told that it is
-    not free.
+    The agent takes part in every open task that its robot can do.  One task has the robot; in the others the agent
+    reports that it is not available.
     """
 
     def __init__(self, node: SwarmNode, driver: Driver, clock: IReactorTime, rng: random.Random) -> None:
         self._node = node
         self._clock = clock
         self._rng = rng
-        self._body = Body(driver, clock, self._seen, self._no_body)
+        self._body = Body(driver, clock, self._on_observation, self._on_missing)
         self._docket = Docket()
         self._checking: set[str] = set()
         self._parts: dict[str, Part] = {}
@@ -50,54 +50,54 @@ class Agent(Service):
         self._tick: IDelayedCall | None = None
         self._token = 0
         self._was_stopped = False
-        node.halt.watch(self._obey)
+        node.halt.watch(self._apply_stop)
 
     @property
     def engagement(self) -> Engagement | None:
-        """The engagement that has the body."""
+        """The engagement that has the robot, or None."""
         return None if self._holder is None else self._holder.engagement
 
     def startService(self) -> None:
-        """Connect the body, and follow the tasks once the node has joined."""
+        """Connect the robot, and follow the tasks once the node has joined."""
         super().startService()
         self._body.start()
-        self._node.joined.addCallback(self._follow)
-        self._tick = self._clock.callLater(TICK, self._turn)
+        self._node.joined.addCallback(self._follow_tasks)
+        self._tick = self._clock.callLater(TICK, self._on_tick)
 
     def stopService(self) -> Deferred[Any]:
-        """Stop the body first, then give back what is held; fires when those who lent it know."""
+        """Stop the robot, then release all leases; fires when the quorum members know."""
         super().stopService()
         self._body.stop()
         if self._tick is not None and self._tick.active():
             self._tick.cancel()
-        told: list[Deferred[Any]] = [self._leave(task_id) for task_id in list(self._parts)]
-        return DeferredList([*told, self._body.driver.disconnect()], consumeErrors=True)
+        releases: list[Deferred[Any]] = [self._leave(task_id) for task_id in list(self._parts)]
+        return DeferredList([*releases, self._body.driver.disconnect()], consumeErrors=True)
 
     # -- observe ----------------------------------------------------------------------------------------------------
 
-    def _seen(self, seen: Observation) -> None:
+    def _on_observation(self, seen: Observation) -> None:
         if seen.frame is not None:
-            # In the robot's seconds until it was heard, in those of this clock since then.
+            # age: on the robot's clock until the frame was received, on this clock since then
             age = max(0.0, seen.t_robot - seen.frame.t_robot) + self._clock.seconds() - seen.t_host
             self._node.streams.offer(CAMERA, seen.frame.seq, seen.frame.data, age)
         if self._body.is_empty or self._body.is_off or not self._node.halt.is_known:
-            return  # what it offered now it could not do at once, and others would count on it
-        for engagement in self._having_body():
+            return  # the robot could not act at once on this report, and others would rely on it
+        for engagement in self._engagements_with_robot():
             if not engagement.is_over:
                 engagement.look(seen, self._clock.seconds())
 
-    def _no_body(self, reason: str) -> None:
+    def _on_missing(self, reason: str) -> None:
         self._say(f"has no robot: {reason}")
 
     # -- tasks ------------------------------------------------------------------------------------------------------
 
-    def _follow(self, _: object) -> object:
+    def _follow_tasks(self, _: object) -> object:
         if self.running:
             self._node.halt.learn()
-            self._node.watch_tasks(self._tasks)
+            self._node.watch_tasks(self._process_tasks)
         return _
 
-    def _tasks(self, records: list[Record]) -> None:
+    def _process_tasks(self, records: list[Record]) -> None:
         listed = tasks_of(records)
         self._docket.forget(listed, self._clock.seconds())
         for task_id, task in sorted(listed.items()):
@@ -105,34 +105,34 @@ class Agent(Service):
                 continue
             if self._docket.is_new(task_id) and task_id not in self._checking:
                 self._checking.add(task_id)
-                self._check(task)
+                self._check_outcome(task)
             elif task_id in self._docket.open:
                 self._docket.add(task)
                 if task_id in self._parts:
                     self._parts[task_id].engagement.renewed(task)
 
-    def _check(self, task: Task) -> None:
+    def _check_outcome(self, task: Task) -> None:
         if self.running:
             known = self._node.entangled.get(group_key(task.task_id))
-            known.addCallback(self._checked, task)
-            known.addErrback(self._unchecked, task)
+            known.addCallback(self._join_unless_over, task)
+            known.addErrback(self._check_again, task)
 
-    def _checked(self, records: list[Record], task: Task) -> None:
-        """A task heard of: it may be an old one that is done."""
+    def _join_unless_over(self, records: list[Record], task: Task) -> None:
+        """Join the task unless its outcome is already recorded."""
         self._checking.discard(task.task_id)
         if outcome_of(task, records) is not None:
             self._docket.bury(task.task_id, self._clock.seconds())
         elif self._docket.add(task):
-            self._arrange()
+            self._assign_robot()
 
-    def _unchecked(self, failure: Any, task: Task) -> None:
-        """Nobody could tell whether the task is still open: ask again in a while."""
+    def _check_again(self, failure: Any, task: Task) -> None:
+        """Check again later: no replica answered, so it is unknown whether the task is still open."""
         failure.trap(EntangledError)
         if self.running:
-            self._clock.callLater(REENGAGE, self._check, task)
+            self._clock.callLater(REENGAGE, self._check_outcome, task)
 
-    def _arrange(self) -> None:
-        """Take part in what is open, and give the body to the task that it is due to."""
+    def _assign_robot(self) -> None:
+        """Join the open tasks, and give the robot to the most urgent one."""
         if not self.running:
             return
         followed = self._docket.followed()
@@ -142,21 +142,24 @@ class Agent(Service):
         active = [part for part in self._parts.values() if not (part.engagement.is_over or part.engagement.is_paused)]
         holder = self._holder if self._holder in active else None
         current = None if holder is None else holder.engagement
-        heads = self._heads(active)
-        wanted = next_task(
+        heads = self._most_urgent_parts(active)
+        due_task = next_task(
             [head.engagement.task for head in heads],
             next((head.engagement.task for head, parts in heads.items() if holder in parts), None),
             current is None or current.may_be_put_aside,
         )
-        parts = next((parts for head, parts in heads.items() if head.engagement.task is wanted), [])
+        parts = next((parts for head, parts in heads.items() if head.engagement.task is due_task), [])
         part = due(parts, holder) if parts else None
         if part is not self._holder:
             self._give_body(part)
         for each in active:
             each.engagement.lend_body(each in parts and each is not part, self._clock.seconds())
 
-    def _heads(self, active: list[Part]) -> dict[Part, list[Part]]:
-        """The most urgent part of each group with all that are in it, and each that is in none by itself."""
+    def _most_urgent_parts(self, active: list[Part]) -> dict[Part, list[Part]]:
+        """Return the most urgent part of each group with all parts of the group.
+
+        A task without a group stands alone.
+        """
         for task_id, part in self._parts.items():
             division = part.engagement.division
             if division is not None and part in active:
@@ -169,8 +172,8 @@ class Agent(Service):
             groups.setdefault(part if division is None else division, []).append(part)
         return {parts[0]: parts for parts in groups.values()}
 
-    def _having_body(self) -> list[Engagement]:
-        """The engagements that the body is free for: the one that has it, and those of its group."""
+    def _engagements_with_robot(self) -> list[Engagement]:
+        """Return the engagements that the robot is free for: the one that has it, and the others of its group."""
         return [p.engagement for p in list(self._parts.values()) if p is self._holder or p.engagement.claim.is_lent]
 
     def _engage(self, task: Task) -> None:
@@ -181,7 +184,7 @@ class Agent(Service):
             self._docket.bury(task.task_id, self._clock.seconds())
             return self._say(str(error))
         stop = self._body.halt
-        part = Part(task, self._node, behaviour, strategy, self._clock, self._token, self._told, stop)
+        part = Part(task, self._node, behaviour, strategy, self._clock, self._token, self._publish_status, stop)
         self._parts[task.task_id] = part
         self._say(f"assigned: {task.title}")
         group = group_of(task)
@@ -192,7 +195,7 @@ class Agent(Service):
         part.report()
 
     def _give_body(self, part: Part | None) -> None:
-        """Take the body from the task that has it, and give it to that of ``part``."""
+        """Take the robot from its current task and give it to the task of ``part``."""
         before, self._holder = self._holder, part
         group = None if part is None else part.engagement.division
         if before is not None and group is not None and before.engagement.division is group:
@@ -204,7 +207,7 @@ class Agent(Service):
         if part is None:
             return self._node.presence.change(task="", status=IDLE)
         engagement = part.engagement
-        engagement.take_body(self._node.lessee(engagement.task, self._turn_now, self._token), self._token)
+        engagement.take_body(self._node.lessee(engagement.task, self._take_turn, self._token), self._token)
         self._node.presence.change(task=engagement.task.task_id, status=engagement.me.status)
 
     def _leave(self, task_id: str) -> Deferred[object]:
@@ -220,17 +223,17 @@ class Agent(Service):
 
     # -- act --------------------------------------------------------------------------------------------------------
 
-    def _turn(self) -> None:
-        self._tick = self._clock.callLater(TICK, self._turn)
-        self._turn_now()
+    def _on_tick(self) -> None:
+        self._tick = self._clock.callLater(TICK, self._on_tick)
+        self._take_turn()
 
-    def _turn_now(self) -> None:
+    def _take_turn(self) -> None:
         if not self.running:
             return
         for part in list(self._parts.values()):
             if part.engagement.is_over:
-                self._finished(part)
-        self._arrange()
+                self._finish(part)
+        self._assign_robot()
         for part in list(self._parts.values()):
             part.engagement.set_load(len(self._parts))
             part.caretaker.look()
@@ -244,17 +247,20 @@ class Agent(Service):
             return
         has_body = self._body.answers
         if not has_body:
-            for each in self._having_body():
+            for each in self._engagements_with_robot():
                 each.lose_body()
-        # A robot may have obeyed an agent before this one: nothing older than that does it obey now.
+        # The robot may have obeyed another agent before: it rejects older tokens.
         engagement.claim.raise_token(self._body.driver.token)
         deed = engagement.step(self._clock.seconds())
         self._token = max(self._token, engagement.claim.token)
         if deed is not None and has_body and not self._body.do(deed):
             engagement.on(Event.OUTRANKED, self._clock.seconds())
 
-    def _obey(self) -> str:
-        """Stand while the team is stopped, and say what the body does; what is held is kept, so nobody takes over."""
+    def _apply_stop(self) -> str:
+        """Stand still while the team is stopped, and return the robot's state for the stop's reply.
+
+        The agent keeps its lease, so that no other agent takes over.
+        """
         if not self.running:
             return NO_ROBOT
         halt = self._node.halt
@@ -264,11 +270,11 @@ class Agent(Service):
         if not halt.is_on:
             return GOES_ON
         if not halt.is_known:
-            halt.learn()  # no node has answered so far
+            halt.learn()  # no node has answered yet
         self._body.driver.stop()
         return STANDS if self._body.driver.state == "ready" else "does not reach its robot, which stops by itself"
 
-    def _finished(self, part: Part) -> None:
+    def _finish(self, part: Part) -> None:
         engagement = part.engagement
         had_body = part is self._holder
         if had_body:
@@ -281,9 +287,9 @@ class Agent(Service):
 
     # -- publish ----------------------------------------------------------------------------------------------------
 
-    def _told(self, part: Part, member: Member) -> None:
+    def _publish_status(self, part: Part, member: Member) -> None:
         if part is self._holder and not part.engagement.is_over:
-            # What the device is after the task, its end says.
+            # The end of the task sets the device's status instead.
             self._node.presence.change(status=member.status)
 
     def _say(self, text: str) -> None:
@@ -291,16 +297,16 @@ class Agent(Service):
 
 
 def due(parts: list[Part], holder: Part | None) -> Part:
-    """Which of the tasks of one group is to have the body: the one that is given to it, else one it cannot tell of yet.
+    """Return the part of a group that should have the robot: the assigned one, else one with an unknown cost.
 
-    ``parts`` are the most urgent first, at least one; ``holder`` has the body now, for one of them or another task.
+    ``parts`` are sorted by urgency, at least one; ``holder`` has the robot now, for one of them or for another task.
     """
     own = holder if holder in parts else None
     if own is not None and (own.engagement.is_acting or not own.engagement.may_be_put_aside):
         return own
-    mine = next((part for part in parts if part.engagement.me.assigned == part.engagement.me.uuid), None)
-    if mine is not None:
-        return mine
+    assigned_part = next((part for part in parts if part.engagement.me.assigned == part.engagement.me.uuid), None)
+    if assigned_part is not None:
+        return assigned_part
     blind = [part for part in parts if part.engagement.me.cost is None]
     if own is not None and (own in blind or not blind):
         return own

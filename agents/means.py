@@ -1,7 +1,7 @@
-"""Means: what a body can do, out of its description and out of what it did when it was told to move; pure.
+"""The motion capabilities of a robot, derived from its description and its response to commands; pure.
 
-Behaviours ask here for velocities, a lens and rangers, and never for a kind of robot.  A body that says nothing of
-itself has the means of the simulated ERS-7.
+Behaviours ask here for speeds, the lens and rangers, so they do not depend on the kind of robot.  A robot without a
+description has the capabilities of the simulated ERS-7.
 """
 
 from __future__ import annotations
@@ -14,73 +14,76 @@ from drivers.reading import Action, Description, Value
 
 STAND = {"base.vx": 0.0, "base.vy": 0.0, "base.wz": 0.0}
 TURN_SPEED = 1.6
-"""Nobody turns faster than that, in rad/s: pictures blur, and come late."""
+"""Maximum turn rate in rad/s while searching: faster turns blur pictures, which also arrive late."""
 WALK = 0.16
 SWIFT = 0.3
-"""Metres a second of a body that ranges what lies ahead; ``WALK`` is for one that feels it only when it is there."""
+"""Walking speed in m/s of a robot that ranges what lies ahead.
+
+``WALK`` is for robots that detect obstacles by touch.
+"""
 SECONDS_AHEAD = 3.0
-"""A body that walks at most so far as it sees in so many seconds can stop before what it sees."""
+"""Seconds of walking that the ranger must cover, so that the robot can stop in time."""
 FACING = math.radians(3.0)
 COARSEST = math.radians(12.0)
 CAMERA_AHEAD = 0.10
-"""Metres from the middle of a robot to its camera, where its description does not say ``ahead``."""
+"""Metres from the robot's centre to its camera if the description has no ``ahead``."""
 VIEW = math.radians(56.9), math.radians(45.2)
-"""Across and up, of the ERS-7's camera."""
+"""Horizontal and vertical field of view of the ERS-7's camera."""
 STOP_AT = 0.12
-"""Metres left between the head and the target when the task is done: near, and not touching."""
+"""Metres between head and target at the end of the task: near, without contact."""
 ROOM = 0.08
-"""What is left at least between the body of a broader robot and the target."""
+"""Minimum metres between a wide robot and the target."""
 FRESH = 0.5
-"""Seconds since the newest sighting that still count as seeing the target."""
+"""Seconds for which the newest sighting counts as seeing the target."""
 FPS = 15.0
-USUAL = {"base.vx": (-0.156, 0.160), "base.vy": (-0.103, 0.103), "base.wz": (-2.03, 2.03)}
-"""The limits of an ERS-7."""
+ERS7_LIMITS = {"base.vx": (-0.156, 0.160), "base.vy": (-0.103, 0.103), "base.wz": (-2.03, 2.03)}
+"""The limits of an ERS-7: m/s and rad/s."""
 REACTION = 0.1
-"""Seconds from a command to the motion, beside the wait for the next picture."""
+"""Seconds from a command to the motion, without the wait for the next picture."""
 NEAR, FAR = ("near", "front"), ("near", "far", "front")
-"""The rangers that look straight ahead: those that measure to the last, and all."""
+"""The rangers that look straight ahead: the ones for close ranges, and all."""
 LIGHTS = ("front_left", "center_left", "center_right", "front_right")
 LIT = 0.35
-"""A light bumper that is hit says that something is nearer than that, and not how near."""
+"""Metres below which a light bumper reports a hit; it does not measure the range."""
 MORE = 1.5
-"""So much faster than what was too slow is tried next."""
+"""Factor by which the next command exceeds one that was too slow to move the robot."""
 CIRCLE = 0.3
-"""Metres: the circle of a body that turns only as it walks, until it has shown its own."""
+"""Initial radius in metres of the circle of a robot that turns only while walking."""
 
 
 class Means:
-    """The means of one body, told by ``description``.
+    """The motion capabilities of one robot, given by ``description``.
 
-    ``walk`` (m/s) and ``turn`` (rad/s) are the highest speeds for what it senses, ``lens`` is what the camera sees
-    across and up in radians (up None: as across, for the picture's pixels are square), ``ahead`` and ``radius`` are in
-    metres.  ``run`` is where its pictures are decoded.
+    ``walk`` (m/s) and ``turn`` (rad/s) are the maximum speeds that its sensors allow.  ``lens`` is the camera's
+    horizontal and vertical field of view in radians (vertical None: square pixels).  ``ahead`` and ``radius`` are in
+    metres.  ``run`` decodes its pictures.
     """
 
     def __init__(self, description: Description | None = None, run: Run = run_now) -> None:
         self.run = run
         if description is None:
-            description = Description("", "", {"ranger": {"max": 1.5}}, USUAL, 0.12)
+            description = Description("", "", {"ranger": {"max": 1.5}}, ERS7_LIMITS, 0.12)
         self._keys = description.limits
-        self.strafes = self._most("base.vy") > 0.0
+        self.strafes = self._max_speed("base.vy") > 0.0
         self.ranges = "ranger" in description.capabilities
-        """Whether it measures how far what lies ahead is."""
+        """Whether it measures the range ahead."""
         camera = description.capabilities.get("camera", {})
         reach = _number(description.capabilities.get("ranger", {}), "max", SECONDS_AHEAD)
         swift = max(WALK, min(SWIFT, reach / SECONDS_AHEAD)) if self.ranges else WALK
-        self.walk = min(swift, self._most("base.vx"))
-        self.turn = self._most("base.wz")
+        self.walk = min(swift, self._max_speed("base.vx"))
+        self.turn = self._max_speed("base.wz")
         across = _number(camera, "fov_h_deg", math.nan)
         up = _number(camera, "fov_v_deg", math.nan)
         self.lens: tuple[float, float | None] = VIEW
         if not math.isnan(across):
             self.lens = math.radians(across), None if math.isnan(up) else math.radians(up)
         fps = max(0.5, description.rates.get("camera", FPS))
-        # Half a view from one picture to the next: nothing slips through between two.
+        # Half a field of view per picture, so that the camera misses nothing while turning.
         self.look_turn = min(TURN_SPEED, self.turn, max(0.5, 0.5 * self.lens[0] * fps))
         self.ahead = _number(camera, "ahead", CAMERA_AHEAD)
         self.radius = description.radius
         self.is_walking = False
-        """Whether it walks ahead since it was told to move last."""
+        """Whether the last command made it walk ahead."""
         self.fresh = max(FRESH, min(2.5 / fps, 3 * FRESH))
         self.circle = 0.0
         """The radius in metres of the circle on which it turns; 0: on the spot."""
@@ -90,38 +93,41 @@ class Means:
 
     @property
     def aim(self) -> float:
-        """How well it can face something, in radians: whoever turns in steps is content with half a step."""
+        """The accuracy in radians with which it can face a target; half a step for a robot that turns in steps."""
         return max(FACING, min(COARSEST, 0.75 * self._step * self._reaction))
 
     @property
     def stop_at(self) -> float:
-        """Metres between its camera and a thing at which it has arrived: room to stand, and for its last stride."""
+        """Metres between its camera and a target at which it has arrived: room to stand, and for its last stride."""
         last = min(ROOM / 2, self._stride * self._reaction)
         return max(STOP_AT, self.radius - self.ahead + ROOM) + last
 
     @property
     def is_coarse(self) -> bool:
-        """Whether it turns in such steps that it cannot face a thing exactly."""
+        """Whether it turns in such large steps that it cannot face a target exactly."""
         return self.aim > FACING
 
     def spin(self, wz: float) -> Action:
-        """Turn with ``wz`` rad/s on the spot, or as narrowly and as slowly as it can."""
+        """Return the action that turns with ``wz`` rad/s on the spot, or as tightly and slowly as the robot can."""
         if 0.0 < abs(wz) < self._least_turn:
             wz = math.copysign(self._least_turn, wz)
         return {**STAND, "base.vx": self.walk if self.circle and wz else 0.0, "base.wz": wz}
 
     def go(self, vx: float, wz: float = 0.0) -> Action:
-        """Walk with ``vx`` m/s, or as slowly as it can, and turn with ``wz`` rad/s."""
+        """Return the action that walks with ``vx`` m/s, or as slowly as the robot can, and turns with ``wz`` rad/s."""
         if 0.0 < abs(vx) < self._least_walk:
             vx = math.copysign(self._least_walk, vx)
         return {**STAND, "base.vx": vx, "base.wz": wz}
 
     def fitted(self, action: Action) -> Action:
-        """``action`` without rest on the axes that the body does not have; what moves them is left to be refused."""
+        """Return ``action`` without zero speeds on axes that the robot lacks.
+
+        Other speeds are left for the driver to reject.
+        """
         return {key: value for key, value in action.items() if key in self._keys or value}
 
     def did(self, wished: Action, done: Action) -> None:
-        """Learn from what the body does (``done``) when it is told to do ``wished``."""
+        """Learn from the actual motion ``done`` of the command ``wished``."""
         vx, wz = wished.get("base.vx", 0.0), wished.get("base.wz", 0.0)
         real_vx, real_wz = done.get("base.vx", vx), done.get("base.wz", wz)
         self.is_walking = real_vx > 0.0
@@ -132,7 +138,7 @@ class Means:
         if wz and real_wz and abs(real_wz) > 1.05 * abs(wz) + 0.02:
             self._step = abs(real_wz) if not self._step else min(self._step, abs(real_wz))
         if wz and not vx and not real_wz:
-            # Too slow for it; and where the fastest is too slow it turns only as it walks.
+            # Too slow for the robot; if the fastest rate is too slow, it turns only while walking.
             if abs(wz) >= 0.99 * min(self.turn, self.look_turn):
                 self.circle = self.circle or CIRCLE
             else:
@@ -142,20 +148,20 @@ class Means:
         if self.circle and real_vx and real_wz:
             self.circle = abs(real_vx / real_wz)
 
-    def _most(self, key: str) -> float:
+    def _max_speed(self, key: str) -> float:
         return self._keys[key][1] if key in self._keys else 0.0
 
 
 def is_bumped(values: Mapping[str, Value]) -> bool:
-    """Whether the body feels that it touches something."""
+    """Return whether a bump sensor reports contact."""
     return any(value is True and key.startswith("bump.") for key, value in values.items())
 
 
 def is_lit(values: Mapping[str, Value]) -> bool:
-    """Whether a light bumper that looks ahead is hit."""
+    """Return whether a light bumper that looks ahead reports a hit."""
     return any(values.get(f"lightbump.{name}.hit") is True for name in LIGHTS)
 
 
-def _number(properties: Mapping[str, float | str], key: str, usual: float) -> float:
-    value = properties.get(key, usual)
-    return value if isinstance(value, int | float) and math.isfinite(value) and value > 0.0 else usual
+def _number(properties: Mapping[str, float | str], key: str, default: float) -> float:
+    value = properties.get(key, default)
+    return value if isinstance(value, int | float) and math.isfinite(value) and value > 0.0 else default

@@ -1,7 +1,7 @@
-"""Part: one agent's engagement in one task, with its place in the group of the task; reports go out through it.
+"""One agent's engagement in one task, connected to the task's group: its reports are sent through it.
 
-The caretaker fills up the council of the task when a member of it is gone.  That falls to whoever acts, and before
-anybody does to the first of those present (consensus rules 1 and 2).
+The caretaker replaces lost members of the task's quorum.  This is the duty of the acting agent or, while no agent acts,
+of the first present agent (consensus rules 1 and 2).
 """
 
 from __future__ import annotations
@@ -29,40 +29,40 @@ from middleware.tasks.order import order_of
 from middleware.tasks.task import Member, Result, Task, council_of, group_key
 
 AGAIN = 0.5
-"""Seconds until an outcome that no majority could be told is told again."""
+"""Seconds until an outcome is sent again after no majority could be reached."""
 
 VISIT_S = 5.0
-"""Seconds between two looks; a council that nobody asks for a lease is asked then whether it is there."""
+"""Seconds between two checks; a quorum without lease requests is probed at this interval."""
 LOOK_AGAIN_S = 10.0
-"""Seconds until a successor is looked for again where there was none."""
+"""Seconds until a successor is looked for again after none was found."""
 
 
 class Caretaker:
-    """What looks after the council of the task of ``engagement``, in the name of ``node``."""
+    """Maintains the quorum of the task of ``engagement`` on behalf of ``node``."""
 
     def __init__(self, engagement: Engagement, node: SwarmNode, clock: IReactorTime) -> None:
         self._engagement = engagement
         self._node = node
         self._clock = clock
         self._council: Council | None = None
-        self._visit_at = clock.seconds() + VISIT_S
-        self._look_at = 0.0
+        self._next_check_at = clock.seconds() + VISIT_S
+        self._next_search_at = 0.0
 
     def look(self) -> None:
-        """Look after the council, if it falls to this agent."""
+        """Check the quorum and replace lost members, if that is this agent's duty."""
         engagement, now = self._engagement, self._clock.seconds()
-        if now < self._visit_at or not engagement.keeps_council(now):
+        if now < self._next_check_at or not engagement.keeps_council(now):
             return
-        self._visit_at = now + VISIT_S
+        self._next_check_at = now + VISIT_S
         lessee = engagement.lessee if engagement.is_acting else None
-        council = self._visited() if lessee is None else lessee.council
-        if now >= self._look_at and self._node.councils.has_vacancy(engagement.task, council):
-            self._look_at = now + LOOK_AGAIN_S
+        council = self._probed_council() if lessee is None else lessee.council
+        if now >= self._next_search_at and self._node.councils.has_vacancy(engagement.task, council):
+            self._next_search_at = now + LOOK_AGAIN_S
             following = Deferred.fromCoroutine(self._node.councils.successors(engagement.task, council))
-            following.addCallback(self._found, council).addErrback(_nobody)
+            following.addCallback(self._hand_over_council, council).addErrback(_ignore_unreachable)
 
-    def _visited(self) -> Council:
-        """The council that nobody asks for a lease, asked whether it is there."""
+    def _probed_council(self) -> Council:
+        """Probe the quorum, which gets no lease requests at present."""
         task = self._engagement.task
         if self._council is None:
             self._council = self._node.councils.of(task)
@@ -70,7 +70,7 @@ class Caretaker:
         self._council.visit()
         return self._council
 
-    def _found(self, members: tuple[Contact, ...] | None, council: Council) -> object:
+    def _hand_over_council(self, members: tuple[Contact, ...] | None, council: Council) -> object:
         if members is not None and council is self._council:
             return council.change(members)
         if members is not None:
@@ -78,13 +78,13 @@ class Caretaker:
         return None
 
 
-def _nobody(failure: Any) -> None:
-    """Too few answer just now, or somebody claims the lease: it is tried again."""
+def _ignore_unreachable(failure: Any) -> None:
+    """Ignore that too few members answer or that the lease is claimed: the caretaker tries again."""
     failure.trap(EntangledError)
 
 
 class Part:
-    """The agent of ``node`` at ``task``; ``told`` is called with each report that goes out."""
+    """The agent of ``node`` at ``task``; ``told`` is called with each report that is sent."""
 
     def __init__(
         self,
@@ -110,29 +110,29 @@ class Part:
         now = clock.seconds()
         self.engagement = Engagement(task, me, behaviour, strategy, self, self._panel, token, now, age)
         self.caretaker = Caretaker(self.engagement, node, clock)
-        self._group = node.group(task, self._heard, self._ordered, self._panel)
+        self._group = node.group(task, self._on_reports, self._on_orders, self._panel)
 
     def report(self) -> None:
-        """Tell the others how things stand."""
+        """Send the agent's report."""
         self._group.report(self.engagement.me)
 
     def leave(self, is_running: bool) -> Deferred[object]:
-        """Give back what is held and hear no more of it; who goes on running takes its report back.
+        """Release the lease and leave the group; a node that continues to run also withdraws its report.
 
-        Fires when those who lend it know.
+        Fires when the quorum members know.
         """
         self.is_left = True
-        told = self.engagement.abandon(self._clock.seconds())
+        released = self.engagement.abandon(self._clock.seconds())
         self._close()
         self._group.leave()
         if is_running:
             self._group.withdraw()
-        return told
+        return released
 
-    def _heard(self, members: list[Member], outcome: Result | None) -> None:
+    def _on_reports(self, members: list[Member], outcome: Result | None) -> None:
         self.engagement.heard(members, outcome, self._clock.seconds())
 
-    def _ordered(self, records: list[Record]) -> None:
+    def _on_orders(self, records: list[Record]) -> None:
         self.engagement.ordered(order_of(records))
         task = council_of(self.engagement.task, records)
         if task is not self.engagement.task:
@@ -144,22 +144,22 @@ class Part:
         self._told(self, member)
 
     def justify(self, verdict: Verdict) -> None:
-        """Publish why the agent decided so, where the others know of it."""
+        """Publish the record of a decision, if the agent's report is visible to the others."""
         if self._panel.counts(self._clock.seconds()):
             self._node.justify(verdict)
 
     def conclude(self, result: Result) -> None:
-        """Record the outcome, as long as it is this agent's to record."""
+        """Record the outcome, while this agent may record it."""
         lessee = self.engagement.lessee
         if self.is_left or lessee is None:
             return
         result = replace(result, token=max(result.token, lessee.token))
         proved = lessee.end(result.token)
         proved.addCallback(lambda proof: self._group.conclude(result, proof))
-        proved.addErrback(self._not_concluded, result)
+        proved.addErrback(self._retry_conclude, result)
 
-    def _not_concluded(self, failure: Any, result: Result) -> None:
-        """No majority could be told: try again for as long as the task is this agent's to conclude."""
+    def _retry_conclude(self, failure: Any, result: Result) -> None:
+        """Try again while this agent may record the outcome: no majority could be reached."""
         failure.trap(EntangledError)
         if failure.check(Superseded) is not None:
             self.engagement.on(Event.REOPENED, self._clock.seconds())
@@ -167,5 +167,5 @@ class Part:
             self._clock.callLater(AGAIN, self.conclude, result)
 
     def say(self, text: str) -> None:
-        """Write a line for people."""
+        """Write a line to the device's log on the page."""
         self._node.presence.say(self._node.wall(), text)

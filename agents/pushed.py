@@ -1,4 +1,4 @@
-"""Pushed: observations, means and contexts as plain values, and behaviours as their own process serves them; pure."""
+"""Observations, motion capabilities and contexts as plain values, and the process side of deployed behaviours; pure."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ OPTIONAL: Mapping[str, object] = {
     "weight": 1.0,
     "electorate": 0.0,
 }
-"""The optional attributes of a behaviour, each with its default (``agents.behaviour``)."""
+"""The optional attributes of a behaviour with their defaults (``agents.behaviour``)."""
 LOOK, SEARCH, HOLD, EXECUTE, EMBODY = "look", "search", "hold", "execute", "embody"
 
 
 class BehaviourKind:
-    """Behaviours, in their own process.  Each answer is the result, the cost, and the optional attributes."""
+    """Serves behaviours in their own process; each reply has the result, the cost and the optional attributes."""
 
     def make(self, make: Make, arguments: list[Any]) -> object:
-        """A behaviour for the parameters of a task, with its own random generator."""
+        """Create a behaviour from a task's parameters, with its own random generator."""
         parameters, seed = arguments
         return _Embodied(make(parameters, random.Random(seed)))
 
     def facts(self, thing: object) -> dict[str, Any]:
-        """Its cost and attributes before the first look."""
+        """Return the behaviour's cost and attributes before the first observation."""
         assert isinstance(thing, _Embodied)
         return {"told": told(thing.behaviour)}
 
     def call(self, thing: object, method: str, arguments: list[Any]) -> object:
-        """The result of one method, with the cost and attributes after it."""
+        """Call one method; returns its result, and the cost and attributes after it."""
         assert isinstance(thing, _Embodied)
         behaviour = thing.behaviour
         result = None
@@ -58,50 +58,50 @@ class BehaviourKind:
 
 
 class _Embodied:
-    """A behaviour, with what its body can do."""
+    """A behaviour and the motion capabilities of its robot."""
 
     def __init__(self, behaviour: Any) -> None:
         self.behaviour = behaviour
         self._means: Means | None = None
 
     def embody(self, fields: dict[str, Any]) -> None:
-        """Tell it the means of its body; later calls update the same object."""
+        """Pass on the motion capabilities; later calls update the same object."""
         is_new = self._means is None
         self._means = means = self._means or Means()
         for name, value in fields.items():
-            setattr(means, name, _tuples(value))
+            setattr(means, name, _tuples_from_lists(value))
         if is_new and hasattr(self.behaviour, "embody"):
             self.behaviour.embody(means)
 
 
 def told(thing: object) -> list[Any]:
-    """The cost and the optional attributes of a behaviour, in the order of ``OPTIONAL``."""
-    return [getattr(thing, "cost", None), *(getattr(thing, name, usual) for name, usual in OPTIONAL.items())]
+    """Return the cost and the optional attributes of a behaviour, in the order of ``OPTIONAL``."""
+    return [getattr(thing, "cost", None), *(getattr(thing, name, default) for name, default in OPTIONAL.items())]
 
 
 def plain_means(means: Means) -> dict[str, Any]:
-    """The means of a body as plain values; without ``run``, because that process decodes its pictures itself."""
+    """Convert motion capabilities to plain values; ``run`` is left out because the process decodes pictures itself."""
     fields = {name: value for name, value in vars(means).items() if name != "run"}
     return {name: dict(value) if isinstance(value, Mapping) else value for name, value in fields.items()}
 
 
 def plain_observation(seen: Observation) -> list[Any]:
-    """An observation as plain values."""
+    """Convert an observation to plain values."""
     samples = {key: list(values) for key, values in seen.samples.items()}
     frame = None if seen.frame is None else list(astuple(seen.frame))
     return [seen.t_host, seen.t_robot, dict(seen.values), samples, frame]
 
 
 def observation_of(fields: list[Any]) -> Observation:
-    """An observation out of plain values."""
+    """Rebuild an observation from plain values."""
     t_host, t_robot, values, samples, frame = fields
-    held = {key: tuple(each) for key, each in samples.items()}
-    return Observation(t_host, t_robot, values, held, None if frame is None else Frame(*frame))
+    sample_tuples = {key: tuple(each) for key, each in samples.items()}
+    return Observation(t_host, t_robot, values, sample_tuples, None if frame is None else Frame(*frame))
 
 
-def _tuples(value: object) -> object:
+def _tuples_from_lists(value: object) -> object:
     if isinstance(value, dict):
-        return {key: _tuples(each) for key, each in value.items()}
+        return {key: _tuples_from_lists(each) for key, each in value.items()}
     return tuple(value) if isinstance(value, list) else value
 
 
@@ -109,5 +109,5 @@ def _plain_action(action: object) -> dict[str, float] | None:
     if action is None:
         return None
     if not isinstance(action, Mapping):
-        raise TypeError(f"an action is a mapping, not {type(action).__name__}")
+        raise TypeError(f"an action must be a mapping, not {type(action).__name__}")
     return {str(key): float(value) for key, value in action.items()}

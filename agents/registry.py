@@ -1,4 +1,4 @@
-"""Registry: the agent of a device, by the name in its configuration (thesis, Table 5.1), imported when asked for."""
+"""Load a device's agent by the name in its settings (thesis, Table 5.1)."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ MakeAgent = Callable[[SwarmNode, Driver, IReactorTime, random.Random], Service]
 
 
 def agent_named(name: str) -> MakeAgent:
-    """What makes the agent called ``name``: a built-in one, or ``module:Class`` of this machine.
+    """Return the factory of the agent called ``name``: a built-in one, or ``module:Class`` on this machine.
 
-    Raises ``UnknownAgent``, which names those there are.
+    Raises ``UnknownAgent``, whose text lists the known names.
     """
     target = BUILT_IN.get(name, name if ":" in name else None)
     if target is None:
         known = ", ".join(sorted(BUILT_IN))
-        raise UnknownAgent(f"no agent is called {name!r}; there are {known}, or write module:Class")
+        raise UnknownAgent(f"unknown agent {name!r}; use {known}, or module:Class")
     module, _, attribute = target.partition(":")
     try:
         make: Any = getattr(importlib.import_module(module), attribute)

@@ -1,8 +1,8 @@
-"""SearchAndApproach: turn until the target is seen, face it, tell how far it is, and walk up to it (thesis, section 5).
+"""Search for the red target, face it, report its distance, and walk up to it (thesis, section 5).
 
-Distance comes from a ranger that looks ahead once the robot faces the target, cross-checked with the size in the
-picture: a ranger that reads something else (a dog in between, a wall behind) is not believed.  Without a ranger it is
-the picture's, and a bump into the target is an arrival as well.
+The distance comes from a ranger that looks ahead once the robot faces the target, cross-checked against the target's
+size in the picture, because a ranger may measure another dog or a wall.  Without a ranger the distance comes from the
+picture, and a bump into the target also counts as arrival.
 """
 
 from __future__ import annotations
@@ -22,29 +22,29 @@ from agents.vision import Sighting, Size, find_target
 from drivers.reading import Action, Observation
 
 AT_IT = math.radians(12.0)
-"""Whoever stands before the target looks at it at least so well."""
+"""A robot in front of the target faces it within this angle."""
 TURN_FIRST = math.radians(25)
 IN_THE_WAY = 0.30
 SIDESTEP, CREEP = 0.10, 0.04
 SHOULDER = 2.0
-"""So many of its own radii a robot goes on aside once its eyes are past what stands between: its body is broader."""
+"""A robot continues sideways by this many radii after its camera has passed an obstacle, since its body is wider."""
 TOUCHING = 0.30
-"""Who faces a target that seems no farther away and bumps into something bumped into the target."""
+"""A bump while facing a target within this many metres is a bump into the target."""
 TIGHT = 3.0
-"""Who turns on a circle only, and has the target aside within so many of its radii, walks back first."""
+"""A robot that cannot turn on the spot backs off first if the target is to its side within this many circle radii."""
 MEMORY = 4.0
-"""Seconds for which a target out of sight is still believed to be where it was: another dog may only be passing by."""
+"""Seconds for which a target out of sight is assumed to stay: another dog may be passing."""
 HIDDEN = 30.0
-"""The same where something is seen to stand between: a robot that died on its way stays where it is."""
+"""The same in seconds if an obstacle is seen in between: a robot that failed on the way stays there."""
 DISAGREEMENT = 0.25
 SETTLE = 3
 STRIDE, STUCK = 0.02, 1.5
-"""Who walks, and comes no farther than that (metres) in so many seconds, stands against something."""
+"""A walking robot that moves less than this (metres) in this time (seconds) is stuck."""
 MAX_SIZE = 5.0
 
 
 class SearchAndApproach:
-    """One robot and one red target; ``parameters`` may give ``target_radius`` and ``target_height`` in metres."""
+    """One robot and one red target; ``parameters`` may have ``target_radius`` and ``target_height`` in metres."""
 
     def __init__(self, parameters: Mapping[str, float | str], rng: random.Random) -> None:
         self._radius = _metres(parameters, "target_radius", 0.08)
@@ -64,24 +64,24 @@ class SearchAndApproach:
         self._circling = Circling(self._means)
         self._detour = Detour(self._means)
         self._is_lit = self._is_bumped = self._was_bumped = self._has_arrived = False
-        self._moved: tuple[Pose, float] = (0.0, 0.0, 0.0), -math.inf
-        self._asked_at = -math.inf
+        self._last_moved: tuple[Pose, float] = (0.0, 0.0, 0.0), -math.inf
+        self._called_at = -math.inf
         self._blocked_at = math.inf, math.inf
-        self._way = 0.0
+        self._initial_gap = 0.0
         self._north: float | None = None
 
     def embody(self, means: Means) -> None:
-        """Look and walk as this body can."""
+        """Use the motion capabilities of this robot."""
         self._means = self._exploration.means = self._circling.means = self._detour.means = means
         self._detector.run = means.run
 
     # -- observing --------------------------------------------------------------------------------------------------
 
     def look(self, seen: Observation, now: float) -> None:
-        """Take in odometry and rangers, and search the picture if it is a new one."""
+        """Process odometry and ranges, and search a new picture for the target."""
         values = seen.values
         x, y, yaw = (float(values.get(f"odom.{axis}", 0.0)) for axis in ("x", "y", "yaw"))
-        # Odometry counts from wherever the robot was switched on: the first pose is no turn.
+        # Odometry starts at an arbitrary pose, so the first one is not a turn.
         before = self._pose if self._has_pose else (x, y, yaw)
         self._pose, self._has_pose = (x, y, yaw), True
         for name in FAR:
@@ -93,31 +93,31 @@ class SearchAndApproach:
         if seen.frame is not None and seen.frame.seq != self._frame:
             self._frame = seen.frame.seq
             find = partial(find_target, seen.frame.data, self._size, self._means.lens)
-            self._detector.detect(find, partial(self._saw, now, self._pose))
+            self._detector.detect(find, partial(self._add_sighting, now, self._pose))
         if self._circling.is_walking or self._detour.is_on(now):
-            self._looked_at = now  # it looks elsewhere, and the target stays where it is
+            self._looked_at = now  # the robot looks elsewhere, and the target stays in place
         elif self.cost is not None and self._is_hidden and now - self._seen_at <= HIDDEN - MEMORY:
             self._looked_at = now
         if now - self._looked_at > MEMORY:
             self._forget()
 
-    def _saw(self, now: float, pose: Pose, sighting: Sighting | None) -> None:
-        """Add a sighting in the picture that came at ``now``, when the robot stood at ``pose``."""
+    def _add_sighting(self, now: float, pose: Pose, sighting: Sighting | None) -> None:
+        """Add a sighting from the picture that arrived at ``now``, when the robot was at ``pose``."""
         if sighting is None:
             return
         self._seen_at = self._looked_at = now
-        # Where it stands in the robot's own odometry: between pictures the body turns and walks, the target does not.
+        # Stored in odometry coordinates: the robot moves between pictures, the target does not.
         x, y, yaw = pose
         if sighting.is_filling and self._target is not None and not self._means.ranges:
-            # It is nearer than the picture can tell: what was known before, and the way since, say how near.
+            # Nearer than the picture can measure: use the last position and the distance walked since.
             sighting = replace(sighting, distance=min(sighting.distance, self._distance))
         reach, towards = sighting.distance + self._means.ahead, yaw + sighting.bearing
         self._target = (x + reach * math.cos(towards), y + reach * math.sin(towards))
         if abs(sighting.bearing) < self._means.aim:
-            self._distances = [*self._distances, self._measured(sighting)][-9:]
+            self._distances = [*self._distances, self._measure_distance(sighting)][-9:]
 
-    def _measured(self, sighting: Sighting) -> float:
-        """Metres from the head: the ranger's where it agrees with the picture, else the picture's."""
+    def _measure_distance(self, sighting: Sighting) -> float:
+        """Return the metres from the head: the ranger's if it agrees with the picture, else the picture's."""
         for name in FAR:
             ranged = self._ranges[name] + self._radius
             if abs(ranged - sighting.distance) < DISAGREEMENT * sighting.distance:
@@ -144,14 +144,14 @@ class SearchAndApproach:
 
     @property
     def _is_hidden(self) -> bool:
-        """Whether something stands between here and where the target is believed to be."""
+        """Whether an obstacle stands between the robot and the assumed position of the target."""
         if self._target is None or abs(self._bearing) > AT_IT:
             return False
         return self._ahead + self._radius < self._distance * (1 - DISAGREEMENT) - 0.05
 
     @property
     def cost(self) -> float | None:
-        """Metres to the target: the median of the newest measurements, once there are enough of them."""
+        """Metres to the target: the median of the newest measurements; None until there are enough."""
         if self._target is None or len(self._distances) < SETTLE:
             return None
         ordered = sorted(self._distances)
@@ -159,7 +159,7 @@ class SearchAndApproach:
 
     @property
     def angle(self) -> float | None:
-        """Where the dog stands as seen from the target, by the compass; None without target or compass."""
+        """The robot's direction as seen from the target, by the compass; None without target or compass."""
         if self._target is None or self._north is None:
             return None
         x, y, _ = self._pose
@@ -168,66 +168,66 @@ class SearchAndApproach:
 
     @property
     def progress(self) -> float | None:
-        """The share of the way that is done, from where the dog stood by; None where it did not, or sees nothing."""
-        return None if self._target is None or not self._way else max(0.0, 1.0 - self._gap / self._way)
+        """The share of the distance walked since the robot last held; None if it did not hold or sees no target."""
+        return None if self._target is None or not self._initial_gap else max(0.0, 1.0 - self._gap / self._initial_gap)
 
     def is_in_view(self, now: float) -> bool:
-        """Whether the newest sighting still counts as seeing the target."""
+        """Return whether the newest sighting is recent enough to count as seeing the target."""
         return now - self._seen_at <= self._means.fresh
 
     # -- acting -----------------------------------------------------------------------------------------------------
 
     def search(self, now: float) -> Action:
-        """Look around and walk to new places; something seen, face it."""
+        """Look around and walk to new places; face the target once it is seen."""
         if self._target is not None:
             self._detour.end()
             return self._face()
-        self._feel(now)
+        self._detect_stuck(now)
         return self._dodge(now) or self._exploration.step(self._pose, self._ahead)
 
     def hold(self, now: float) -> Action:
-        """Stand at the post and keep facing the target, ready to take over."""
+        """Stand at the post and face the target."""
         if self._target is None:
             return self.search(now)
         self._detour.end()
-        self._way = self._gap
+        self._initial_gap = self._gap
         is_facing = abs(self._bearing) < self._means.aim and self.is_in_view(now)
         return self._circling.step(self._pose, self._target, self.angle, self._ahead, is_facing) or self._face()
 
     def take_post(self, post: Post) -> None:
-        """Stand there from now on while another acts, and search that sector while there is nothing to be seen."""
+        """Move to ``post`` while another robot acts, and search its sector while no target is seen."""
         self._circling.send(post.angle)
         if self._north is not None:
             self._exploration.sector = math.remainder(post.sector[0] - self._north, math.tau), post.sector[1]
 
     def execute(self, context: Context) -> Action | None:
-        """Walk up to the target and stop before touching it; None once the dog stands there."""
+        """Walk up to the target and stop before touching it; None when the robot has arrived."""
         now = context.now
         self._circling.rest()
         if self._target is None:
             return self.search(now)
-        self._feel(now)
+        self._detect_stuck(now)
         bearing, gap = self._bearing, self._gap
         means = self._means
         turn = clipped(TURN_GAIN * bearing, means.look_turn)
         is_facing = abs(bearing) < AT_IT
         self._has_arrived = is_facing and gap <= TOUCHING and (self._is_bumped or self._has_arrived)
         if self._has_arrived or (gap <= means.stop_at and is_facing):
-            # Arriving at a memory is no arrival: the target must be before the eyes, or the dog waits until it forgets.
+            # The target must be in view on arrival; otherwise the robot waits until its remembered position expires.
             self._done_for = self._done_for + 1 if self.is_in_view(now) else 0
             self._detour.end()
             is_enough = self._has_arrived or (means.is_coarse and abs(bearing) < means.aim)
             return None if self._done_for >= SETTLE else STAND if is_enough else means.spin(turn)
         self._done_for = 0
-        round_it = self._dodge(now)
-        if round_it is not None:
-            return round_it
+        detour = self._dodge(now)
+        if detour is not None:
+            return detour
         if abs(bearing) > TURN_FIRST:
             if math.dist(self._pose[:2], self._target) < TIGHT * means.circle:
-                return means.go(-CREEP)  # nearer than it can turn to
+                return means.go(-CREEP)  # nearer than the robot's turning circle
             return means.spin(turn)
         if self._ahead < IN_THE_WAY and self._is_hidden:
-            # Something stands between: step aside, keep the eyes on the target; or go round it.
+            # An obstacle is in between: step aside while facing the target, or take a detour.
             if not means.strafes:
                 self._detour.begin(self._pose, self._side, now, has_touched=False)
                 return self._dodge(now) or STAND
@@ -243,20 +243,20 @@ class SearchAndApproach:
         for name in NEAR:
             near = self._ranges.get(name, math.nan)
             if abs(self._bearing) < AT_IT and abs(near - believed) < 0.12:
-                # The ranger of another robot may sit behind its camera: then the picture knows better.
+                # The ranger may sit behind the camera: then the picture is more accurate.
                 return near if name == "near" else min(near, believed)
         return believed
 
-    def _feel(self, now: float) -> None:
-        """Count it as a bump where a body that ranges nothing walks, and comes nowhere."""
-        is_walking = self._means.is_walking and not self._means.ranges and now - self._asked_at < STUCK / 2
-        self._asked_at = now
-        if not is_walking or math.dist(self._moved[0][:2], self._pose[:2]) > STRIDE:
-            self._moved = self._pose, now
-        self._is_bumped = self._is_bumped or now - self._moved[1] > STUCK
+    def _detect_stuck(self, now: float) -> None:
+        """Count as a bump if a robot without a ranger walks but does not move."""
+        is_walking = self._means.is_walking and not self._means.ranges and now - self._called_at < STUCK / 2
+        self._called_at = now
+        if not is_walking or math.dist(self._last_moved[0][:2], self._pose[:2]) > STRIDE:
+            self._last_moved = self._pose, now
+        self._is_bumped = self._is_bumped or now - self._last_moved[1] > STUCK
 
     def _dodge(self, now: float) -> Action | None:
-        """The way round what was touched just now, or before; None where there is nothing to go round."""
+        """Return the next action of a detour around a touched obstacle; None if there is none."""
         if self._is_bumped and not self._was_bumped:
             self._detour.begin(self._pose, self._side, now, has_touched=True)
             if self._target is None:
@@ -271,13 +271,13 @@ class SearchAndApproach:
 
     @property
     def _ahead(self) -> float:
-        """Metres to whatever is straight ahead; NaN where nothing is within reach."""
+        """Metres to the next obstacle straight ahead; NaN if none is in range."""
         lit = [LIT] if self._is_lit else []
         return min((r for r in (*self._ranges.values(), *lit) if not math.isnan(r)), default=math.nan)
 
 
-def _metres(parameters: Mapping[str, float | str], name: str, usual: float) -> float:
-    value = float(parameters.get(name, usual))
+def _metres(parameters: Mapping[str, float | str], name: str, default: float) -> float:
+    value = float(parameters.get(name, default))
     if not 0.0 < value <= MAX_SIZE:
         raise ValueError(f"{name} must be more than 0 and at most {MAX_SIZE:g} m, is {value:g}")
     return value

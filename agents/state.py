@@ -1,8 +1,8 @@
 """The states of one agent in one task, and the table (state, event) -> (state, effects); pure.
 
-The table has a row for every pair: an event that says nothing to a state leaves it as it is.  Three rules can be read
-from it.  EXECUTING is entered by GRANTED alone.  It is left with STOP as the first effect, before the lease is given
-back.  An outcome absorbs all that follows.
+The table has a row for every pair: an event without meaning in a state leaves it unchanged.  The table ensures three
+rules.  Only GRANTED leads to EXECUTING.  Leaving EXECUTING has STOP as its first effect, before the lease is released.
+DONE is final.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from middleware.directory import presence
 
 
 class State(Enum):
-    """The states of one agent in one task, each with the coarse status that the page shows for it."""
+    """The states of one agent in one task, each with the status that the page shows for it."""
 
-    IDLE = presence.ASSIGNED, "has no body for the task: another task has it, or this one is paused"
+    IDLE = presence.ASSIGNED, "has no robot for the task: another task has it, or this one is paused"
     OBSERVING = presence.SEARCHING, "has nothing to report yet: `behaviour.search`"
-    REPORTED = presence.WAITING, "waits for the reports of others: `behaviour.hold`"
-    WAITING = presence.WAITING, "stands by while another should act; its rank is its place in the line"
-    CLAIMING = presence.WAITING, "should act, and asks the council for the lease"
+    REPORTED = presence.WAITING, "waits for the reports of other agents: `behaviour.hold`"
+    WAITING = presence.WAITING, "is a standby while another agent should act; its rank is its place among the standbys"
+    CLAIMING = presence.WAITING, "should act, and requests the lease from the quorum members"
     EXECUTING = presence.EXECUTING, "holds the lease, and acts: `behaviour.execute`"
-    RELEASING = presence.WAITING, "has stopped its body, and keeps the lease until the outcome is recorded"
-    FENCED = presence.WAITING, "has stopped its body: its lease ran out, or the body obeyed a newer token"
+    RELEASING = presence.WAITING, "has stopped its robot, and keeps the lease until the outcome is recorded"
+    FENCED = presence.WAITING, "has stopped its robot: its lease expired, or the robot obeyed a newer token"
     DONE = presence.DONE, "knows the outcome of the task"
 
     def __init__(self, status: str, text: str) -> None:
@@ -33,51 +33,51 @@ class State(Enum):
 
 
 class Event(Enum):
-    """What happens to an agent in a task."""
+    """The events of an agent in a task."""
 
-    NO_BODY = "the task is paused, or the body is another task's"
-    FREE = "the body is free for the task"
-    LATE = "the task is past its deadline; this agent is to end it, and does not hold the lease"
-    EXPIRED = "the same, and it holds the lease"
-    BLIND = "another should act or nobody, and this agent has no cost to report"
-    UNDECIDED = "nobody is named yet"
-    PASSED_OVER = "another should act"
-    LEASED_IN_VAIN = "another should act, and this agent holds the lease"
+    NO_BODY = "the task is paused, or another task has the robot"
+    FREE = "the robot is free for the task"
+    LATE = "the task is past its deadline; this agent must end it, and does not hold the lease"
+    EXPIRED = "the task is past its deadline; this agent must end it, and holds the lease"
+    BLIND = "another agent or none should act, and this agent has no cost to report"
+    UNDECIDED = "no agent is assigned yet"
+    PASSED_OVER = "another agent should act"
+    LEASED_IN_VAIN = "another agent should act, and this agent holds the lease"
     NAMED = "this agent should act, and does not hold the lease"
     GRANTED = "this agent should act, or cannot stop yet, and holds the lease"
-    MOVE = "the council is to change, and the body may be stopped for it"
-    FINISHED = "the behaviour has nothing left to do"
-    OUTRANKED = "the body has obeyed a newer token than that of the lease"
-    LENT = "the body goes to another task of the group"
+    MOVE = "the quorum is to change, and the robot may be stopped for it"
+    FINISHED = "the behaviour has finished"
+    OUTRANKED = "the robot has obeyed a newer token than the lease's"
+    LENT = "the robot is given to another task of the group"
     LEAVE = "the agent leaves the task"
     REOPENED = "a higher token was granted before the outcome was recorded"
     OUTCOME = "the task has an outcome"
 
 
 class Effect(Enum):
-    """What the agent does because of an event."""
+    """The effects of an event."""
 
-    STOP = "stop the body"
-    RELEASE = "give the lease back, or stop claiming it"
-    GIVE_BACK = "give the lease back, and say so to people"
-    HAND_OVER = "give the lease back for good, and tell those that stand by"
+    STOP = "stop the robot"
+    RELEASE = "release the lease, or stop claiming it"
+    GIVE_BACK = "release the lease, and log it on the page"
+    HAND_OVER = "release the lease and notify the standbys"
     WANT = "claim the lease, or keep it"
-    CLAIM = "claim the lease, and begin to wait for it"
+    CLAIM = "claim the lease, and start to wait for it"
     INSIST = "claim the lease, and report again each second"
-    STAND_BY = "line up at the council, where the rank is low enough"
-    CHANGE_COUNCIL = "have the council changed; the lease goes back with it, and is claimed again"
-    OFFER = "count the body as free in the next report"
-    WITHDRAW = "take the report back"
-    START = "say to people that the agent goes"
-    EXECUTE = "do the next bit of the task, under the lease"
-    HOLD = "report the decision, and search or stand by meanwhile"
+    STAND_BY = "poll the quorum members as a standby, if the rank is low enough"
+    CHANGE_COUNCIL = "change the quorum; the lease is released with it, and claimed again"
+    OFFER = "report the robot as available in the next report"
+    WITHDRAW = "withdraw the report"
+    START = "log on the page that the agent acts"
+    EXECUTE = "perform the next action of the task, under the lease"
+    HOLD = "report the decision, and search or hold meanwhile"
     COMPLETE = "record that the task is completed"
     FAIL = "record that the task has failed"
     END = "report the end"
 
 
 class Row(NamedTuple):
-    """In each of ``states`` the event leads to ``target`` (None: nowhere) with these effects."""
+    """In each of ``states`` the event leads to ``target`` (None: the same state) with these effects."""
 
     event: Event
     states: tuple[State, ...]
@@ -114,7 +114,7 @@ ROWS = (
     Row(_V.UNDECIDED, _PRESENT, _S.REPORTED, (_E.RELEASE, _E.HOLD)),
     Row(_V.UNDECIDED, _ACTING, _S.REPORTED, (*_GIVES_BACK, _E.HOLD)),
     Row(_V.UNDECIDED, (_S.IDLE, *_SETTLED)),
-    # An agent that only stands by, and holds nothing, keeps its place in the line.
+    # A standby without a lease keeps its rank.
     Row(_V.PASSED_OVER, _RESTING, _S.WAITING, _STANDS_BY),
     Row(_V.PASSED_OVER, (_S.CLAIMING,), _S.WAITING, (_E.RELEASE, *_STANDS_BY)),
     Row(_V.PASSED_OVER, _ACTING, _S.WAITING, (*_GIVES_BACK, *_STANDS_BY)),
@@ -129,12 +129,12 @@ ROWS = (
     Row(_V.GRANTED, _PRESENT, _S.EXECUTING, (_E.WANT, _E.START, _E.EXECUTE)),
     Row(_V.GRANTED, _ACTING, None, (_E.WANT, _E.EXECUTE)),
     Row(_V.GRANTED, (_S.IDLE, *_SETTLED)),
-    # It stays the one that acts, so that no other is named; it stands until it has its lease again.
+    # The agent remains the acting one, so that no other is assigned; it stands still until it has a lease again.
     Row(_V.MOVE, _ACTING, None, (_E.STOP, _E.CHANGE_COUNCIL)),
     Row(_V.MOVE, _NOT_ACTING),
     Row(_V.FINISHED, _ACTING, _S.RELEASING, (_E.STOP, _E.COMPLETE)),
     Row(_V.FINISHED, _NOT_ACTING),
-    # To an agent that only stands by it says nothing: the body remembers what a former life of its agent did.
+    # A standby ignores it: the robot remembers a token from an earlier run of the agent.
     Row(_V.OUTRANKED, _ACTING, _S.FENCED, (_E.STOP, _E.RELEASE)),
     Row(_V.OUTRANKED, _NOT_ACTING),
     Row(_V.LENT, _ASIDE, None, (_E.RELEASE,)),
@@ -151,27 +151,27 @@ ROWS = (
 
 
 def build_table(rows: Iterable[Row]) -> dict[tuple[State, Event], tuple[State, tuple[Effect, ...]]]:
-    """Return the table of ``rows``, one entry for each pair that they name."""
+    """Return the table of ``rows``, with one entry for each pair that they name."""
     return {(state, row.event): (row.target or state, row.effects) for row in rows for state in row.states}
 
 
 TABLE = build_table(ROWS)
-"""(state, event) to (next state, effects in their order)."""
+"""(state, event) to (next state, effects in order)."""
 
 
 class Course:
-    """The way of one agent through one task; ``rank`` is its place among those that stand by, from 1."""
+    """The state of one agent in one task; ``rank`` is its rank among the standbys, from 1."""
 
     def __init__(self) -> None:
         self.state = State.IDLE
         self.rank = 0
 
     def __str__(self) -> str:
-        """The state as people read it."""
+        """Return the state for display."""
         return f"{self.state.name}({self.rank})" if self.state is State.WAITING and self.rank else self.state.name
 
     def go(self, event: Event, rank: int | None = None) -> tuple[Effect, ...]:
-        """Take the step of ``event`` and return its effects; ``rank`` is the new rank, where the event gives one."""
+        """Apply ``event`` and return its effects; ``rank`` is the new rank, if the event gives one."""
         self.state, effects = TABLE[self.state, event]
         if rank is not None:
             self.rank = rank

@@ -1,4 +1,4 @@
-"""TurnAround: one dog, the one with the most charge left, turns once on the spot."""
+"""Turn around on the spot; the robot with the highest battery charge does it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,11 @@ MAX_TURNS = 100.0
 
 
 class TurnAround:
-    """A task that needs no target: what it costs is the charge already used, 0 to 1."""
+    """Turn on the spot; no target is needed.
+
+    The cost is the used share of the battery charge, 0 to 1.  The parameter ``turns`` is the number of turns (default
+    1).
+    """
 
     def __init__(self, parameters: Mapping[str, float | str], rng: random.Random) -> None:
         self._turns = float(parameters.get("turns", 1.0))
@@ -25,44 +29,44 @@ class TurnAround:
         self._means = Means()
         self._charge: float | None = None
         self._yaw: float | None = None
-        self._turned = 0.0
-        self._acting = False
+        self._turned_rad = 0.0
+        self._is_acting = False
 
     def embody(self, means: Means) -> None:
-        """Turn as this body can."""
+        """Use the motion capabilities of this robot."""
         self._means = means
 
     def look(self, seen: Observation, now: float) -> None:
-        """Take in the charge and the heading."""
+        """Process the battery charge and the heading."""
         self._charge = float(seen.values.get("power.level", math.nan))
         yaw = float(seen.values.get("odom.yaw", 0.0))
-        if self._yaw is not None and self._acting:
-            self._turned += math.remainder(yaw - self._yaw, math.tau)
+        if self._yaw is not None and self._is_acting:
+            self._turned_rad += math.remainder(yaw - self._yaw, math.tau)
         self._yaw = yaw
 
     @property
     def cost(self) -> float | None:
-        """The share of the charge that is used up."""
+        """The used share of the battery charge."""
         return None if self._charge is None or math.isnan(self._charge) else round(1.0 - self._charge, 4)
 
     def search(self, now: float) -> Action:
-        """Nothing is to be searched."""
+        """Return to stand: there is nothing to search for."""
         return STAND
 
     def hold(self, now: float) -> Action:
         """Stand still."""
-        self._acting = False
+        self._is_acting = False
         return STAND
 
     @property
     def progress(self) -> float:
         """The share of the turns that is done."""
-        return 1.0 if not self._turns else self._turned / (self._turns * math.tau)
+        return 1.0 if not self._turns else self._turned_rad / (self._turns * math.tau)
 
     def execute(self, context: Context) -> Action | None:
-        """Turn left until the turns are done, from where it was."""
+        """Turn left until the turns are complete; turns under an earlier lease count."""
         if not context.is_resumed:
-            self._yaw = None  # what the body did meanwhile was not for this task
-        self._acting = True
-        is_done = self._turned >= self._turns * math.tau
+            self._yaw = None  # turns made in between were not for this task
+        self._is_acting = True
+        is_done = self._turned_rad >= self._turns * math.tau
         return None if is_done else self._means.spin(clipped(SPEED, self._means.turn))

@@ -1,7 +1,7 @@
-"""Vision: find the red target in a camera picture.
+"""Find the red target in a camera picture.
 
-The only module of this room that needs OpenCV (extra ``[vision]``); it is imported when an agent that looks is made.
-Red is one corner of YCrCb, the colours that the ERS-7's camera delivers, so one range finds it: no wrap-around of hue.
+The only module of this package that needs OpenCV (extra ``[vision]``); it is imported on demand.  In YCrCb, the colour
+space of the ERS-7's camera, red is one corner and needs one range, without the wrap-around of hue.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ BLUR = 2
 MIN_AREA = 14
 SAME_SHAPE = 0.2
 ENOUGH = 1024
-"""Pixels a side that show the target well enough."""
+"""Pixels per side that are sufficient for detection."""
 
 
 @dataclass(frozen=True)
 class Size:
-    """What the target measures, in metres: it stands upright and is round from above."""
+    """The size of the target in metres: an upright cylinder."""
 
     radius: float
     height: float
@@ -39,8 +39,8 @@ class Size:
 class Sighting:
     """The target in one picture: ``bearing`` in radians (left positive), ``distance`` in metres from camera to axis.
 
-    ``is_whole`` is false where the blob is cut off by the picture's edge or partly hidden, so that its size says less;
-    where ``is_filling`` it goes from edge to edge, and all that is known is that the target is nearer than that.
+    ``is_whole`` is False if the blob is cut off by the picture's edge or partly hidden, so that its size is less
+    reliable.  If ``is_filling``, it spans the whole width, and the distance is only an upper bound.
     """
 
     bearing: float
@@ -50,9 +50,9 @@ class Sighting:
 
 
 def find_target(jpeg: bytes, size: Size, lens: tuple[float, float | None] = VIEW) -> Sighting | None:
-    """The largest red blob of a JPEG picture, or None; no whole JPEG, or one beyond the limits, shows nothing.
+    """Return the largest red blob of a JPEG picture; None if there is none or the picture is incomplete or too large.
 
-    ``lens`` is what the picture shows across and up, in radians; up None: its pixels are square.
+    ``lens`` is the horizontal and vertical field of view in radians (vertical None: square pixels).
     """
     sides = size_of(jpeg)
     picture = None if sides is None else cv2.imdecode(np.frombuffer(jpeg, np.uint8), _reduction(max(sides)))
@@ -75,24 +75,24 @@ def find_target(jpeg: bytes, size: Size, lens: tuple[float, float | None] = VIEW
     by_width = focal_x * 2 * size.radius / across
     by_height = focal_y * size.height / up
     is_whole = left > 0 and left + width < columns and abs(by_width / by_height - 1) < SAME_SHAPE
-    # What hides a part of it makes it look smaller, never larger: the nearer of the two is the better witness.
+    # An obstacle makes the target look smaller, never larger: the smaller distance is more reliable.
     distance = by_width if is_whole else min(by_width, by_height)
     is_filling = left == 0 and width == columns
     return Sighting(bearing, distance / max(math.cos(bearing), 0.5), is_whole, is_filling)
 
 
 def _reduction(side: int) -> int:
-    """How to decode a picture of so many pixels a side: of a large one every second or fourth is enough."""
+    """Return the decoding mode for a picture with ``side`` pixels: large ones are reduced by 2 or 4."""
     if side <= ENOUGH:
         return cv2.IMREAD_COLOR
     return cv2.IMREAD_REDUCED_COLOR_2 if side <= 2 * ENOUGH else cv2.IMREAD_REDUCED_COLOR_4
 
 
 def _extent(redness: npt.NDArray[np.float32]) -> tuple[float, float]:
-    """How many pixels the blob in ``redness`` (Cr) measures across and up, to a fraction of a pixel.
+    """Return the width and height in pixels, with subpixel accuracy, of the blob in ``redness`` (Cr).
 
-    JPEG keeps colour at half the resolution, so edges are soft: a pixel counts by how red it is, from grey to the red
-    of the blob itself.
+    JPEG stores colour at half the resolution, so edges are soft: each pixel is weighted by its redness, from grey to
+    the blob's own red.
     """
     share = np.clip((redness - GREY) / max(float(np.percentile(redness, 90)) - GREY, 1.0), 0.0, 1.0)
     share[share < 0.1] = 0.0

@@ -1,5 +1,5 @@
-"""How agents decide: strategies say who should act, bids carry their reports, and a lease says who may act.
+"""Consensus: strategies choose the agent that should act; a quorum lease gives an agent the right to act.
 
-``strategy`` is the interface of strategies and ``strategies`` has the built-in ones; ``bidding`` carries reports to the
-council of a task and its announcement back; ``lease`` grants the right to act.
+``strategy`` is the interface of strategies and ``strategies`` has the built-in ones.  ``bidding`` carries reports to
+the quorum members of a task and their announcement back.  ``lease`` grants the right to act.
 """

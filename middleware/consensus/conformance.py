@@ -1,11 +1,11 @@
-"""Conformance: what every strategy must hold to, as tests that anyone can run on one's own.
+"""Conformance tests that every strategy must pass, for use with your own strategy.
 
 ::
 
     class MineTests(Conformance, SynchronousTestCase):
         make = Mine
 
-or, without a test case, ``broken(Mine)``, which gives a line for each rule that is broken.
+Without a test case, ``broken(Mine)`` returns a line for each rule that the strategy breaks.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from middleware.consensus.strategy import READABLE, Consensus, ConsensusAlgorith
 
 Make = Callable[[], ConsensusAlgorithm]
 TEAMS = 40
-"""Random teams for each rule; the same in every run."""
+"""Number of random teams for each rule; the same teams in every run."""
 HOSTILE = (
     {"cost": math.nan},
     {"cost": math.inf},
@@ -48,16 +48,16 @@ HOSTILE = (
     {"agent": "x" * 10_000},
     {"choice": "x" * 10_000},
 )
-"""What makes a report unlawful; each would win, if it counted."""
+"""Changes that make a report invalid; each such report would win if it were valid."""
 _BARE = Report("", 0.0)
 
 
 class Breach(AssertionError):
-    """A strategy breaks a rule; the text says which, and on which reports."""
+    """A strategy breaks a rule; the text names the rule and the reports."""
 
 
 class Salted(str):
-    """A name that lies elsewhere in a set, as all names do where the process hashes otherwise."""
+    """A name with another hash value, as in a process with another ``PYTHONHASHSEED``."""
 
     salt = 0
 
@@ -65,25 +65,25 @@ class Salted(str):
         return hash((Salted.salt, str(self)))
 
 
-def team(dice: random.Random, most: int = 9) -> list[Report]:
-    """Reports of a random team, with ties, and with everything in them that some strategy may want."""
-    costs = [0.0, 1.0, 1.0, 2.5, dice.uniform(0.0, 50.0), dice.uniform(0.0, 1e6)]
+def team(rng: random.Random, most: int = 9) -> list[Report]:
+    """Create the reports of a random team, with ties and with every field that a strategy may read."""
+    costs = [0.0, 1.0, 1.0, 2.5, rng.uniform(0.0, 50.0), rng.uniform(0.0, 1e6)]
     return [
         Report(
             f"agent-{number:03d}",
-            dice.choice(costs),
-            value=(dice.uniform(-9.0, 9.0), dice.uniform(-9.0, 9.0)),
-            choice=dice.choice(["left", "left", "right"]),
-            weight=dice.choice([1.0, 1.0, 2.0]),
-            battery=dice.choice([1.0, 0.25]),
-            load=float(dice.randrange(3)),
+            rng.choice(costs),
+            value=(rng.uniform(-9.0, 9.0), rng.uniform(-9.0, 9.0)),
+            choice=rng.choice(["left", "left", "right"]),
+            weight=rng.choice([1.0, 1.0, 2.0]),
+            battery=rng.choice([1.0, 0.25]),
+            load=float(rng.randrange(3)),
         )
-        for number in dice.sample(range(500), dice.randint(1, most))
+        for number in rng.sample(range(500), rng.randint(1, most))
     ]
 
 
 def check_name(make: Make) -> None:
-    """It says its name and version."""
+    """The strategy has a name and a version."""
     strategy = make()
     for label in ("name", "version"):
         text = getattr(strategy, label, None)
@@ -91,156 +91,191 @@ def check_name(make: Make) -> None:
 
 
 def check_purity(make: Make) -> None:
-    """The answer depends on the reports alone: not on what was asked before, nor by whom, and they stay as they are."""
+    """The decision depends on the reports alone, not on earlier calls, and ``find`` does not change the reports."""
     old = make()
-    for dice, contacts in _teams():
-        kept = list(contacts)
+    for rng, contacts in _teams():
+        before = list(contacts)
         first = old.find(contacts)
-        _demand(contacts == kept, "find changes the reports that it is given", contacts)
-        old.find(team(dice))
-        _demand(old.find(contacts) == first, "asked again it finds something else", contacts)
-        _demand(make().find(contacts) == first, "another one of it finds something else", contacts)
+        _demand(contacts == before, "find modifies its arguments", contacts)
+        old.find(team(rng))
+        _demand(old.find(contacts) == first, "a second call of find gives another result", contacts)
+        _demand(make().find(contacts) == first, "a second instance gives another result", contacts)
 
 
 def check_order(make: Make) -> None:
-    """Neither the order of the reports nor their repetition makes a difference."""
+    """Neither the order of the reports nor their repetition affects the decision."""
     strategy = make()
-    for dice, contacts in _teams():
+    for rng, contacts in _teams():
         mixed = [*contacts, *contacts[: len(contacts) // 2]]
-        dice.shuffle(mixed)
-        _demand(strategy.find(mixed) == strategy.find(contacts), "the order or repetition of reports shows", contacts)
+        rng.shuffle(mixed)
+        _demand(
+            strategy.find(mixed) == strategy.find(contacts),
+            "the order or repetition of the reports affects the result",
+            contacts,
+        )
 
 
 def check_merge(make: Make) -> None:
-    """``merge`` is a join, and what is found from a summary is what is found from all reports."""
+    """``merge`` is a join, and a summary leads to the same decision as all reports."""
     strategy = make()
-    for dice, contacts in _teams():
-        dearer = [replace(r, cost=r.cost + 1.0) for r in contacts[:2]]
-        a, b, c = (dice.sample(contacts, dice.randint(0, len(contacts))) for _ in range(3))
-        b = [*b, *dearer]
+    for rng, contacts in _teams():
+        costlier = [replace(r, cost=r.cost + 1.0) for r in contacts[:2]]
+        a, b, c = (rng.sample(contacts, rng.randint(0, len(contacts))) for _ in range(3))
+        b = [*b, *costlier]
         ab, bc = strategy.merge(a, b), strategy.merge(b, c)
         _demand(ab == strategy.merge(b, a), "merge is not commutative", contacts)
         _demand(strategy.merge(ab, c) == strategy.merge(a, bc), "merge is not associative", contacts)
         _demand(strategy.merge(ab, ab) == ab == strategy.merge(ab, ()), "merge is not idempotent", contacts)
-        _demand(strategy.find(ab) == strategy.find([*a, *b]), "a summary is not enough to find the same", contacts)
-        _demand({*ab} <= {*a, *b}, "merge invents reports", contacts)
+        _demand(
+            strategy.find(ab) == strategy.find([*a, *b]),
+            "find of a merged summary gives another result than find of all reports",
+            contacts,
+        )
+        _demand({*ab} <= {*a, *b}, "merge returns reports that were not given", contacts)
 
 
 def check_ties(make: Make) -> None:
-    """Among equals there is always one, and the same for everybody."""
+    """Among equal reports exactly one agent wins, the same at every node."""
     strategy = make()
-    for dice, contacts in _teams():
+    for rng, contacts in _teams():
         equals = [replace(contacts[0], agent=r.agent) for r in contacts]
         found = strategy.find(equals)
-        _demand(found.assigned_agent is not None, "nobody is assigned among equals", equals)
-        dice.shuffle(equals)
-        _demand(strategy.find(equals) == found, "equals are told apart by the order of their reports", equals)
+        _demand(found.assigned_agent is not None, "no agent is assigned among equal reports", equals)
+        rng.shuffle(equals)
+        _demand(strategy.find(equals) == found, "the order of equal reports affects the result", equals)
 
 
 def check_winners(make: Make) -> None:
-    """Whoever is named has reported, and nobody is named twice; who is alone is assigned, of nobody none."""
+    """Only reporting agents are named, none twice; a single agent is assigned, and without reports none is."""
     strategy = make()
-    _demand(strategy.find([]).assigned_agent is None, "somebody is assigned though nobody reported")
+    _demand(strategy.find([]).assigned_agent is None, "an agent is assigned without any report")
     for _, contacts in _teams():
         found = strategy.find(contacts)
         names = [name for name in (found.assigned_agent, *found.standby) if name is not None]
-        _demand(isinstance(found, Consensus), "find answers no Consensus", contacts)
-        _demand({*names, *found.assigned} <= {r.agent for r in contacts}, "it names who did not report", contacts)
-        _demand(len(set(names)) == len(names), "somebody is named twice", contacts)
+        _demand(isinstance(found, Consensus), "find does not return a Consensus", contacts)
+        _demand(
+            {*names, *found.assigned} <= {r.agent for r in contacts}, "it names an agent that did not report", contacts
+        )
+        _demand(len(set(names)) == len(names), "it names an agent twice", contacts)
         alone = contacts[0]
-        _demand(strategy.find([alone]).assigned_agent == alone.agent, "who is alone is not assigned", [alone])
+        _demand(strategy.find([alone]).assigned_agent == alone.agent, "the only agent is not assigned", [alone])
 
 
 def check_hostile(make: Make) -> None:
-    """Reports of nothing, less than nothing, or of yesterday neither win nor make a difference, nor an exception."""
+    """Invalid, infinite, negative and stale reports neither win nor affect the decision nor raise an exception."""
     strategy = make()
-    for dice, contacts in _teams():
+    for rng, contacts in _teams():
         found = strategy.find(contacts)
         for change in HOSTILE:
             changes: dict[str, Any] = {"agent": "aaa", "cost": 0.0, **change}
             with_it = [*contacts, replace(contacts[0], **changes)]
-            dice.shuffle(with_it)
-            _demand(strategy.find(with_it) == found, f"a report with {str(change):.60} makes a difference", with_it)
-            _demand(strategy.find([with_it[0]] if refusal(with_it[0]) else []).assigned_agent is None, "it wins")
+            rng.shuffle(with_it)
+            _demand(
+                strategy.find(with_it) == found, f"an invalid report with {str(change):.60} affects the result", with_it
+            )
+            _demand(
+                strategy.find([with_it[0]] if refusal(with_it[0]) else []).assigned_agent is None,
+                "an invalid report wins",
+            )
             strategy.merge(with_it, with_it)
 
 
 def check_improves(make: Make) -> None:
-    """Only what is better by more than the hysteresis takes over, so that the task never goes to and fro."""
+    """Only an offer that is better by more than the hysteresis takes over, so that the task does not oscillate."""
     strategy = make()
-    for dice, contacts in _teams():
-        a, b = contacts[0], replace(team(dice)[0], agent="other")
+    for rng, contacts in _teams():
+        a, b = contacts[0], replace(team(rng)[0], agent="other")
         for share in (0.0, 0.1, 0.5):
             both = [strategy.improves(a, b, share), strategy.improves(b, a, share)]
-            _demand(all(isinstance(yes, bool) for yes in both), "improves answers neither yes nor no")
-            _demand(both != [True, True], "each of two is better than the other", [a, b])
-        _demand(not strategy.improves(a, replace(a, agent="other"), 0.0), "an equal one is better", [a])
+            _demand(all(isinstance(yes, bool) for yes in both), "improves does not return a bool")
+            _demand(both != [True, True], "improves is true in both directions", [a, b])
+        _demand(not strategy.improves(a, replace(a, agent="other"), 0.0), "improves is true for an equal report", [a])
         wins = [strategy.improves(a, b, share) for share in (0.0, 0.1, 0.3, 0.9)]
-        _demand(wins == sorted(wins, reverse=True), "more hysteresis makes a change easier", [a, b])
+        _demand(wins == sorted(wins, reverse=True), "improves becomes true with more hysteresis", [a, b])
         for change in HOSTILE:
             changes: dict[str, Any] = {"agent": "other", "cost": 0.0, **change}
-            _demand(not strategy.improves(a, replace(a, **changes), 0.1), f"{str(change):.60} takes over", [a])
+            _demand(
+                not strategy.improves(a, replace(a, **changes), 0.1),
+                f"an invalid report with {str(change):.60} takes over",
+                [a],
+            )
 
 
 def check_hashing(make: Make) -> None:
-    """It makes no difference how the process hashes names (PYTHONHASHSEED)."""
+    """The hash seed of the process (``PYTHONHASHSEED``) does not affect the decision."""
     for _, contacts in _teams():
         found = []
         for Salted.salt in (0, 1, 2):
             salted = [replace(r, agent=Salted(r.agent), choice=Salted(r.choice), task=Salted(r.task)) for r in contacts]
             found.append(make().find(salted))
-        _demand(found[0] == found[1] == found[2], "the order of a set or dict of names shows", contacts)
+        _demand(found[0] == found[1] == found[2], "the hash values of names affect the result", contacts)
 
 
 def check_many(make: Make) -> None:
-    """With 300 agents everything is as with three."""
-    dice = random.Random("many")
-    one = team(dice)[0]
+    """The rules also hold with 300 agents."""
+    rng = random.Random("many")
+    one = team(rng)[0]
     contacts = [replace(one, agent=f"agent-{number:03d}", cost=1000.0 * (1 + number)) for number in range(300)]
     strategy = make()
     found = strategy.find(contacts)
-    _demand(found.assigned_agent in {r.agent for r in contacts}, "nobody is found among 300")
-    dice.shuffle(contacts)
-    _demand(strategy.find(contacts) == found, "among 300 the order shows")
+    _demand(found.assigned_agent in {r.agent for r in contacts}, "no agent is assigned among 300")
+    rng.shuffle(contacts)
+    _demand(strategy.find(contacts) == found, "among 300 agents the order of the reports affects the result")
     other = {r.agent: f"agent-{299 - number:03d}" for number, r in enumerate(sorted(contacts, key=_agent_of))}
     renamed = strategy.find([replace(r, agent=other[r.agent]) for r in contacts])
-    _demand(renamed.assigned_agent == other[str(found.assigned_agent)], "who wins depends on how it is numbered")
+    _demand(
+        renamed.assigned_agent == other[str(found.assigned_agent)], "the winner depends on the numbers of the agents"
+    )
 
 
 def check_group(make: Make) -> None:
-    """Several tasks at once: one answer each, nobody beyond its capacity, whatever the order."""
+    """Several tasks at once: one decision each, no agent beyond its capacity, independent of the order."""
     strategy: Any = make()
     if not hasattr(strategy, "find_group"):
         return
-    for dice, contacts in _teams():
-        items = [Item(f"task-{number}", (dice.uniform(-9.0, 9.0), dice.uniform(-9.0, 9.0))) for number in range(5)]
-        room = {r.agent: dice.randint(1, 2) for r in contacts}
+    for rng, contacts in _teams():
+        items = [Item(f"task-{number}", (rng.uniform(-9.0, 9.0), rng.uniform(-9.0, 9.0))) for number in range(5)]
+        capacity_of = {r.agent: rng.randint(1, 2) for r in contacts}
         bids = [
-            replace(r, task=item.task, cost=dice.choice([1.0, r.cost]), capacity=room[r.agent])
+            replace(r, task=item.task, cost=rng.choice([1.0, r.cost]), capacity=capacity_of[r.agent])
             for r in contacts
             for item in items
         ]
         found = strategy.find_group(bids, items)
-        _demand([f.task for f in found] == [item.task for item in items], "not every task has one answer", bids)
-        held = [f.assigned_agent for f in found if f.assigned_agent is not None]
-        _demand(all(held.count(agent) <= room[agent] for agent in held), "somebody has more than it can take", bids)
-        _demand(len(held) == min(len(items), sum(room.values())), "a task is left though somebody has room", bids)
+        _demand(
+            [f.task for f in found] == [item.task for item in items],
+            "find_group does not return one decision for each task",
+            bids,
+        )
+        assigned = [f.assigned_agent for f in found if f.assigned_agent is not None]
+        _demand(
+            all(assigned.count(agent) <= capacity_of[agent] for agent in assigned),
+            "an agent has more tasks than its capacity",
+            bids,
+        )
+        _demand(
+            len(assigned) == min(len(items), sum(capacity_of.values())),
+            "a task has no agent although one has capacity left",
+            bids,
+        )
         mixed, turned = [*bids, *bids[:3]], items[::-1]
-        dice.shuffle(mixed)
-        _demand(strategy.find_group(mixed, turned) == found, "the order of bids or tasks shows", bids)
+        rng.shuffle(mixed)
+        _demand(strategy.find_group(mixed, turned) == found, "the order of the bids or tasks affects the result", bids)
         hostile: list[Any] = [replace(bids[0], **change) for change in HOSTILE if "agent" not in change]
-        _demand(strategy.find_group([*bids, *hostile], items) == found, "an unlawful bid makes a difference", bids)
+        _demand(strategy.find_group([*bids, *hostile], items) == found, "an invalid bid affects the result", bids)
 
 
 def check_reads(make: Make) -> None:
-    """What it does not name in ``reads`` is not shown to it in a running team, and must make no difference."""
+    """A field that ``reads`` does not name is hidden in a running team, and must not affect the decision."""
     strategy = make()
     hidden: dict[str, Any] = {name: getattr(_BARE, name) for name in READABLE if name not in reads_of(strategy)}
     for _, contacts in _teams():
-        whole = strategy.find(contacts)
-        shown = strategy.find([replace(report, **hidden) for report in contacts])
-        same = [(f.assigned_agent, f.standby, f.value, f.choice) for f in (whole, shown)]
-        _demand(same[0] == same[1], f"it goes by more than {', '.join(reads_of(strategy)) or 'the cost'}", contacts)
+        with_all_fields = strategy.find(contacts)
+        with_visible_fields = strategy.find([replace(report, **hidden) for report in contacts])
+        same = [(f.assigned_agent, f.standby, f.value, f.choice) for f in (with_all_fields, with_visible_fields)]
+        _demand(
+            same[0] == same[1], f"it reads more fields than {', '.join(reads_of(strategy)) or 'the cost'}", contacts
+        )
 
 
 CHECKS: dict[str, Callable[[Make], None]] = {
@@ -260,18 +295,18 @@ CHECKS: dict[str, Callable[[Make], None]] = {
 
 
 def broken(make: Make) -> dict[str, str]:
-    """Which rules a strategy breaks, and how; one that raises breaks the rule."""
+    """Return the rules that a strategy breaks, with the reason; an exception breaks the rule."""
     found = {}
     for name, check in CHECKS.items():
         try:
             check(make)
-        except Exception as error:  # the strategy is foreign code
+        except Exception as error:  # third-party code may raise anything
             found[name] = str(error) if isinstance(error, Breach) else f"{type(error).__name__}: {error}"
     return found
 
 
 class Conformance:
-    """Tests to be mixed into a test case that says ``make = ...``, the class of a strategy; one for each check."""
+    """Mixin for a test case that sets ``make`` to the class of a strategy; it adds one test for each check."""
 
     make: Any
 
@@ -294,11 +329,11 @@ def _agent_of(report: Report) -> str:
 
 def _teams() -> Iterator[tuple[random.Random, list[Report]]]:
     for number in range(TEAMS):
-        dice = random.Random(f"conformance/{number}")
-        yield dice, team(dice)
+        rng = random.Random(f"conformance/{number}")
+        yield rng, team(rng)
 
 
 def _demand(is_so: bool, otherwise: str, contacts: Sequence[Report] = ()) -> None:
     if not is_so:
-        told = "; ".join(f"{r.agent!s:.40}: {r.cost!r:.20}" for r in contacts[:6])
-        raise Breach(f"{otherwise}{', e.g. ' + told if told else ''}")
+        examples = "; ".join(f"{r.agent!s:.40}: {r.cost!r:.20}" for r in contacts[:6])
+        raise Breach(f"{otherwise}{', e.g. ' + examples if examples else ''}")

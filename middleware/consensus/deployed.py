@@ -1,6 +1,6 @@
-"""Deployed: how a task names a module that an operator pushed, and what makes the thing it names; pure.
+"""The names by which tasks refer to deployed modules, and the lookup of their factories; pure.
 
-Every node looks such names up, also one that allows no deployment and so loads nothing of ``middleware.deployment``.
+Every node resolves such names, including nodes that allow no deployment and do not import ``middleware.deployment``.
 """
 
 from __future__ import annotations
@@ -13,27 +13,29 @@ from middleware.errors import SwarmError, UnknownStrategy, UnknownTask
 STRATEGY, BEHAVIOUR = "strategy", "behaviour"
 KINDS = (STRATEGY, BEHAVIOUR)
 PREFIX = "deployed:"
-"""Before the name of a module where a task names it as its strategy or its kind."""
+"""Prefix of the name of a deployed module in a task's strategy or kind."""
 ERRORS: Mapping[str, type[SwarmError]] = {STRATEGY: UnknownStrategy, BEHAVIOUR: UnknownTask}
 
 Make = Callable[..., Any]
-"""What makes a strategy (no arguments) or the way to a behaviour (parameters and random generator)."""
+"""Creates a strategy (no arguments) or a behaviour (parameters and random generator)."""
 Deployed = Mapping[tuple[str, str], Make]
-"""(kind, name without ``PREFIX``) to what makes it: the modules that run on one node."""
+"""The factories of the modules that run on this node, by kind and name without ``PREFIX``."""
 
 
 def is_deployed(name: str) -> bool:
-    """Whether a task's strategy or kind is a module that an operator pushed."""
+    """Return whether a task's strategy or kind is a deployed module."""
     return name.startswith(PREFIX)
 
 
 def maker_of(kind: str, name: str, deployed: Deployed) -> Make:
-    """What makes the module of this ``kind`` that a task calls ``name``.
+    """Return the factory of the deployed module ``name`` of this ``kind``.
 
-    Raises ``UnknownStrategy`` or ``UnknownTask``, as the kind is; it names those that there are.
+    Raises ``UnknownStrategy`` or ``UnknownTask``, depending on the kind; the text lists the known names.
     """
     make = deployed.get((kind, name.removeprefix(PREFIX)))
     if make is None:
         known = ", ".join(sorted(f"{PREFIX}{each}" for other, each in deployed if other == kind)) or "none"
-        raise ERRORS[kind](f"no {kind} {name!r} here ([deployment] of this node); there are {known}")
+        raise ERRORS[kind](
+            f"{kind} {name!r} is not deployed on this node (see [deployment] in its settings); deployed: {known}"
+        )
     return make

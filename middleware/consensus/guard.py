@@ -1,7 +1,7 @@
-"""Guard: what stands between a strategy that somebody wrote and the agents that ask it.
+"""Protect agents against faulty strategies.
 
-A strategy that raises, does not answer in time, or answers what cannot be has no opinion; then the nearest acts, and
-the answer says so.  None of this is needed for safety, which rests on leases; it keeps the team at work.
+A strategy that raises, times out or returns an invalid result is replaced by ``nearest`` for that decision, and the
+reason says so.  Safety does not depend on this, because it rests on leases; the guard keeps the team working.
 """
 
 from __future__ import annotations
@@ -28,23 +28,26 @@ from middleware.errors import SwarmError
 
 REMEMBERED = 64
 STRIKES = 3
-"""A strategy that is lost so often within ``SPAN`` questions is asked no more, since each costs up to the deadline."""
+"""A strategy that is lost this many times within ``SPAN`` calls is not called again.
+
+Each loss costs a full deadline.
+"""
 SPAN = 10_000
-"""Questions after which a loss is forgotten: about four minutes of a task.  A busy machine is late now and then."""
+"""Calls after which a loss is forgotten, about four minutes of a task: a busy machine is late now and then."""
 
 
 class NoOpinion(SwarmError):
-    """What a strategy answered cannot be used; the text says why."""
+    """A strategy's result is unusable; the text is the reason."""
 
 
 class Lost(NoOpinion):
-    """A strategy gave no answer, and what it ran in had to be ended: it was late, said too much, or died."""
+    """A strategy gave no result and its process was ended: it was late, sent too much, or died."""
 
 
 class Guard:
-    """A strategy that cannot fail, around one that can; the nearest acts where it has no opinion.
+    """Call a strategy and fall back to ``nearest`` if it fails.
 
-    ``twice`` asks everything a second time in another order, for strategies that nobody here has tested.
+    With ``twice``, ``find`` is called a second time with the reports in another order, for third-party strategies.
     """
 
     log = Logger()
@@ -57,89 +60,93 @@ class Guard:
         self.why_not = ""
         self._fallback = Nearest()
         self._twice = twice
-        self._asked = 0
+        self._calls = 0
         self._losses: list[int] = []
-        self._answers: OrderedDict[tuple[Report, ...], Consensus] = OrderedDict()
+        self._results: OrderedDict[tuple[Report, ...], Consensus] = OrderedDict()
 
     def find(self, contacts: Sequence[Report]) -> Consensus:
-        """The consensus point of the lawful reports; the reason says where it is the fallback's."""
-        lawful = _lawful(contacts)
+        """Decide from the valid reports; the reason says if the fallback decided."""
+        valid = _valid_reports(contacts)
         try:
-            self._may_be_asked()
-            found = checked(self.strategy.find(lawful), lawful)
-            known = self._answers.setdefault(lawful, found)
-            if known != found or (self._twice and checked(self.strategy.find(lawful[::-1]), lawful) != found):
-                raise NoOpinion("it gives two answers to equal reports")
-            while len(self._answers) > REMEMBERED:
-                self._answers.popitem(last=False)
-        except Exception as error:  # the strategy is foreign code
-            why = self._failed(error)
-            instead = self._fallback.find(lawful)
-            said = f"{self.name} has no opinion ({why}); {self._fallback.name}: {instead.reason}"
-            return replace(instead, strategy=self._fallback.name, reason=said)
+            self._check_losses()
+            found = checked(self.strategy.find(valid), valid)
+            known = self._results.setdefault(valid, found)
+            if known != found or (self._twice and checked(self.strategy.find(valid[::-1]), valid) != found):
+                raise NoOpinion("it gives two results for equal reports")
+            while len(self._results) > REMEMBERED:
+                self._results.popitem(last=False)
+        except Exception as error:  # third-party code may raise anything
+            why = self._record_failure(error)
+            fallback = self._fallback.find(valid)
+            reason = f"{self.name} has no opinion ({why}); {self._fallback.name}: {fallback.reason}"
+            return replace(fallback, strategy=self._fallback.name, reason=reason)
         return replace(found, strategy=self.name)
 
     def find_group(self, contacts: Sequence[Report], items: Sequence[Item]) -> tuple[Consensus, ...]:
-        """One consensus point for each item; of a strategy for one task, or of the fallback, one after the other."""
-        lawful = _lawful(contacts)
-        whole = getattr(self.strategy, "find_group", None)
-        if whole is None:
-            return one_by_one(self.find, lawful, items)
+        """Decide all items.
+
+        A strategy without ``find_group``, and the fallback, decide the items one after another.
+        """
+        valid = _valid_reports(contacts)
+        find_group = getattr(self.strategy, "find_group", None)
+        if find_group is None:
+            return one_by_one(self.find, valid, items)
         try:
-            self._may_be_asked()
-            found = checked_group(whole(lawful, items), lawful, items)
+            self._check_losses()
+            found = checked_group(find_group(valid, items), valid, items)
         except NotImplementedError:
-            return one_by_one(self.find, lawful, items)
-        except Exception as error:  # the strategy is foreign code
-            said = f"{self.name} has no opinion ({self._failed(error)}); {self._fallback.name}: "
-            found = one_by_one(self._fallback.find, lawful, items)
-            return tuple(replace(p, strategy=self._fallback.name, reason=said + p.reason) for p in found)
+            return one_by_one(self.find, valid, items)
+        except Exception as error:  # third-party code may raise anything
+            reason = f"{self.name} has no opinion ({self._record_failure(error)}); {self._fallback.name}: "
+            found = one_by_one(self._fallback.find, valid, items)
+            return tuple(replace(p, strategy=self._fallback.name, reason=reason + p.reason) for p in found)
         return tuple(replace(point, strategy=self.name) for point in found)
 
     def improves(self, current: Report, offer: Report, hysteresis: float) -> bool:
-        """Whether ``offer`` should take over; the fallback says so where the strategy has no opinion."""
+        """Return whether ``offer`` should take over; the fallback decides if the strategy fails."""
         if refusal(offer):
             return False
         try:
-            self._may_be_asked()
+            self._check_losses()
             answer = self.strategy.improves(current, offer, hysteresis)
             if not isinstance(answer, bool):
-                raise NoOpinion(f"improves answers {type(answer).__name__}, not yes or no")
-        except Exception as error:  # the strategy is foreign code
-            self._failed(error)
+                raise NoOpinion(f"improves returns {type(answer).__name__}, not bool")
+        except Exception as error:  # third-party code may raise anything
+            self._record_failure(error)
             return self._fallback.improves(current, offer, hysteresis)
         return answer
 
     def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
-        """A summary of both, of lawful reports that are in one of them; the fallback's where it is not."""
-        lawful = _lawful((*a, *b))
+        """Return a summary of the valid reports of both; the fallback's if the strategy returns other reports."""
+        valid = _valid_reports((*a, *b))
         try:
-            self._may_be_asked()
-            merged = self.strategy.merge(lawful, ())
-            if not isinstance(merged, tuple) or len(merged) > len(lawful) or not set(merged) <= set(lawful):
-                raise NoOpinion("merge invents reports")
-        except Exception as error:  # the strategy is foreign code
-            self._failed(error)
-            return self._fallback.merge(lawful, ())
+            self._check_losses()
+            merged = self.strategy.merge(valid, ())
+            if not isinstance(merged, tuple) or len(merged) > len(valid) or not set(merged) <= set(valid):
+                raise NoOpinion("merge returns reports that were not given")
+        except Exception as error:  # third-party code may raise anything
+            self._record_failure(error)
+            return self._fallback.merge(valid, ())
         return merged
 
     def stop(self) -> None:
-        """Let go of what the strategy runs in, if anything; one that ran in something has no opinion from then on."""
+        """Stop the strategy's process, if it has one."""
         stop = getattr(self.strategy, "stop", None)
         if stop is not None:
             stop()
 
-    def _may_be_asked(self) -> None:
+    def _check_losses(self) -> None:
         if len(self._losses) >= STRIKES:
-            raise NoOpinion(f"it gave no answer {STRIKES} times and is asked no more")
-        self._asked += 1
+            raise NoOpinion(f"it gave no result {STRIKES} times and is not called again")
+        self._calls += 1
 
-    def _failed(self, error: Exception) -> str:
-        """Count and log it; gives it in one line.  The same again is not logged again."""
+    def _record_failure(self, error: Exception) -> str:
+        """Count and log a failure, and return it in one line; the same failure is not logged again."""
         if isinstance(error, Lost):
-            self._losses = [*(each for each in self._losses if self._asked - each < SPAN), self._asked]
+            self._losses = [*(each for each in self._losses if self._calls - each < SPAN), self._calls]
         text = str(error) if isinstance(error, NoOpinion) else f"{type(error).__name__}: {error}"
-        why = (text.strip().splitlines() or ["it says nothing"])[-1][:MAX_NAME]  # of a trace, what was raised
+        # the last line of a trace is the exception
+        why = (text.strip().splitlines() or ["no error text"])[-1][:MAX_NAME]
         if why != self.why_not:
             self.why_not = why
             self.log.failure("strategy {name} has no opinion: {why}", name=self.name, why=why)
@@ -147,66 +154,66 @@ class Guard:
 
 
 def checked(found: Consensus, contacts: Sequence[Report]) -> Consensus:
-    """``found`` if it can be the consensus point of ``contacts``; raises ``NoOpinion`` where it cannot."""
+    """Return ``found`` if it is a possible decision for ``contacts``; raise ``NoOpinion`` otherwise."""
     if not isinstance(found, Consensus):
-        raise NoOpinion(f"find answers {type(found).__name__}, not Consensus")
+        raise NoOpinion(f"find returns {type(found).__name__}, not Consensus")
     agents = {report.agent for report in contacts}
     named = () if found.assigned_agent is None else (found.assigned_agent,)
     for group in (found.standby, found.assigned, found.value):
         if not isinstance(group, tuple) or len(group) > max(8, len(agents)):
-            raise NoOpinion("it names more than there are")
+            raise NoOpinion("it names more agents or numbers than allowed")
     for agent in (*named, *found.standby, *found.assigned):
         if agent not in agents:
-            raise NoOpinion(f"it names {agent!r:.60}, who did not report")
+            raise NoOpinion(f"it names {agent!r:.60}, which did not report")
     if len({*named, *found.standby}) < len(named) + len(found.standby):
-        raise NoOpinion("it names somebody twice")
+        raise NoOpinion("it names an agent twice")
     for text in (found.digest, found.task, found.choice, found.strategy, found.reason):
         if not isinstance(text, str) or len(text) > 2 * MAX_NAME:
-            raise NoOpinion("its texts are too long")
+            raise NoOpinion("a text of its result is too long")
     if not all(type(n) in (int, float) and -MAX_NUMBER <= n <= MAX_NUMBER for n in found.value):
-        raise NoOpinion("its value is no place")
+        raise NoOpinion("its value is not a tuple of valid numbers")
     return found
 
 
 def checked_group(
     found: Sequence[Consensus], contacts: Sequence[Report], items: Sequence[Item]
 ) -> tuple[Consensus, ...]:
-    """``found`` if it has one possible point for each item and gives nobody too much; raises ``NoOpinion`` else."""
+    """Return ``found`` if it has one possible decision per item within all capacities; else raise ``NoOpinion``."""
     if not isinstance(found, tuple) or not all(isinstance(point, Consensus) for point in found):
-        raise NoOpinion("find_group answers no tuple of Consensus")
+        raise NoOpinion("find_group does not return a tuple of Consensus")
     if [point.task for point in found] != [item.task for item in listed(items)]:
-        raise NoOpinion("it does not give one answer for each task")
+        raise NoOpinion("find_group does not return one decision for each task")
     wanted = {"", *(item.task for item in items)}
-    room = capacities(report for report in standing(contacts) if report.task in wanted)
+    capacity_left = capacities(report for report in standing(contacts) if report.task in wanted)
     for point in found:
         checked(point, [report for report in contacts if report.task in (point.task, "")])
         for agent in {*point.assigned, *filter(None, (point.assigned_agent,))}:
-            room[agent] = room.get(agent, 0) - 1
-    if tired := sorted(agent for agent, left in room.items() if left < 0):
-        raise NoOpinion(f"it gives {tired[0]!r:.60} more than it takes")
+            capacity_left[agent] = capacity_left.get(agent, 0) - 1
+    if overloaded := sorted(agent for agent, remaining in capacity_left.items() if remaining < 0):
+        raise NoOpinion(f"it gives {overloaded[0]!r:.60} more tasks than its capacity")
     return found
 
 
 def one_by_one(
     find: Callable[[Sequence[Report]], Consensus], contacts: Sequence[Report], items: Sequence[Item]
 ) -> tuple[Consensus, ...]:
-    """The tasks by name, each decided by itself; who has enough to do is left out."""
+    """Decide the items separately, sorted by task name; agents whose capacity is used up are left out."""
     counted = standing(contacts)
-    room = capacities(counted)
+    capacity_left = capacities(counted)
     points = []
     for item in listed(items):
-        free = [replace(r, task=item.task) for r in counted if r.task in (item.task, "") and room[r.agent] > 0]
+        free = [replace(r, task=item.task) for r in counted if r.task in (item.task, "") and capacity_left[r.agent] > 0]
         point = replace(find(free), task=item.task, epoch=counted[0].epoch if counted else 0)
         if point.assigned_agent is not None:
-            room[point.assigned_agent] -= 1
+            capacity_left[point.assigned_agent] -= 1
         points.append(point)
     return tuple(points)
 
 
-def _lawful(contacts: Sequence[Report]) -> tuple[Report, ...]:
-    """The reports that count, in an order that does not depend on the given one."""
-    return tuple(sorted((r for r in contacts if not refusal(r)), key=_order))
+def _valid_reports(contacts: Sequence[Report]) -> tuple[Report, ...]:
+    """Return the valid reports in an order that does not depend on the given one."""
+    return tuple(sorted((r for r in contacts if not refusal(r)), key=_sort_key))
 
 
-def _order(report: Report) -> tuple[object, ...]:
+def _sort_key(report: Report) -> tuple[object, ...]:
     return (report.task, report.agent, report.epoch, report.sequence, report.cost, repr(report))

@@ -1,4 +1,4 @@
-"""Item: one of several tasks that are shared out at once, and what a strategy for several promises."""
+"""Base class and data of strategies that assign several tasks at once."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from middleware.consensus.strategies.nearest import Nearest
 from middleware.consensus.strategy import Consensus, Report, digest_of, standing
 
 QUANTUM = 1_000_000
-"""Costs are compared as whole millionths, so that sums are exact and equal everywhere."""
+"""Costs are compared as whole millionths, so that sums are exact and equal at all nodes."""
 
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """A task as strategies for several see it: ``position`` in metres where it matters, ``slots`` agents act."""
+    """A task to assign: its ``position`` in metres (may be empty), and the number of agents that act (``slots``)."""
 
     task: str
     position: tuple[float, ...] = ()
@@ -22,39 +22,39 @@ class Item:
 
 
 class Sharing(Nearest):
-    """What the strategies for several tasks have in common; each brings its own ``find_group``."""
+    """Base class of strategies that assign several tasks; subclasses implement ``find_group``."""
 
     def find(self, contacts: Sequence[Report]) -> Consensus:
-        """The consensus point of the first task by name."""
+        """Decide the task whose id sorts first."""
         found = self.find_group(contacts, items_of(standing(contacts)))
         return found[0] if found else super().find(contacts)
 
     def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
-        """All reports that count of both: each may matter."""
+        """Return all valid reports of both: each may affect the assignment."""
         return standing((*a, *b))
 
     def find_group(self, contacts: Sequence[Report], items: Sequence[Item]) -> tuple[Consensus, ...]:
-        """One consensus point for each item, in the order of their names; nobody acts for more than its capacity."""
+        """Decide all items, sorted by task name; no agent gets more tasks than its capacity."""
         raise NotImplementedError
 
 
 def items_of(contacts: Iterable[Report]) -> list[Item]:
-    """The tasks that the reports are about, where nobody says more about them."""
+    """Return the tasks that the reports name, as items without positions."""
     return [Item(task) for task in sorted({r.task for r in contacts if isinstance(r.task, str)})]
 
 
 def listed(items: Iterable[Item]) -> list[Item]:
-    """Each task once, by name."""
+    """Return each item once, sorted by task name."""
     return sorted({item.task: item for item in items}.values(), key=lambda item: item.task)
 
 
 def exact(cost: float) -> int:
-    """A cost in whole millionths."""
+    """Return a cost in whole millionths."""
     return round(cost * QUANTUM)
 
 
 def capacities(contacts: Iterable[Report]) -> dict[str, int]:
-    """How many tasks each agent takes; where its reports differ, the least it says."""
+    """Return the number of tasks that each agent accepts; the least if its reports differ."""
     most: dict[str, int] = {}
     for report in contacts:
         most[report.agent] = min(report.capacity, most.get(report.agent, report.capacity))
@@ -64,9 +64,9 @@ def capacities(contacts: Iterable[Report]) -> dict[str, int]:
 def shared_out(
     name: str, counted: Sequence[Report], items: Sequence[Item], owners: Mapping[str, Sequence[str]]
 ) -> tuple[Consensus, ...]:
-    """The consensus points of an assignment: who has each task, and who else bid for it, the cheapest first.
+    """Build the decisions of an assignment; other bidders become standbys, the cheapest first.
 
-    ``counted`` are the reports that stand.
+    ``owners`` are the agents of each task, ``counted`` the valid reports.
     """
     epoch = counted[0].epoch if counted else 0
     digest = digest_of(counted) if counted else ""
@@ -79,9 +79,9 @@ def shared_out(
         chosen = tuple(owners.get(item.task, ()))
         order = sorted(bids.get(item.task, []), key=lambda r: (r.cost, r.agent))
         standby = tuple(r.agent for r in order if r.agent not in chosen)[:15]
-        reason = f"divided with {len(items) - 1} other{'s' * (len(items) != 2)} among {agents}"
+        reason = f"assigned with {len(items) - 1} other task{'s' * (len(items) != 2)} among {agents} agents"
         if not chosen:
-            reason = "nobody bid for it" if not order else "everybody who bid for it has enough to do"
+            reason = "no agent bid for it" if not order else "all bidders have reached their capacity"
         points.append(
             Consensus(
                 chosen[0] if chosen else None, standby, digest, item.task, epoch, chosen, strategy=name, reason=reason

@@ -1,4 +1,4 @@
-"""Remote: a strategy in another process, and the answers of one that runs in this process, as plain values; pure."""
+"""Calls of a strategy in another process, with arguments and results as plain values; pure."""
 
 from __future__ import annotations
 
@@ -12,41 +12,44 @@ from middleware.consensus.strategy import Consensus, Report
 
 
 class RemoteStrategy:
-    """A strategy whose methods run elsewhere; each method raises what went wrong there."""
+    """A strategy in another process; each method raises the error of that process."""
 
     def ask(self, method: str, arguments: list[Any]) -> Any:
-        """The plain answer to one question."""
+        """Call ``method`` in the other process and return its result as plain values."""
         raise NotImplementedError
 
     def find(self, contacts: Sequence[Report]) -> Consensus:
-        """The consensus point of the strategy."""
-        return _consensus(self.ask("find", [astuple(r) for r in contacts]))
+        """Decide, in the other process."""
+        return _consensus_from(self.ask("find", [astuple(r) for r in contacts]))
 
     def find_group(self, contacts: Sequence[Report], items: Sequence[Item]) -> tuple[Consensus, ...]:
-        """The points of a strategy for several tasks; raises ``NotImplementedError`` for any other."""
+        """Decide all items, in the other process.
+
+        Raises ``NotImplementedError`` if the strategy decides single tasks only.
+        """
         answer = self.ask("find_group", [[astuple(r) for r in contacts], [astuple(i) for i in items]])
         if answer is None:
             raise NotImplementedError
         if not isinstance(answer, list):
-            raise NoOpinion(f"find_group answers {answer!r:.60}")
-        return tuple(_consensus(point) for point in answer)
+            raise NoOpinion(f"find_group returns {answer!r:.60}, not a tuple of Consensus")
+        return tuple(_consensus_from(point) for point in answer)
 
     def improves(self, current: Report, offer: Report, hysteresis: float) -> bool:
-        """The answer of the strategy."""
+        """Compare two reports, in the other process."""
         answer: bool = self.ask("improves", [astuple(current), astuple(offer), hysteresis])
         return answer
 
     def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
-        """The summary of the strategy."""
+        """Summarise reports, in the other process."""
         answer = self.ask("merge", [[astuple(r) for r in a], [astuple(r) for r in b]])
         try:
             return tuple(report_of(fields) for fields in answer)
         except TypeError as error:
-            raise NoOpinion("merge answers no reports") from error
+            raise NoOpinion("merge does not return a tuple of Report") from error
 
 
 def answer(strategy: Any, method: str, arguments: list[Any]) -> Any:
-    """The answer of ``strategy`` to one question of a ``RemoteStrategy``, as plain values."""
+    """Run one call of a ``RemoteStrategy`` on ``strategy`` and return the result as plain values."""
     if method == "find":
         return astuple(strategy.find([report_of(r) for r in arguments]))
     if method == "improves":
@@ -61,16 +64,16 @@ def answer(strategy: Any, method: str, arguments: list[Any]) -> Any:
 
 
 def report_of(fields: Sequence[Any]) -> Report:
-    """A report out of what ``astuple`` made of it and a pipe carried."""
-    return Report(*_fields(fields))
+    """Rebuild a report from the plain values of ``astuple``."""
+    return Report(*_tuples_from_lists(fields))
 
 
-def _consensus(plain: Any) -> Consensus:
+def _consensus_from(plain: Any) -> Consensus:
     try:
-        return Consensus(*_fields(plain))
+        return Consensus(*_tuples_from_lists(plain))
     except TypeError as error:
-        raise NoOpinion(f"it answers {plain!r:.60}, not Consensus") from error
+        raise NoOpinion(f"it returns {plain!r:.60}, not Consensus") from error
 
 
-def _fields(values: Sequence[Any]) -> list[Any]:
+def _tuples_from_lists(values: Sequence[Any]) -> list[Any]:
     return [tuple(value) if isinstance(value, list) else value for value in values]

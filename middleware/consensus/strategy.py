@@ -1,8 +1,8 @@
-"""Strategy: who should act.  Pure, replaceable, loaded by name; it may be wrong, and then only the choice suffers.
+"""The interface of strategies: pure functions, loaded by name, from reports to the agent that should act.
 
-A strategy sees the reports of the agents assigned to a task and names the one that should act (thesis, section 4.2.5
-and Algorithm 4.5: ``consensus.find(contacts)``, ``consensus.assigned_agent``).  Who may act is not its business
-(``lease``).
+A strategy sees the reports of the agents that take part in a task and selects the agent that should act (thesis,
+section 4.2.5 and Algorithm 4.5: ``consensus.find(contacts)``, ``consensus.assigned_agent``). A wrong strategy makes a
+bad choice, never an unsafe one: only the lease (``middleware.consensus.lease``) gives an agent the right to act.
 """
 
 from __future__ import annotations
@@ -30,26 +30,36 @@ BUILT_IN = {
 }
 ENTRY_POINTS = "swarm_node.strategies"
 MAX_NUMBER = 1e9
-"""What is beyond it is no cost, place or weight of anything on this planet, and adds up without loss."""
+"""Upper bound of costs, weights and coordinates; such numbers add up without loss of precision."""
 MAX_WHOLE = 2**53
 MAX_NAME = 200
 READABLE = ("battery", "load", "value", "choice", "weight", "electorate")
-"""What a strategy may go by beside the cost.  In ``reads`` it says what of it; who does not say is given all."""
+"""The fields of ``Report`` that a strategy may read besides the cost.  A strategy without ``reads`` gets all of them.
+"""
 SHOWN = 40
 LABELS = ("cost", "weight", "electorate", "load", "age", "valid_for")
 
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """One agent's report: ``agent`` is its uuid, ``cost`` what acting would cost it (for ``nearest``: metres).
+    """One agent's report about one task.
 
-    ``task`` and ``epoch`` say what the report is about; of several epochs only the newest counts.  ``unmet`` names the
-    requirements that the device does not meet.  ``age`` is how many seconds ago it was measured and ``valid_for`` how
-    many it holds (0: as long as the agent is there), both durations, since no two clocks agree.  ``value`` is a number
-    or a place, in metres (``average``, ``rendezvous``; for ``sequential`` where the agent stands), ``choice`` a vote
-    and ``sequence`` its number, ``weight`` counts for both and ``electorate`` is the weight of all that may vote,
-    ``capacity`` is how many tasks the agent would take, ``battery`` the share that is left and ``load`` how many tasks
-    it has already.
+    - ``agent``: the agent's uuid
+    - ``cost``: the cost of acting, at least 0, in the strategy's unit (``nearest``: metres; ``capability_cost``:
+      seconds)
+    - ``task``: the task's id
+    - ``epoch``: the round of the decision; only reports of the newest epoch count
+    - ``sequence``: the number of this report or vote; a higher one replaces a lower one of the same agent
+    - ``value``: a number or a place in metres (``average``, ``rendezvous``); the agent's position for ``sequential``
+    - ``choice``: the option that the agent votes for; "" if it has not voted
+    - ``weight``: the weight of ``value`` and ``choice``
+    - ``electorate``: the total weight of all agents that may vote
+    - ``capacity``: the number of tasks that the agent accepts
+    - ``battery``: the charge that is left, 0 to 1
+    - ``load``: the number of tasks that the agent already has
+    - ``unmet``: the requirements of the task that the device does not meet
+    - ``age``: seconds since the measurement.  Ages are durations because the clocks of two nodes differ.
+    - ``valid_for``: seconds for which the report is valid; 0: while the agent is present
     """
 
     agent: str
@@ -71,10 +81,15 @@ class Report:
 
 @dataclass(frozen=True)
 class Consensus:
-    """The consensus point: who should act, those that stand by in order, and a digest of the reports used.
+    """The decision of a strategy (the thesis' consensus point).
 
-    ``assigned`` are all that act where a task has several places, ``value`` is what was agreed on by number or place
-    and ``choice`` by vote; ``strategy`` and ``reason`` are for people and make no difference.
+    - ``assigned_agent``: the uuid of the agent that should act, or None
+    - ``standby``: the uuids of the standbys, the best first
+    - ``digest``: the digest of the reports that were used (``digest_of``)
+    - ``task``, ``epoch``: the task and the round that were decided
+    - ``assigned``: all agents that act, if the task has several slots
+    - ``value``: the agreed number or place; ``choice``: the option that won the vote
+    - ``strategy``, ``reason``: text for display; ignored in comparisons
     """
 
     assigned_agent: str | None
@@ -90,71 +105,83 @@ class Consensus:
 
 
 class ConsensusAlgorithm(Protocol):
-    """What a strategy is.  Each method is a pure function; equal reports in any order give an equal result.
+    """The interface of a strategy.  Each method is a pure function: equal reports in any order give an equal result.
 
-    It may also have ``reads``, the names among ``READABLE`` of what it goes by beside the cost.
+    Invalid reports (``refusal``) must not affect any result; ``standing`` removes them.  Ties must be broken equally at
+    every node, for example by uuid.  ``middleware.consensus.conformance`` tests an implementation against all rules.
+
+    A strategy may also have an attribute ``reads``, the names out of ``READABLE`` of the fields that it uses besides
+    the cost, and a method ``find_group`` to decide several tasks at once (``middleware.consensus.item``).
     """
 
     name: str
     version: str
 
     def find(self, contacts: Sequence[Report]) -> Consensus:
-        """The consensus point of the reports of all contacts, oneself included."""
+        """Decide from the reports of all agents, including the caller's; without reports, assign no agent."""
 
     def improves(self, current: Report, offer: Report, hysteresis: float) -> bool:
-        """Whether ``offer`` is so much better than ``current`` that the task should change hands."""
+        """Return whether ``offer`` is better than ``current`` by more than ``hysteresis``.
+
+        ``hysteresis`` is a share of the cost (0.1: 10 %).
+        ``current`` is the report of the agent that acts now; if True, the task is reassigned to the agent of ``offer``.
+        An equal or invalid offer is never better.
+        """
 
     def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
-        """A summary of both: the order, grouping and repetition of merges never show, and ``find`` of it is theirs."""
+        """Return a summary of both sets of reports that leads ``find`` to the same decision as all reports.
+
+        The operation is a join: commutative, associative and idempotent.
+        """
 
 
 def refusal(report: Report) -> str:
-    """Why a report counts for nothing, or "" where it is lawful."""
+    """Return the reason why a report is invalid and is ignored, or "" if it is valid."""
     if not isinstance(report.agent, str) or not 0 < len(report.agent) <= MAX_NAME:
-        return "the agent has no name, or too long a one"
+        return f"agent must be a text of 1 to {MAX_NAME} characters"
     numbers = (report.cost, report.weight, report.electorate, report.load, report.age, report.valid_for)
     if not all((type(n) is float or type(n) is int) and 0.0 <= n <= MAX_NUMBER for n in numbers):
         for label, number in zip(LABELS, numbers, strict=True):
-            if why := _unlawful(number):
+            if why := _range_error(number):
                 return f"{label} {why}"
     if not isinstance(report.value, tuple) or len(report.value) > 8:
-        return "value is no place"
+        return "value must be a tuple of at most 8 numbers"
     for number in report.value:
-        if why := _unlawful(number, lowest=-MAX_NUMBER):
+        if why := _range_error(number, lowest=-MAX_NUMBER):
             return f"value {why}"
     if type(report.battery) not in (float, int) or not 0.0 <= report.battery <= 1.0:
-        return f"battery {_told(report.battery)} is no share"
+        return f"battery {_format_number(report.battery)} is not between 0 and 1"
     for whole in (report.epoch, report.sequence, report.capacity):
         if type(whole) is not int or not 0 <= whole < MAX_WHOLE:
-            return f"{_told(whole)} is no epoch, sequence or capacity"
+            return f"epoch, sequence or capacity {_format_number(whole)} is not a whole number from 0 to 2^53 - 1"
     for text in (report.task, report.choice):
         if not isinstance(text, str) or len(text) > MAX_NAME:
-            return "task or choice is no text, or too long"
+            return f"task and choice must be texts of at most {MAX_NAME} characters"
     if report.unmet:
-        return "cannot do it: " + ", ".join(map(str, report.unmet))[:MAX_NAME]
+        return "requirements not met: " + ", ".join(map(str, report.unmet))[:MAX_NAME]
     if 0.0 < report.valid_for < report.age:
         return f"stale: {report.age:g} s old, valid for {report.valid_for:g} s"
     return ""
 
 
 def cost_of(report: Report) -> float:
-    """What most strategies rank by."""
+    """Return the report's cost: the default rank."""
     return report.cost
 
 
 def standing(contacts: Iterable[Report], rank: Callable[[Report], float] = cost_of) -> tuple[Report, ...]:
-    """The reports that count: lawful, of the newest epoch, one of each agent and task, by task and agent.
+    """Return the valid reports of the newest epoch, one per task and agent, sorted by task and agent.
 
-    Within an epoch a bid only ever improves, so of several of one agent that of the lowest ``rank`` stands.  This is a
-    join: it makes no difference who merged what first, or twice.
+    Of several reports of one agent the one with the lowest ``rank`` counts. The operation is a join: order, grouping
+    and repetition of the reports make no difference.
     """
-    lawful = [r for r in contacts if not refusal(r)]
-    epoch = max((r.epoch for r in lawful), default=0)
+    valid = [r for r in contacts if not refusal(r)]
+    epoch = max((r.epoch for r in valid), default=0)
     best: dict[tuple[str, str], Report] = {}
-    for report in lawful:
+    for report in valid:
         if report.epoch == epoch:
             known = best.setdefault((report.task, report.agent), report)
-            if known is not report and _order(report, rank) < _order(known, rank):
+            if known is not report and _sort_key(report, rank) < _sort_key(known, rank):
                 best[report.task, report.agent] = report
     return tuple(best[key] for key in sorted(best))
 
@@ -167,9 +194,10 @@ def led_by(
     value: tuple[float, ...] = (),
     choice: str = "",
 ) -> Consensus:
-    """What the strategy ``name`` finds: the first of ``order`` acts, the others stand by; without an order nobody does.
+    """Build the decision of the strategy ``name``: the first agent of ``order`` acts, the others are standbys.
 
-    ``counted`` are the reports used, at least one, all of one task and epoch.
+    If ``order`` is empty, no agent is assigned.  ``counted`` are the reports that were used, at least one, all of one
+    task and epoch.
     """
     agents = tuple(r.agent for r in order)
     return Consensus(
@@ -187,16 +215,19 @@ def led_by(
 
 
 def reads_of(strategy: object) -> tuple[str, ...]:
-    """What ``strategy`` goes by beside the cost, in the order of ``READABLE``; everything where it does not say."""
+    """Return the fields that ``strategy`` reads besides the cost, in the order of ``READABLE``.
+
+    A strategy without ``reads`` gets all fields.
+    """
     try:
-        said = tuple(getattr(strategy, "reads", READABLE))
-        return tuple(name for name in READABLE if name in said)
-    except Exception:  # the strategy is foreign code
+        declared = tuple(getattr(strategy, "reads", READABLE))
+        return tuple(name for name in READABLE if name in declared)
+    except Exception:  # third-party code may raise anything
         return READABLE
 
 
 def agreement(value: tuple[float, ...], choice: str) -> str:
-    """What was agreed on by number, place or vote, as people read it; "" where nothing was."""
+    """Format the agreed number, place or option for display; "" if there is none."""
     if choice:
         return choice[:SHOWN]
     if len(value) == 1:
@@ -205,75 +236,75 @@ def agreement(value: tuple[float, ...], choice: str) -> str:
 
 
 def digest_of(contacts: Iterable[Report]) -> str:
-    """Eight hex digits that are equal for equal reports, whatever their order."""
-    texts = sorted(f"{r.agent}={r.cost + 0.0:.6f};{_rest(r)}" for r in contacts)  # -0.0 is 0.0
+    """Return a digest of eight hexadecimal digits that is equal for equal reports in any order."""
+    texts = sorted(f"{r.agent}={r.cost + 0.0:.6f};{_optional_fields(r)}" for r in contacts)  # -0.0 is 0.0
     return hashlib.blake2s("".join(texts).encode(errors="replace"), digest_size=4).hexdigest()
 
 
 def strategy_for(name: str, dotted: bool = False, deployed: Deployed | None = None) -> ConsensusAlgorithm:
-    """The strategy called ``name``: a built-in one, or an entry point of ``swarm_node.strategies``.
+    """Load the strategy called ``name``: a built-in one, or an entry point of the group ``swarm_node.strategies``.
 
-    ``deployed:x`` is the module ``x`` that an operator pushed, among those in ``deployed``.
-
-    With ``dotted`` also ``module:Class``, for names out of this machine's own settings: what a peer sends must never
-    say what is imported here.  Raises ``UnknownStrategy``, which names those that there are.
+    ``deployed:x`` is the module ``x`` in ``deployed``, which an operator deployed to the team. With ``dotted``,
+    ``name`` may also be ``module:Class``.  Use this for names in local settings only: a peer must not choose what this
+    machine imports. Raises ``UnknownStrategy``; its text lists the known names.
     """
     if is_deployed(name):
-        return _deployed(name, deployed or {})
+        return _create_deployed(name, deployed or {})
     module, _, attribute = place_of(name, dotted).partition(":")
     try:
         strategy: ConsensusAlgorithm = getattr(importlib.import_module(module), attribute)()
-    except Exception as error:  # a module of somebody else may fail in any way
+    except Exception as error:  # third-party code may raise anything
         raise UnknownStrategy(f"strategy {name!r} cannot be loaded: {error}") from error
     return strategy
 
 
 def place_of(name: str, dotted: bool = False) -> str:
-    """Where that strategy lies, ``module:Class``, without importing it; raises ``UnknownStrategy``."""
+    """Return the import path ``module:Class`` of a strategy without importing it; raises ``UnknownStrategy``."""
     target = name if dotted and ":" in name else BUILT_IN.get(name)
     if target is None:
-        from importlib.metadata import entry_points  # heavy, and most nodes never come here
+        from importlib.metadata import entry_points  # slow to import, and rarely needed
 
         found = {point.name: point.value for point in entry_points(group=ENTRY_POINTS)}
         target = found.get(name)
         if target is None:
-            raise UnknownStrategy(f"no strategy is called {name!r}; there are {', '.join(sorted(BUILT_IN | found))}")
+            raise UnknownStrategy(f"unknown strategy {name!r}; known: {', '.join(sorted(BUILT_IN | found))}")
     return target
 
 
-def _unlawful(number: float, lowest: float = 0.0) -> str:
+def _range_error(number: float, lowest: float = 0.0) -> str:
     if type(number) is not float and type(number) is not int:
-        return "is no number"
+        return "has the wrong type, not a number"
     if lowest <= number <= MAX_NUMBER:
         return ""
     if number != number:
         return "is not a number"
     if number in (float("inf"), float("-inf")):
         return "is infinite"
-    return f"{_told(number)} is negative" if lowest == 0.0 and number < 0.0 else f"{_told(number)} is enormous"
+    problem = "is negative" if lowest == 0.0 and number < 0.0 else f"exceeds {MAX_NUMBER:g} in magnitude"
+    return f"{_format_number(number)} {problem}"
 
 
-def _told(number: object) -> str:
+def _format_number(number: object) -> str:
     try:
         return f"{number:.3g}" if isinstance(number, float) else repr(number)[:40]
-    except ValueError:  # a whole number of thousands of digits
-        return "a number of thousands of digits"
+    except ValueError:  # an integer with thousands of digits
+        return "an integer with thousands of digits"
 
 
-def _order(report: Report, rank: Callable[[Report], float]) -> tuple[object, ...]:
-    return (rank(report), report.cost, _rest(report), report.age, report.valid_for)
+def _sort_key(report: Report, rank: Callable[[Report], float]) -> tuple[object, ...]:
+    return (rank(report), report.cost, _optional_fields(report), report.age, report.valid_for)
 
 
-def _rest(report: Report) -> str:
+def _optional_fields(report: Report) -> str:
     given = (report.task, report.epoch, report.sequence, report.value, report.choice, report.weight, report.capacity)
     more = (report.battery, report.load, report.electorate)
     return "" if (given, more) == (("", 0, 0, (), "", 1.0, 1), (1.0, 0.0, 0.0)) else f"{given!r}{more!r};"
 
 
-def _deployed(name: str, deployed: Deployed) -> ConsensusAlgorithm:
+def _create_deployed(name: str, deployed: Deployed) -> ConsensusAlgorithm:
     make = maker_of(STRATEGY, name, deployed)
     try:
         strategy: ConsensusAlgorithm = make()
-    except Exception as error:  # a module of somebody else may fail in any way
-        raise UnknownStrategy(f"strategy {name!r} cannot be made: {error}") from error
+    except Exception as error:  # third-party code may raise anything
+        raise UnknownStrategy(f"strategy {name!r} cannot be created: {error}") from error
     return strategy

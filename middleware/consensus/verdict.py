@@ -1,9 +1,9 @@
-"""Verdict: one agent's signed account of one decision; pure (what all of them say together: ``explanation``).
+"""An agent's signed record of one decision; pure (``explanation`` combines the records of all agents).
 
-Each agent that takes part in a task writes whom it named, by which rule and from which reports, into slots of its own
-under a key beside the task's group: who asks why reads it, and those at work are not told.  The record's signature is
-the agent's; nobody can testify for another.  The accounts are team records: why somebody went can be asked after it is
-gone.
+Each participant of a task writes its decision, the strategy and the reports into its own slots under a key next to the
+task's group.  Only queries read these records; the working agents are not notified.  The record is signed by its agent,
+so no agent can write another agent's decision.  The records are team records, so they remain after their agent has
+left.
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ from middleware.tasks.task import Member, is_choice, is_value
 
 SLOT = "verdict"
 KEPT = 4
-"""Epochs of one task that an agent keeps: the newest takes the slot of the one that was ``KEPT`` before it."""
+"""Number of epochs of a task that an agent keeps; a new one replaces the slot of the epoch ``KEPT`` before it."""
 MANY, BEST = 30, 8
-"""Of more than ``MANY`` reports the ``BEST`` are written down, with the count of all; as many of the silent."""
+"""Of more than ``MANY`` reports only the ``BEST`` are recorded, with the total count; ``BEST`` silent names at most."""
 STANDBY = 3
 MAX_VERDICT = 3300
-"""Bytes of a verdict at most: three datagrams, and one for a team of ten."""
-NAME, WORDS = 40, 160
-USUAL = Report("", 0.0)
+"""Maximum size of a record's value in bytes: three datagrams, and one for a team of ten."""
+MAX_NAME_BYTES, MAX_TEXT_BYTES = 40, 160
+DEFAULT = Report("", 0.0)
 
 
 @dataclass(frozen=True)
 class Reported:
-    """What one participant had reported when it was decided: its uuid, its name, and the cost.
+    """What one participant had reported at the time of the decision: its uuid, name and cost.
 
-    ``more`` is what else counted, in words; empty where nothing did, or was as usual.
+    ``more`` describes the other fields that the strategy read; "" if there were none or all had their default.
     """
 
     agent: str
@@ -49,13 +49,17 @@ class Reported:
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whom ``agent`` (a uuid) named as the one to do ``task`` in ``epoch``, and why.
+    """The decision of ``agent`` (a uuid) about ``task`` in ``epoch``, with its reasons.
 
-    ``winner`` and ``standby`` are uuids, ``winner`` empty where nobody was fit.  ``rule`` and ``version`` are those of
-    the strategy, ``hysteresis`` tells in words what became of whoever acted before.  ``reports`` are the best first;
-    ``reported`` counts all there were, ``silent`` names participants without a report, ``participants`` counts both.
-    ``digest`` is of the reports as this agent computed it; ``token`` is not 0 where it holds the right to act.
-    ``value`` and ``choice`` are what was agreed on by number, place or vote, empty where nothing was.
+    - ``winner``, ``standby``: uuids; ``winner`` is empty if no agent qualified
+    - ``rule``, ``version``: name and version of the strategy
+    - ``hysteresis``: describes the effect on the agent that acted before
+    - ``digest``: the digest of the reports, as this agent computed it
+    - ``token``: the fencing token of the lease if this agent holds it, otherwise 0
+    - ``participants``, ``reported``: the number of participants, and of those with a report
+    - ``reports``: the reports, the best first
+    - ``silent``: names of participants without a report
+    - ``value``, ``choice``: the agreed number or place, or the option that won the vote; empty if there is none
     """
 
     agent: str
@@ -78,12 +82,15 @@ class Verdict:
 
     @property
     def key(self) -> bytes:
-        """The key under which it is written."""
+        """The key of the record."""
         return verdicts_key(self.task)
 
     @property
     def is_witness(self) -> bool:
-        """Whether its agent is to write it: in a group of more than ``MANY``, those with the best reports do."""
+        """Whether the agent should write its record.
+
+        In a group of more than ``MANY`` members only the agents with the best reports do.
+        """
         return self.participants <= MANY or self.agent in [report.agent for report in self.reports[:BEST]]
 
     @property
@@ -92,49 +99,49 @@ class Verdict:
         return slot_of(self.epoch)
 
     def packed(self) -> bytes:
-        """The value of the verdict's record, at most ``MAX_VERDICT`` bytes whatever the texts."""
+        """Return the value of the record, at most ``MAX_VERDICT`` bytes; longer texts are cut."""
         content = {
-            "name": _cut(self.name, NAME),
+            "name": _cut(self.name, MAX_NAME_BYTES),
             "task": _cut(self.task, 64),
             "epoch": self.epoch,
             "rule": _cut(self.rule, 64),
-            "version": _cut(self.version, NAME),
+            "version": _cut(self.version, MAX_NAME_BYTES),
             "winner": bytes.fromhex(self.winner),
             "standby": [bytes.fromhex(uuid) for uuid in self.standby[:STANDBY]],
-            "hysteresis": _cut(self.hysteresis, WORDS),
+            "hysteresis": _cut(self.hysteresis, MAX_TEXT_BYTES),
             "digest": _cut(self.digest, 64),
             "token": self.token,
             "participants": self.participants,
             "reported": self.reported,
-            "reports": [[bytes.fromhex(r.agent), _cut(r.name, NAME), r.cost] for r in self.reports[:MANY]],
-            "silent": [_cut(name, NAME) for name in self.silent[:BEST]],
+            "reports": [[bytes.fromhex(r.agent), _cut(r.name, MAX_NAME_BYTES), r.cost] for r in self.reports[:MANY]],
+            "silent": [_cut(name, MAX_NAME_BYTES) for name in self.silent[:BEST]],
         }
         if self.value:
             content["value"] = list(self.value)
         if self.choice:
             content["choice"] = _cut(self.choice, 64)
         value = bytes(msgpack.packb(content))
-        more = [_cut(r.more, NAME) for r in self.reports[:MANY]]
+        more = [_cut(r.more, MAX_NAME_BYTES) for r in self.reports[:MANY]]
         while any(more):
-            told = bytes(msgpack.packb({**content, "more": more}))
-            if len(told) <= MAX_VERDICT:
-                return told
-            more.pop()  # of the worst ones only the cost
+            extended = bytes(msgpack.packb({**content, "more": more}))
+            if len(extended) <= MAX_VERDICT:
+                return extended
+            more.pop()  # the worst reports keep only their cost
         return value
 
 
 def verdicts_key(task: str) -> bytes:
-    """The key under which the verdicts on a task lie."""
+    """Return the key of the decision records of a task."""
     return hashed_key(verdicts_text(task))
 
 
 def verdicts_text(task: str) -> str:
-    """The text of that key, as a shell names it."""
+    """Return the text of that key, as used in the shell."""
     return f"task/{task}/why"
 
 
 def slot_of(epoch: int) -> str:
-    """The slot of an epoch's verdict."""
+    """Return the slot of an epoch's decision record."""
     return f"{SLOT}/{epoch % KEPT}"
 
 
@@ -151,20 +158,20 @@ def verdict_from(
     token: int = 0,
     view: View | None = None,
 ) -> Verdict:
-    """The account of one decision that ``me`` took.
+    """Build the record of a decision that ``me`` made.
 
-    ``consensus`` is what the strategy found among the reports, ``assigned`` who was decided for after the
-    ``hysteresis`` (a share), ``token`` that of the lease which this agent holds, or 0; ``view`` is what the strategy
-    goes by.
+    ``consensus`` is the strategy's decision, ``assigned`` the agent selected after applying ``hysteresis`` (a share),
+    ``token`` the fencing token of the lease that this agent holds, or 0, and ``view`` the fields that the strategy
+    reads.
     """
     view = view or View()
     members = {m.uuid: m for m in (*others, me)}
-    fit = [m for m in members.values() if m.cost is not None]
-    told = (Reported(m.uuid, m.name, float(m.cost or 0.0), _more(view.report(m))) for m in fit)
-    reports = sorted(told, key=lambda r: (r.cost, r.agent))
+    able = [m for m in members.values() if m.cost is not None]
+    reported = (Reported(m.uuid, m.name, float(m.cost or 0.0), _describe_fields(view.report(m))) for m in able)
+    reports = sorted(reported, key=lambda r: (r.cost, r.agent))
     best = reports if len(reports) <= MANY else reports[:BEST]
     silent = sorted(m.name for m in members.values() if m.cost is None)
-    acting = sorted((m for m in fit if m.status == EXECUTING), key=lambda m: (m.cost, m.uuid))
+    acting = sorted((m for m in able if m.status == EXECUTING), key=lambda m: (m.cost, m.uuid))
     return Verdict(
         me.uuid,
         me.name,
@@ -173,8 +180,10 @@ def verdict_from(
         rule,
         version,
         assigned or "",
-        tuple(uuid for uuid in (*_first(consensus.assigned_agent), *consensus.standby) if uuid != assigned)[:STANDBY],
-        _outcome(members, acting[0] if acting else None, consensus, assigned, hysteresis),
+        tuple(uuid for uuid in (*_as_tuple(consensus.assigned_agent), *consensus.standby) if uuid != assigned)[
+            :STANDBY
+        ],
+        _describe_outcome(members, acting[0] if acting else None, consensus, assigned, hysteresis),
         consensus.digest,
         token,
         len(members),
@@ -187,14 +196,14 @@ def verdict_from(
 
 
 def verdict_of(record: Record) -> Verdict | None:
-    """The verdict in a record, or None where it holds none, or one in another's name; never raises."""
+    """Return the decision in a record, or None if it is invalid or written under another agent's name; never raises."""
     content = mapping_of(record, MAX_VERDICT)
     if content is None or not record.name.startswith(f"{SLOT}/"):
         return None
     texts = [content.get(name) for name in ("name", "task", "rule", "version", "hysteresis", "digest")]
     wholes = [content.get(name) for name in ("epoch", "token", "participants", "reported")]
-    winner, standby = content.get("winner"), _uuids(content.get("standby"))
-    reports, silent = _reports(content.get("reports"), content.get("more", [])), content.get("silent")
+    winner, standby = content.get("winner"), _uuids_from(content.get("standby"))
+    reports, silent = _reports_from(content.get("reports"), content.get("more", [])), content.get("silent")
     value, choice = content.get("value", []), content.get("choice", "")
     if not all(_is_line(text) for text in texts) or not all(is_whole(number) for number in wholes):
         return None
@@ -233,54 +242,54 @@ def verdict_of(record: Record) -> Verdict | None:
 # -- inside -------------------------------------------------------------------------------------------------------
 
 
-def _outcome(
+def _describe_outcome(
     members: Mapping[str, Member], acting: Member | None, found: Consensus, assigned: str | None, hysteresis: float
 ) -> str:
-    """What became of whoever acted, in words; where nobody is to act, why not."""
+    """Describe the effect on the agent that acted before; or why no agent is assigned."""
     best = found.assigned_agent
     if not assigned:
         return found.reason or "no report counts"
     if acting is None:
-        return f"nobody acted before; {found.reason}" if found.task else "nobody acted before"
-    name = members[best].name if best is not None and best in members else "nobody"
+        return f"no agent acted before; {found.reason}" if found.task else "no agent acted before"
+    name = members[best].name if best is not None and best in members else "no agent"
     if assigned == acting.uuid:
         if best == assigned:
-            return f"{acting.name} acts already, and nobody is better"
+            return f"{acting.name} already acts, and no agent is better"
         return f"{name} is the best, but not better by {hysteresis:.0%} than {acting.name}, who acts"
     return f"{name} is better by more than {hysteresis:.0%} than {acting.name}, who acted"
 
 
-def _first(uuid: str | None) -> tuple[str, ...]:
+def _as_tuple(uuid: str | None) -> tuple[str, ...]:
     return () if uuid is None else (uuid,)
 
 
 def _cut(text: str, most: int) -> str:
-    """At most ``most`` bytes of a text, without what no terminal should be shown: other members chose their names."""
+    """Cut a text to ``most`` bytes and replace unprintable characters: other members chose the text."""
     printable = "".join(c if c.isprintable() else "?" for c in text)
     return printable.encode(errors="replace")[:most].decode(errors="ignore")
 
 
 def _is_line(value: object) -> bool:
-    """Whether ``value`` is text that a terminal can be shown."""
+    """Return whether ``value`` is printable text."""
     return isinstance(value, str) and value.isprintable()
 
 
-def _uuids(value: object) -> tuple[str, ...] | None:
+def _uuids_from(value: object) -> tuple[str, ...] | None:
     if not isinstance(value, list) or len(value) > STANDBY:
         return None
-    lawful = all(isinstance(uuid, bytes) and len(uuid) == ID_BYTES for uuid in value)
-    return tuple(uuid.hex() for uuid in value) if lawful else None
+    are_valid = all(isinstance(uuid, bytes) and len(uuid) == ID_BYTES for uuid in value)
+    return tuple(uuid.hex() for uuid in value) if are_valid else None
 
 
-def _more(report: Report | None) -> str:
-    """What of a report counted beside the cost, in words; what is as usual is left out."""
+def _describe_fields(report: Report | None) -> str:
+    """Describe the fields besides the cost that the strategy read and that differ from their default."""
     if report is None:
         return ""
-    said = {name: getattr(report, name) for name in READABLE if getattr(report, name) != getattr(USUAL, name)}
-    return ", ".join(_said(name, value) for name, value in said.items())
+    description = {name: getattr(report, name) for name in READABLE if getattr(report, name) != getattr(DEFAULT, name)}
+    return ", ".join(_describe_field(name, value) for name, value in description.items())
 
 
-def _said(name: str, value: object) -> str:
+def _describe_field(name: str, value: object) -> str:
     if name == "battery":
         return f"battery {value:.0%}"
     if name == "load":
@@ -292,18 +301,18 @@ def _said(name: str, value: object) -> str:
     return f"{name} {value:g}"
 
 
-def _reports(value: object, more: object) -> tuple[Reported, ...] | None:
+def _reports_from(value: object, more: object) -> tuple[Reported, ...] | None:
     if not isinstance(value, list) or len(value) > MANY:
         return None
     if not isinstance(more, list) or len(more) > len(value) or not all(_is_line(each) for each in more):
         return None
     reports = []
-    for entry, said in zip_longest(value, more, fillvalue=""):
+    for entry, description in zip_longest(value, more, fillvalue=""):
         if not isinstance(entry, list) or len(entry) != 3:
             return None
         agent, name, cost = entry
-        is_lawful = isinstance(agent, bytes) and len(agent) == ID_BYTES and _is_line(name)
-        if not is_lawful or not is_number(cost) or cost < 0:
+        is_valid = isinstance(agent, bytes) and len(agent) == ID_BYTES and _is_line(name)
+        if not is_valid or not is_number(cost) or cost < 0:
             return None
-        reports.append(Reported(agent.hex(), name, float(cost), said))
+        reports.append(Reported(agent.hex(), name, float(cost), description))
     return tuple(reports)

@@ -1,12 +1,13 @@
-"""View: what a strategy sees of the members of a task; pure.
+"""The part of the members' reports that a strategy sees; pure.
 
-Records under the group's key and bids to the council are two ways of the same report, and both go through here: so a
-strategy decides the same by either.  What it does not read is not shown to it, and is no part of the digest.
+Records under the task's key and bids to the quorum members carry the same reports, and both pass through here: the
+decision does not depend on the path.  Fields that the strategy does not read are hidden from it and are not part of the
+digest.
 
-Not shown to any strategy is how old a report is, since each member would see another age: what is stale is left out
-before (``agents.conference``).  So are reports of older rounds, and all but the newest of each member: ``epoch`` and
-``sequence`` of a report stay 0.  Who lacks what the task requires takes no part in it: ``unmet`` stays empty.  A body
-does one thing at a time: ``capacity`` stays 1.
+The age of a report is never shown, because each member would see another age; stale reports are removed earlier
+(``agents.conference``).  Reports of older rounds, and all but the newest of each member, are removed too: ``epoch`` and
+``sequence`` of a report stay 0.  A device that does not meet the task's requirements takes no part: ``unmet`` stays
+empty.  A device does one task at a time: ``capacity`` stays 1.
 """
 
 from __future__ import annotations
@@ -20,19 +21,19 @@ from middleware.tasks.task import Member, is_bid, is_choice, is_value
 
 
 class View:
-    """The view of who goes by ``reads`` beside the cost (names out of ``strategy.READABLE``)."""
+    """The view of a strategy that reads ``reads`` (names out of ``strategy.READABLE``) besides the cost."""
 
     def __init__(self, reads: Iterable[str] = ()) -> None:
         self.reads = tuple(name for name in READABLE if name in tuple(reads))
 
     def report(self, member: Member) -> Report | None:
-        """What counts of what ``member`` tells; None where that is nothing."""
+        """Return the report that the strategy sees of ``member``; None if the member has reported no valid cost."""
         if member.cost is None or not is_bid(member.cost):
             return None
-        return Report(member.uuid, member.cost, **{name: _SHOWN[name](member) for name in self.reads})
+        return Report(member.uuid, member.cost, **{name: _READERS[name](member) for name in self.reads})
 
     def told(self, member: Member, report: Report) -> Member:
-        """``member`` as it would be had it told ``report``; unchanged where that is no lawful one."""
+        """Return ``member`` with the values of ``report``; unchanged if the report is invalid."""
         if refusal(report) or not is_value(report.value) or not is_choice(report.choice):
             return member
         known: dict[str, Any] = {name: getattr(report, name) for name in self.reads if name != "load"}
@@ -42,14 +43,14 @@ class View:
 
 
 def view_of(strategy: object) -> View:
-    """What ``strategy`` sees."""
+    """Return the view of ``strategy``."""
     return View(reads_of(strategy))
 
 
-# As numbers of one kind: 1 and 1.0 are equal, and their digests are not.
-_SHOWN: dict[str, Any] = {
+# Numbers are converted to one type: 1 and 1.0 are equal but have different digests.
+_READERS: dict[str, Any] = {
     "battery": lambda member: float(member.battery),
-    "load": lambda member: float(max(0, member.load - 1)),  # what it has beside this task
+    "load": lambda member: float(max(0, member.load - 1)),  # tasks besides this one
     "value": lambda member: tuple(map(float, member.value)),
     "choice": lambda member: member.choice,
     "weight": lambda member: float(member.weight),

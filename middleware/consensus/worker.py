@@ -1,7 +1,7 @@
-"""Worker: a strategy of somebody else in a process of its own, so that it can be ended when it does not.
+"""Run a third-party strategy in a separate process, so that a call that does not return can be stopped.
 
-Code that never returns cannot be stopped from within its own process without harm; a process can.  This is against
-mistakes and not against malice: what may be loaded at all is decided elsewhere.
+Code that never returns cannot be stopped safely within its own process.  This protects against mistakes, not against
+malice: settings decide which code may be loaded.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from middleware.consensus.guard import Lost, NoOpinion
 from middleware.consensus.remote import RemoteStrategy
 
 DEADLINE_S = 0.2
-"""How long the node stands still at most for one question; well below the third of a lease."""
+"""Maximum seconds that one call blocks the node; well below a third of a lease's duration."""
 START_S = 5.0
 MAX_ANSWER = 65_536
 LENGTH = struct.Struct("!I")
 
 
 class Worker(RemoteStrategy):
-    """The strategy at ``place`` (``module:Class``), asked through pipes; each method raises what went wrong.
+    """The strategy at ``place`` (``module:Class``), called through pipes; each method raises the strategy's error.
 
-    ``path`` comes before this process's own path for imports.
+    ``deadline`` is the maximum time of a call in seconds; ``path`` precedes this process's import path.
     """
 
     version = ""
@@ -42,18 +42,18 @@ class Worker(RemoteStrategy):
         self._path = path
         self._process: subprocess.Popen[bytes] | None = None
         self._is_ready = False
-        self._began = 0.0
-        self._broken = ""
+        self._started_at = 0.0
+        self._load_error = ""
         self._is_stopped = False
         self._start()
 
     def stop(self) -> None:
-        """End the process for good: whoever still asks gets no answer, and no new process."""
+        """End the process; later calls raise ``NoOpinion``."""
         self._is_stopped = True
         self._end()
 
     def _start(self) -> None:
-        # Sets come out in the same order on every machine.
+        # A fixed hash seed makes sets iterate in the same order on every machine.
         path = os.pathsep.join((*self._path, *filter(None, sys.path), os.getcwd()))
         self._process = subprocess.Popen(
             [sys.executable, "-m", "middleware.consensus.servant", self._place, str(2.0 * self._deadline)],
@@ -63,7 +63,7 @@ class Worker(RemoteStrategy):
             bufsize=0,
             env={**os.environ, "PYTHONPATH": path, "PYTHONHASHSEED": "0"},
         )
-        self._is_ready, self._began = False, time.monotonic()
+        self._is_ready, self._started_at = False, time.monotonic()
 
     def _end(self) -> None:
         process, self._process = self._process, None
@@ -75,40 +75,40 @@ class Worker(RemoteStrategy):
             process.wait()
 
     def ask(self, method: str, arguments: list[Any]) -> Any:
-        """The answer of its process; raises ``NoOpinion``."""
+        """Call ``method`` in the process and return its result; raises ``NoOpinion``."""
         end = time.monotonic() + self._deadline
-        if self._broken:
-            raise Raised(self._broken)
+        if self._load_error:
+            raise Raised(self._load_error)
         if self._is_stopped:
             raise NoOpinion("it was stopped")
         if self._process is None:
             self._start()
         try:
             if not self._is_ready:
-                self._heard(self._read(end))
+                self._unpack(self._read(end))
                 self._is_ready = True
             self._write(bytes(msgpack.packb([method, arguments])), end)
-            return self._heard(self._read(end))
+            return self._unpack(self._read(end))
         except TimeoutError:
-            if not self._is_ready and time.monotonic() - self._began < START_S:
-                raise NoOpinion("it is still being loaded") from None
+            if not self._is_ready and time.monotonic() - self._started_at < START_S:
+                raise NoOpinion("it is still loading") from None
             self._end()
-            raise Lost(f"it did not answer within {self._deadline:g} s") from None
+            raise Lost(f"it gave no result within {self._deadline:g} s") from None
         except (OSError, ValueError, NoOpinion) as error:
             if not self._is_ready and isinstance(error, Raised):
-                self._broken = str(error)
+                self._load_error = str(error)
             if not self._is_ready or not isinstance(error, Raised):
                 self._end()
             if isinstance(error, OSError):
                 raise Lost("its process has died") from error
             raise
 
-    def _heard(self, answer: bytes) -> Any:
+    def _unpack(self, answer: bytes) -> Any:
         try:
-            is_well, content = msgpack.unpackb(answer)
+            is_ok, content = msgpack.unpackb(answer)
         except Exception as error:  # msgpack raises many things
-            raise Lost("its answer cannot be read") from error
-        if not is_well:
+            raise Lost("its result cannot be decoded") from error
+        if not is_ok:
             raise Raised(str(content))
         return content
 
@@ -122,12 +122,12 @@ class Worker(RemoteStrategy):
             rest = rest[os.write(pipe.fileno(), rest) :]
 
     def _read(self, end: float) -> bytes:
-        (size,) = LENGTH.unpack(self._bytes(LENGTH.size, end))
+        (size,) = LENGTH.unpack(self._read_bytes(LENGTH.size, end))
         if size > MAX_ANSWER:
-            raise Lost(f"its answer has {size} bytes, more than {MAX_ANSWER}")
-        return self._bytes(size, end)
+            raise Lost(f"its result has {size} bytes, more than {MAX_ANSWER}")
+        return self._read_bytes(size, end)
 
-    def _bytes(self, size: int, end: float) -> bytes:
+    def _read_bytes(self, size: int, end: float) -> bytes:
         assert self._process is not None and self._process.stdout is not None
         found = b""
         while len(found) < size:
@@ -140,7 +140,7 @@ class Worker(RemoteStrategy):
 
 
 class Raised(NoOpinion):
-    """The strategy raised; the text is its trace."""
+    """The strategy raised an exception; the text is its trace."""
 
 
 def _wait(pipe: int, event: int, end: float) -> None:

@@ -1,1 +1,1 @@
-"""The devices of the team: the presence record of each, and the list of all, split by prefix in a large team."""
+"""The device directory: the presence record of each device, and the list of all, split by prefix in a large team."""

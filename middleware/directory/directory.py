@@ -1,7 +1,7 @@
-"""Directory: this node's part in the list of all devices, which is split by prefix in a large team.
+"""The directory: the list of all devices, split by prefix in a large team.
 
-It knows where the own device stands, moves it as the team grows and shrinks, and reads what others wrote.  Where a
-device stands is decided in ``prefix``, how a list is walked in ``listing``.
+It writes the own device's record, moves it as the team grows and shrinks, and reads other devices' records.  ``prefix``
+computes the places of a device, and ``listing`` the places to read.
 """
 
 from __future__ import annotations
@@ -21,19 +21,20 @@ from middleware.entangled.record import Record
 from middleware.entangled.replication.reader import ReadConcern
 
 AT_ONCE = 8
-"""Places that one list reads at the same time."""
+"""Number of places that one listing reads concurrently."""
 PLACED, PLACED_STEP = 50, 0.1
-"""Steps for which a newcomer waits until it knows its neighbours, and seconds of each."""
+"""Number of steps for which a new node waits until it knows its neighbours, and their duration in seconds."""
 WIDER = 2
-"""How many depths above its own a device begins that wants to see some of the others only: four places or so."""
+"""Number of depths above its own at which a device starts a partial search: about four places."""
 
 Matches = Callable[[Device], bool]
 
 
 class Page(NamedTuple):
-    """Some of the devices: those found first from a place on, and the id where the next ones begin (None: no more).
+    """Some of the devices.
 
-    ``is_complete`` says whether nobody was left out in between.
+    ``following`` is the id from which to continue (None: the end).  ``is_complete`` is False if devices in
+    this range may be missing.
     """
 
     records: list[Record]
@@ -42,19 +43,19 @@ class Page(NamedTuple):
 
 
 class Directory:
-    """The directory as the node ``entangled`` sees it."""
+    """The directory from the view of the node ``entangled``."""
 
     def __init__(self, entangled: EntangledNode, chores: Background) -> None:
         self.depth = 0
         self.entangled = entangled
         self.chores = chores
         self._own_id = entangled.identity.node_id
-        self._stands: set[tuple[bytes, str]] = set()
-        self._leaves: set[tuple[bytes, str]] = set()
+        self._current_places: set[tuple[bytes, str]] = set()
+        self._old_places: set[tuple[bytes, str]] = set()
 
     @property
     def size(self) -> int:
-        """About how many devices there are; as many as are known where nobody says that there are more."""
+        """The estimated number of devices; in a small team the number of known ones."""
         overlay = self.entangled.overlay
         contacts = overlay.contacts()
         is_large = overlay.roster.is_full or (overlay.is_large and not overlay.is_complete)
@@ -62,13 +63,13 @@ class Directory:
 
     @property
     def lease(self) -> float:
-        """Seconds that this device is listed after its last sign of life."""
+        """Seconds for which this device remains listed after its last renewal."""
         return lease_at(self.depth, self.entangled.lease)
 
-    # -- where this device stands -----------------------------------------------------------------------------------
+    # -- the own record -----------------------------------------------------------------------------------------------
 
     async def arrive(self) -> int:
-        """The depth to begin with.  In a large team a newcomer first learns who its neighbours are."""
+        """Return the initial depth; in a large team, wait first until this node knows its neighbours."""
         overlay = self.entangled.overlay
         for _ in range(PLACED):
             if overlay.is_placed or not overlay.is_large:
@@ -78,34 +79,35 @@ class Directory:
         return self.depth
 
     def review(self) -> int:
-        """The depth at which the device is to be from now on: one more or less where the team is of another size."""
+        """Return the depth from now on: one more or less if the team's size has changed."""
         self.depth = depth_for(self.size, self.depth)
         return self.depth
 
     def announce(self, name: str, value: bytes, depth: int) -> Deferred[Any]:
-        """Write what the device says of itself, packed, where it stands at ``depth``; then leave where it stood."""
+        """Write the device's packed record at its places at ``depth``, then release its previous places."""
         lease = lease_at(depth, self.entangled.lease)
-        stands = {(key, name) for key in places_of(self._own_id, depth)}
-        self._leaves = (self._leaves | self._stands) - stands
-        self._stands = stands
+        new_places = {(key, name) for key in places_of(self._own_id, depth)}
+        self._old_places = (self._old_places | self._current_places) - new_places
+        self._current_places = new_places
         puts = [self.entangled.put(key, name, value, "leased", lease=lease) for key in places_of(self._own_id, depth)]
-        return puts[0] if len(puts) == 1 and not self._leaves else self._moved(puts)
+        return puts[0] if len(puts) == 1 and not self._old_places else self._release_old(puts)
 
-    def _moved(self, puts: list[Deferred[Any]]) -> Deferred[Any]:
+    def _release_old(self, puts: list[Deferred[Any]]) -> Deferred[Any]:
         def left(results: Any) -> None:
-            for key, name in self._leaves:
+            for key, name in self._old_places:
                 self.entangled.release(key, name)
-            self._leaves.clear()
+            self._old_places.clear()
 
         def failed(failure: Any) -> Any:
-            return failure.value.subFailure  # where it stood it stays, until it says something again
+            return failure.value.subFailure  # the previous places are kept until the next announcement
 
         return DeferredList(puts, fireOnOneErrback=True, consumeErrors=True).addCallbacks(left, failed)
 
-    # -- who else is there ------------------------------------------------------------------------------------------
+    # -- other devices
+    # --------------------------------------------------------------------------------------------------
 
     async def around(self) -> list[Record]:
-        """The devices of this device's own neighbourhood, itself included: all there are in a team with one place."""
+        """Return the devices in this device's own neighbourhood, including itself; all devices of an undivided team."""
         place = prefix_of(self._own_id, max(0, self.depth - 1))
         records = await self.entangled.get(place.key)
         return [record for _, record in standing(place.key, records)] if self.depth else records
@@ -117,10 +119,10 @@ class Directory:
         heard: Callable[[Listing], None] = lambda listing: None,
         pause: float = 0.0,
     ) -> Listing:
-        """All devices, or those below a prefix; ``heard`` is told each time that more of them are known.
+        """List all devices, or those below a prefix; ``heard`` is called each time that more of them are known.
 
-        A ``fast`` read costs a fifth, and may lack who has just come or gone.  Never fails: what could not be read is
-        named in ``Listing.missed``.  Between two lots of reads it rests for ``pause`` seconds.
+        A ``fast`` read costs a fifth of a majority read, but may miss recent changes.  Never fails: unread places are
+        in ``Listing.missed``.  ``pause`` is the time in seconds between two batches of reads.
         """
         listing = Listing(max(0, self.depth - 1), under)
 
@@ -130,7 +132,8 @@ class Directory:
             except EntangledError:
                 pass
             try:
-                # Half of the holders went at once: what any of the others has is better than nothing, and not all.
+                # If half of the replicas have failed at once, use the records of any other, but mark the place as
+                # incomplete.
                 listing.read(place, await self.entangled.get(place.key, "fast"))
                 listing.missed.append(place)
             except EntangledError:
@@ -148,11 +151,10 @@ class Directory:
     async def some(
         self, count: int, matches: Matches = lambda device: True, after: bytes | None = None, most_reads: int = 64
     ) -> Page:
-        """At least ``count`` devices that ``matches`` wants, unless there are fewer, and where to go on.
+        """Find ``count`` or more devices for which ``matches`` returns True, and the id to continue from.
 
-        They come neighbourhood by neighbourhood, from the id ``after`` on and round the ring of ids; by default this
-        device's own one comes first, so that those who ask for a page ask different holders.  After ``most_reads``
-        places it stops in any case: a search for what nobody has costs no more than that, and can be gone on with.
+        The search starts at the id ``after``, by default this device's own, so that different nodes ask different
+        replicas, and continues around the id space.  It stops after ``most_reads`` places in any case.
         """
         begin = self._own_id if after is None else after
         depth = max(0, self.depth - WIDER)

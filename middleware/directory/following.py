@@ -1,7 +1,7 @@
-"""Following: one subscriber to the list of all devices, in a team of any size.
+"""A subscription to the list of all devices, for teams of any size.
 
-A team with one place is watched there.  In a larger one the places are read in turn, some of them each second, however
-many there are: to watch a thousand keys would be a thousand times the renewals.
+In an undivided team the single place is watched.  In a larger one the places are read in turn, at a constant rate:
+watching a thousand keys would need a thousand times the renewals.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from middleware.entangled.record import Record
 from middleware.entangled.replication.watch import Changed, Watch
 
 READS_PER_S = 16
-"""Places that a follower reads in a second, at most: 10,000 devices are seen anew about once a minute."""
+"""Maximum number of places that a follower reads per second: it reads 10,000 devices again about once a minute."""
 REST = 2.0
-"""Seconds between two rounds, at least."""
+"""Minimum seconds between two rounds."""
 MARK = b"\xa5depth"
-"""Stands in the value of each device that says it is not at depth 0."""
+"""Part of the record of each device that is not at depth 0."""
 
 
 class Following:
-    """Tells ``changed`` of all devices' records whenever they differ; ``records`` is what is known now.
+    """Calls ``changed`` with all devices' records when they have changed; ``records`` are the current ones.
 
-    With ``keep`` the records of a team with one place are in the node's own store as well.  In a large team one holder
-    of each place is asked, which may lack some: a device is let go of when two rounds in a row did not show it.
+    With ``keep`` the records of an undivided team are also kept in the node's store.  In a large team one replica of
+    each place is asked, which may miss some records, so a device is removed only after two rounds without it.
     """
 
     def __init__(self, directory: Directory, changed: Changed, keep: bool = False) -> None:
@@ -38,26 +38,26 @@ class Following:
         self._is_split = False
         self._unseen: set[bytes] = set()
         self._watch: Watch | None = None
-        self._watch = directory.entangled.watch(DEVICES, self._told, keep)
+        self._watch = directory.entangled.watch(DEVICES, self._on_records, keep)
 
     def stop(self) -> None:
-        """End the subscription; nothing is told any more."""
+        """End the subscription."""
         self._is_stopped = True
         if self._watch is not None:
             self._watch.stop()
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
-    def _told(self, records: list[Record]) -> None:
+    def _on_records(self, records: list[Record]) -> None:
         if self._directory.depth > 1 or any(MARK in (record.value or b"") for record in records):
             if not self._is_split:
                 self._is_split = True
-                self._directory.chores.fork(self._rounds())
+                self._directory.chores.fork(self._read_repeatedly())
         elif not self._is_split:
-            self._tell(records)
+            self._notify(records)
 
-    async def _rounds(self) -> None:
-        """Read all places again and again, until the team is small again."""
+    async def _read_repeatedly(self) -> None:
+        """Read all places repeatedly, until the team is small again."""
         while not self._is_stopped:
             listing = await self._directory.listed("fast", heard=self._add, pause=AT_ONCE / READS_PER_S)
             self._replace(listing)
@@ -66,30 +66,30 @@ class Following:
             await self._directory.chores.sleep(REST)
         self._is_split = False
         if self._watch is not None and not self._is_stopped:
-            self._told(self._watch.records)
+            self._on_records(self._watch.records)
 
     def _add(self, listing: Listing) -> None:
-        """Tell of those that are new, as soon as they are known."""
+        """Report new devices immediately."""
         newest = {record.owner: record for record in self.records}
         for record in listing.records:
             known = newest.get(record.owner)
             if known is None or record.sequence > known.sequence:
                 newest[record.owner] = record
-        self._tell(newest.values())
+        self._notify(newest.values())
 
     def _replace(self, listing: Listing) -> None:
-        """Let go of who was not seen in this round nor in the last, where its place was read."""
+        """Remove devices that were missing in this round and the last, although their place was read."""
         seen = {record.owner for record in listing.records}
         unseen = {
             record.owner
             for record in self.records
             if record.owner not in seen and not any(place.has(node_id(record.owner)) for place in listing.missed)
         }
-        gone, self._unseen = unseen & self._unseen, unseen
-        self._tell(record for record in self.records if record.owner not in gone)
+        removed, self._unseen = unseen & self._unseen, unseen
+        self._notify(record for record in self.records if record.owner not in removed)
 
-    def _tell(self, records: Iterable[Record]) -> None:
-        told = sorted(records, key=lambda record: (record.owner, record.name))
-        if told != self.records and not self._is_stopped:
-            self.records = told
-            self._changed(list(told))
+    def _notify(self, records: Iterable[Record]) -> None:
+        ordered = sorted(records, key=lambda record: (record.owner, record.name))
+        if ordered != self.records and not self._is_stopped:
+            self.records = ordered
+            self._changed(list(ordered))

@@ -1,8 +1,8 @@
-"""Listing: a walk through the places of the directory, which knows whom it may not have seen; pure.
+"""A walk through the places of the directory that knows which devices it may have missed; pure.
 
-Whoever lists reads a place, and goes on to the half that has another key as deep as any device there says that it
-stands, or as deep as the reader itself expects; the other half has the same key.  So each place is read once, and what
-is read is in proportion to what is there.
+After reading a place, the walk continues to the half with another key, down to the depth of the deepest device found
+there or the reader's own; the other half has the same key.  So each place is read once, and the number of reads is
+proportional to the number of devices.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from middleware.entangled.identity import node_id
 from middleware.entangled.record import Record
 
 MOST_READS = 20_000
-"""Places that one listing reads; further ones are left out, and it is not complete."""
+"""Maximum number of places that one listing reads; beyond it the listing is incomplete."""
 
 
 class Listing:
-    """The devices below ``under``; the walk goes down to the depth ``floor`` at least.
+    """The devices below ``under``; the walk reaches at least the depth ``floor``.
 
-    ``reads`` counts the places that were read; ``missed`` are those whose holders gave no answer.
+    ``reads`` is the number of places read; ``missed`` are the places that could not be read.
     """
 
     def __init__(self, floor: int = 0, under: Prefix = ROOT) -> None:
@@ -33,7 +33,7 @@ class Listing:
         self.missed: list[Prefix] = []
 
     def next(self) -> Prefix | None:
-        """A place that is to be read now, or None where nothing is known to be left (ask again after an answer)."""
+        """Return a place to read now, or None if none is known at present (call again after the next ``read``)."""
         if not self._waiting:
             return None
         if self.reads >= MOST_READS:
@@ -45,7 +45,7 @@ class Listing:
         return self._waiting.pop()
 
     def read(self, place: Prefix, records: Iterable[Record]) -> None:
-        """``records`` are what is held under the key of ``place``."""
+        """Process the ``records`` under the key of ``place``."""
         self._open -= 1
         below = []
         for device, record in standing(place.key, records):
@@ -61,32 +61,32 @@ class Listing:
             place = place.along
 
     def failed(self, place: Prefix) -> None:
-        """Nobody could say what is at ``place``."""
+        """Record that no replica of ``place`` answered."""
         self._open -= 1
         self.missed.append(place)
 
     @property
     def is_over(self) -> bool:
-        """Whether nothing is left to be read."""
+        """Whether all places have been read."""
         return not (self._waiting or self._open)
 
     @property
     def is_complete(self) -> bool:
-        """Whether every place was read, so that nobody who stands where its neighbours do was missed."""
+        """Whether every place was read, so that no device at the depth of its neighbours was missed."""
         return self.is_over and not self.missed
 
     @property
     def devices(self) -> list[tuple[Device, Record]]:
-        """The devices that were found, each with its record, in the order of their keys."""
+        """The devices found with their records, sorted by key."""
         return [self._found[owner] for owner in sorted(self._found)]
 
     @property
     def records(self) -> list[Record]:
-        """The record of each device that was found."""
+        """The records of the devices found."""
         return [record for _, record in self.devices]
 
 
 def standing(key: bytes, records: Iterable[Record]) -> list[tuple[Device, Record]]:
-    """The devices among ``records`` that stand under ``key``; who writes anywhere else is not listed there."""
+    """Return the devices in ``records`` whose places include ``key``; other records are ignored."""
     known = [(device, record) for record in records if (device := device_of(record)) is not None]
     return [(device, record) for device, record in known if key in places_of(node_id(record.owner), device.depth)]

@@ -1,8 +1,7 @@
-"""Presence: who is here, what it can do, and how it is.
+"""Presence: the record in which each device announces its capabilities and status.
 
-Each device announces itself in an owner-leased record under one key, so it disappears with its node.  The order of
-joining is a number, one more than the highest seen when the device came, so it needs no common clock and is the same
-on every node.
+The record is owner-leased, so it disappears with its node.  The order of joining is a number, one more than the highest
+that the device found, so it needs no common clock and is the same at every node.
 """
 
 from __future__ import annotations
@@ -22,29 +21,32 @@ DEVICES = hashed_key("devices")
 IDLE, ASSIGNED, SEARCHING, WAITING, EXECUTING, DONE = "IDLE", "ASSIGNED", "SEARCHING", "WAITING", "EXECUTING", "DONE"
 STATUSES = (IDLE, ASSIGNED, SEARCHING, WAITING, EXECUTING, DONE)
 MAX_DEPTH = 16
-"""The directory is split no further: 2**16 places are enough for a million devices."""
+"""Maximum depth of the directory: 2**16 places are enough for a million devices."""
 ID_SHOWN = 6
 MESSAGES_KEPT = 5
 MESSAGE_CHARACTERS = 70
 STOPS_SHOWN = 4
-"""Stops that a device says it obeys; each takes 34 bytes of its record."""
+"""Maximum number of stops in a device's record; each takes 34 bytes."""
 
 Capabilities = Mapping[str, Mapping[str, float | str]]
 
 
 @dataclass(frozen=True)
 class Device:
-    """What a device says of itself (thesis, Algorithm 4.3).
+    """The presence record of a device (thesis, Algorithm 4.3).
 
-    ``uuid`` is its node id in hex; ``joined`` its place in the order of joining; ``since`` seconds of the wall clock,
-    for people; ``messages`` are its newest (time, text) lines; ``deployed`` maps each module that was pushed to the
-    version and digest that it runs, or says that it was refused; ``pages`` are the URLs at which it serves the page;
-    ``position`` is where it says that it is: ``x`` and ``y`` in metres and ``heading`` in radians in the yard's frame,
-    or ``lat`` and ``lon`` in degrees with ``accuracy`` in metres; ``laptop`` and ``agent`` are what people call the
-    computer that its node runs on and the agent that acts for it (thesis, Table 5.1); ``depth`` is how far the
-    directory is split where it stands (``middleware.directory.prefix``); ``stops`` are the ids in hex of the stops that
-    it obeys, ``STOPS_SHOWN`` at most, and ``obeys`` is what it does while the team is stopped
-    (``middleware.stop.halt``).
+    - ``uuid``: the node id in hex
+    - ``joined``: the device's number in the order of joining
+    - ``since``: wall-clock seconds, for display
+    - ``messages``: the newest (time, text) lines
+    - ``deployed``: for each deployed module the version and digest that runs, or the reason why it was rejected
+    - ``pages``: the URLs at which it serves the page
+    - ``position``: ``x`` and ``y`` in metres and ``heading`` in radians on the simulator's map, or ``lat`` and ``lon``
+      in degrees with ``accuracy`` in metres
+    - ``laptop``, ``agent``: display names of the computer and of the agent (thesis, Table 5.1)
+    - ``depth``: the depth of its place in the directory (``middleware.directory.prefix``)
+    - ``stops``: the ids in hex of the stops that it obeys, at most ``STOPS_SHOWN``
+    - ``obeys``: its activity while the team is stopped (``middleware.stop.halt``)
     """
 
     uuid: str
@@ -70,16 +72,19 @@ class Device:
     obeys: str = ""
 
     def with_message(self, now: float, text: str) -> Device:
-        """This device with one more line; the oldest goes when there are more than ``MESSAGES_KEPT``."""
+        """Return this device with one more line; at most ``MESSAGES_KEPT`` are kept."""
         line = (now, text[:MESSAGE_CHARACTERS])
         return replace(self, messages=(*self.messages, line)[-MESSAGES_KEPT:])
 
     def packed(self) -> bytes:
-        """The value of its record; where it is too large, messages give way, then description, then ``deployed``."""
+        """Return the value of its record.
+
+        If it is too large, messages, description and ``deployed`` are removed in that order.
+        """
         device = self
         while True:
             content = dict(vars(device))
-            # Most devices have none of them, and each byte of a record is sent again and again.
+            # most devices have none of these, and records are sent often
             for name in ("pages", "position", "laptop", "agent", "depth", "stops", "obeys"):
                 if not content[name]:
                     del content[name]
@@ -95,9 +100,9 @@ class Device:
 
 
 def device_of(record: Record) -> Device | None:
-    """The device that a record announces, or None where its value is not one, or one of another node.
+    """Decode the device in a record; None if it is invalid or of another node.
 
-    It is announced under the name of the record's slot, which replicas compare with the certificate of its owner.
+    Its name must be the name of the record's slot, which replicas compare with the owner's certificate.
     """
     value = mapping_of(record)
     if value is None or value.get("uuid") != node_id(record.owner).hex() or value.get("name") != record.name:
@@ -115,7 +120,7 @@ def device_of(record: Record) -> Device | None:
         return None
     texts = (device.name, device.kind, device.description, device.address, device.task, device.status, *device.roles)
     texts += (device.laptop, device.agent, device.obeys)
-    lawful = (
+    is_valid = (
         all(
             isinstance(text, str)
             for text in (*texts, *device.pages, *device.stops, *(text for _, text in device.messages))
@@ -134,13 +139,13 @@ def device_of(record: Record) -> Device | None:
         and isinstance(device.position, dict)
         and all(isinstance(name, str) and is_number(n) for name, n in device.position.items())
     )
-    return device if lawful else None
+    return device if is_valid else None
 
 
 def devices_of(records: list[Record]) -> list[tuple[Device, Record]]:
-    """The devices in ``records`` in the order of joining, each with its record.
+    """Decode the devices in ``records``, sorted by their order of joining, each with its record.
 
-    Where several have the same name each is told apart by the beginning of its id.
+    Devices with equal names get a prefix of their id appended.
     """
     known = [(device, record) for record in records if (device := device_of(record)) is not None]
     counts = Counter(name for name, _ in {(device.name, device.uuid) for device, _ in known})
@@ -156,7 +161,7 @@ Later = Callable[[float, Callable[[], None]], object]
 
 
 class Presence:
-    """This node's own device record, announced when it changes and at most every ``PAUSE`` seconds."""
+    """This node's own device record, announced after changes at most every ``PAUSE`` seconds."""
 
     PAUSE = 0.1
 
@@ -164,33 +169,33 @@ class Presence:
         self.device = device
         self._announce = announce
         self._later = later
-        self._pending = False
-        self._present = False
+        self._is_pending = False
+        self._has_appeared = False
 
     def appear(self, joined: int) -> None:
-        """Announce the device for the first time, with its place in the order of joining."""
+        """Announce the device for the first time, with its number in the order of joining."""
         self.device = replace(self.device, joined=joined)
-        self._present = True
+        self._has_appeared = True
         self._announce(self.device.packed())
 
     def change(self, **changes: Any) -> None:
-        """Announce what is new; unchanged fields cost nothing."""
+        """Announce changed fields; unchanged ones cause no message."""
         device = replace(self.device, **changes)
         if device == self.device:
             return
         self.device = device
-        if self._present and not self._pending:
-            self._pending = True
-            self._later(self.PAUSE, self._tell)
+        if self._has_appeared and not self._is_pending:
+            self._is_pending = True
+            self._later(self.PAUSE, self._publish)
 
     def say(self, now: float, text: str) -> None:
         """Add a line to the device's messages."""
         self.change(messages=self.device.with_message(now, text).messages)
 
     def obey(self, stops: Collection[bytes], words: str) -> None:
-        """Say which stops the device obeys, and what it does; no stops: it goes on."""
+        """Announce the stops that the device obeys, and its activity; without stops it continues normally."""
         self.change(stops=tuple(stop.hex() for stop in list(stops)[-STOPS_SHOWN:]), obeys=words)
 
-    def _tell(self) -> None:
-        self._pending = False
+    def _publish(self) -> None:
+        self._is_pending = False
         self._announce(self.device.packed())

@@ -1,1 +1,1 @@
-"""The team as a user interface needs it: a view of its records, and a client that calls and orders."""
+"""The team for user interfaces: a view of its records, and a client for requests and orders."""

@@ -1,4 +1,4 @@
-"""TeamClient: the requests of a user interface over one node (thesis, Algorithm 4.4)."""
+"""The requests of a user interface through one node (thesis, Algorithm 4.4)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from middleware.tasks.order import Order
 from middleware.tasks.task import CANCELLED, TASKS, Result, Task, tasks_of
 
 LOOKUP_S = 1.0
-"""Seconds that the team has to answer whether a task exists."""
+"""Timeout in seconds of the lookup of a task."""
 
 
 class TeamClient:
@@ -36,8 +36,8 @@ class TeamClient:
         self._tasks_watched: dict[str, tuple[Watch, Watch]] = {}
         self.version = 0
         self.view = TeamView(self.read)
-        self._devices = node.watch_devices(self._count, keep=True)
-        self._tasks = node.watch_tasks(self._follow, keep=True)
+        self._devices = node.watch_devices(self._count_change, keep=True)
+        self._tasks = node.watch_tasks(self._watch_tasks, keep=True)
         node.halt.follow()
 
     @property
@@ -64,14 +64,14 @@ class TeamClient:
         return None if record is None else self._node.contact_of(record)
 
     def call(self, uuid: str, method: str, *arguments: object, timeout: float, changes: bool = False) -> Deferred[Any]:
-        """Call a method of a device; fails with ``EntangledError``, with ``NoAnswer`` where it is not present.
+        """Call a method of a device; fails with ``EntangledError``, and with ``NoAnswer`` if it is not present.
 
         :param timeout: seconds
         :param changes: whether the call changes something, so that it may run only once
         """
         contact = self.contact(uuid)
         if contact is None:
-            return fail(NoAnswer(f"{self.view.name_of(uuid)} is not here"))
+            return fail(NoAnswer(f"{self.view.name_of(uuid)} is not present"))
         return self._node.entangled.endpoint.ask(contact, method, *arguments, timeout=timeout, changes=changes)
 
     def stream_camera(self, contact: Contact, on_frame: Callable[[int, bytes, float], None]) -> Callable[[], None]:
@@ -91,14 +91,14 @@ class TeamClient:
     # -- tasks ------------------------------------------------------------------------------------------------------
 
     def new_task_id(self) -> str:
-        """Return an id that no task has."""
+        """Return an unused task id."""
         return self._node.rng.randbytes(6).hex()
 
     def find_task(self, task_id: str) -> Deferred[Task | None]:
         """Fire with the task of that id, or None.
 
-        The team is asked, because another node's last request may not have been replicated to this one; the records
-        that are watched here count where no answer comes in ``LOOKUP_S``.
+        The team is queried, because another node's last write may not have been replicated to this one; if no answer
+        arrives within ``LOOKUP_S``, the locally watched records are used.
         """
         found: Deferred[Task | None] = Deferred()
 
@@ -110,7 +110,7 @@ class TeamClient:
             answer(())
             return found
         cancel = self._node.later(LOOKUP_S, answer, ())
-        self._node.entangled.get(TASKS).addErrback(_none).addCallback(answer).addBoth(lambda _: cancel())
+        self._node.entangled.get(TASKS).addErrback(_ignore_error).addCallback(answer).addBoth(lambda _: cancel())
         return found
 
     def submit(self, template: Task, task_id: str) -> tuple[Task, Deferred[Any]]:
@@ -136,19 +136,19 @@ class TeamClient:
         contacts = [self.contact(device.uuid) for device in self.view.devices]
         return [contact for contact in contacts if contact is not None]
 
-    def _follow(self, records: list[Record]) -> None:
-        self._count(records)
+    def _watch_tasks(self, records: list[Record]) -> None:
+        self._count_change(records)
         for task_id in tasks_of(records):
             if task_id not in self._tasks_watched:
                 self._tasks_watched[task_id] = (
-                    self._node.watch_group(task_id, self._count, keep=True),
-                    self._node.entangled.watch(verdicts_key(task_id), self._count, keep=True),
+                    self._node.watch_group(task_id, self._count_change, keep=True),
+                    self._node.entangled.watch(verdicts_key(task_id), self._count_change, keep=True),
                 )
 
-    def _count(self, records: list[Record]) -> None:
+    def _count_change(self, records: list[Record]) -> None:
         self.version += 1
 
 
-def _none(failure: Any) -> list[Record]:
+def _ignore_error(failure: Any) -> list[Record]:
     failure.trap(EntangledError)
     return []

@@ -1,4 +1,4 @@
-"""TeamView: the devices, tasks and stops in the records of one node (thesis, Algorithm 4.3).  Pure."""
+"""The devices, tasks and stops in the records of one node (thesis, Algorithm 4.3).  Pure."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Progress:
 
 
 class TeamView:
-    """The team in the records that ``read`` returns; each property reads them anew."""
+    """The team in the records that ``read`` returns; each property reads them again."""
 
     def __init__(self, read: Read) -> None:
         self._read = read
@@ -59,7 +59,7 @@ class TeamView:
         return {stop.hex(): by for stop, by in stops_in(self._read(HALT)).items()}
 
     def task(self, task_id: str) -> Task | None:
-        """Return a task, or None where it is not known."""
+        """Return a task, or None if it is unknown."""
         return tasks_in(self._read(TASKS)).get(task_id)
 
     def members(self, task_id: str) -> list[Member]:
@@ -93,7 +93,7 @@ class TeamView:
         return next((device for device in self.devices if device.uuid == uuid), None)
 
     def name_of(self, uuid: str) -> str:
-        """Return the name of a device, or the beginning of its uuid where it is not present."""
+        """Return the name of a device, or the start of its uuid if it is not present."""
         device = self.device(uuid)
         return uuid[:8] if device is None else device.name
 

@@ -1,11 +1,12 @@
-"""Halt: the stops of the whole team as this node knows them, which what acts obeys.
+"""The stops of the whole team as this node knows them; agents obey them.
 
-A stop goes to every device at once, and stays as a record for those that come later or did not hear it.  It is in force
-until a release names it (``middleware.stop.stop_set``).  Stops and releases count only from members that may order.
-Where the role of a record's owner is not known, its stops count and its releases do not.
+A stop is sent to every device at once, and stays as a record for devices that join later or did not receive it.  It is
+in force until a release names it (``middleware.stop.stop_set``).  Stops and releases are accepted only from members
+that may order.  If the role of a record's owner is unknown, its stops are accepted and its releases are not.
 
-A node keeps the stops in its store and acknowledges one when it is written, so that a restart releases nothing.  Where
-no record names a stop any more, because its author left or was revoked, a node that may order names it in its own.
+A node keeps the stops in its store and acknowledges a stop after it is written, so that a restart releases nothing.  If
+no record names a stop any longer, because its author left or was revoked, a node that may order adds it to its own
+record.
 """
 
 from __future__ import annotations
@@ -41,29 +42,32 @@ HALT = hashed_key("halt")
 SLOT = "halt"
 METHOD = "device.halt"
 NOTE = "halt/stops"
-"""The node's note of the stops in force, the released ones, and those that it released itself."""
+"""The key in the node's store of the stops in force, the released ones, and the releases of this node."""
 STANDS = "stands"
 GOES_ON = "goes on"
 NO_ROBOT = "has no robot"
-UNHEARD = "did not answer; it stops when it hears of it, or when its lease is over"
+UNHEARD = "did not answer; it stops when it receives the stop, or when its lease expires"
 UNSAVED = "; it cannot save the stop: a restart of its node may end it"
 RECORDED_RELEASES = 16
-"""Releases that the node's own record names, the newest ones."""
+"""Maximum number of releases in the node's own record; the newest are kept."""
 MADE = ADOPTED = MAX_NAMED // 2
-"""Stops that a node has in force itself, where a new one replaces its oldest, and those of others that it names."""
+"""Maximum number of a node's own stops in force (a new one replaces the oldest), and of adopted stops."""
 REVIEW = 10.0
-"""Least seconds between two looks, while the team is stopped, for a stop that no record names; at most twice that."""
+"""Minimum seconds between two checks for stops without a record while the team is stopped.
+
+The maximum is twice that.
+"""
 
 Report = Callable[[Collection[bytes], str], None]
-"""Called with the stops that are obeyed, and with what this node does, in a few words."""
+"""Called with the stops that are obeyed, and with a short text about the node's activity."""
 Later = Callable[[float, Callable[[], None]], object]
 
 
 class Halt:
-    """The stops as this node knows them; what acts asks ``is_on`` before it acts, and says how it obeys.
+    """The stops as this node knows them; agents check ``is_on`` before they act, and report their activity.
 
-    ``later(seconds, call)`` is a timer that ends with the node, and ``report`` is called when something has changed.
-    Without a node, nothing is stopped.
+    ``later(seconds, call)`` is a timer that ends with the node, and ``report`` is called after each change.  Without a
+    node, nothing is stopped.
     """
 
     def __init__(
@@ -82,8 +86,8 @@ class Halt:
         self._report = report
         self._obeying: list[Callable[[], str]] = []
         self._watch: Watch | None = None
-        self._is_asking = self._is_reviewing = self._is_in_doubt = False
-        self._made: list[bytes] = []
+        self._is_asking = self._is_reviewing = self._has_doubtful = False
+        self._own_stops: list[bytes] = []
         self._ordered: dict[bytes, None] = {}
         self._by = ""
         self._written: tuple[object, ...] = ({}, ())
@@ -102,59 +106,59 @@ class Halt:
 
     @property
     def is_on(self) -> bool:
-        """Whether what acts is to stand: a stop is in force, or this node has just started and does not know yet."""
+        """Whether robots must stand still: a stop is in force, or this node does not know the stops yet."""
         return self.is_stopped or not self.is_known
 
     @property
     def by(self) -> str:
-        """The operators whose stops are in force."""
+        """The operators of the stops in force."""
         return ", ".join(dict.fromkeys(filter(None, self._set.in_force.values())))
 
     @property
     def records(self) -> list[Record]:
-        """The records of the stops, where they are followed."""
+        """The records of the stops, if they are followed."""
         return [] if self._watch is None else self._watch.records
 
     def watch(self, obey: Callable[[], str]) -> None:
-        """Call ``obey`` when the team is stopped and when it is released; it says in a few words what it does then."""
+        """Call ``obey`` when the team is stopped or released; it returns a short text about its activity."""
         self._obeying.append(obey)
 
     def follow(self) -> None:
-        """Follow the records of the stops; they are in the node's store as well."""
+        """Follow the records of the stops; they are also kept in the node's store."""
         if self._entangled is not None and self._watch is None:
             self._watch = self._entangled.watch(HALT, self._merge_records, keep=True)
             self._review_later()
 
     def learn(self) -> None:
-        """Follow the stops, and stand until the network has said which there are; call it again until it has."""
+        """Follow the stops, and stand still until the network has returned them; call it again until then."""
         if self._entangled is None or self._is_asking or (self._watch is not None and self.is_known):
             return
         self.follow()
         self.is_known, self._is_asking = False, True
-        self._entangled.get(HALT).addCallbacks(self._learnt, self._unlearnt)
+        self._entangled.get(HALT).addCallbacks(self._on_records, self._ignore_unreachable)
 
     def refresh(self) -> str:
-        """Judge again what was in doubt, and obey; what this node does now, in a few words."""
-        if self._is_in_doubt:
+        """Check doubtful records again, and obey; returns a short text about the node's activity."""
+        if self._has_doubtful:
             self._merge_records(self.records)
         return self._obey()
 
-    # -- what an operator orders ------------------------------------------------------------------------------------
+    # -- orders of this node's operator -----------------------------------------------------------------------------
 
     def stop(self, by: str, contacts: Collection[Contact]) -> Deferred[dict[str, str]]:
-        """Stop the team; fires with what each of ``contacts`` does, by uuid, in a few words."""
+        """Stop the team; fires with the activity of each of ``contacts`` as a short text, by uuid."""
         assert self._entangled is not None and self._rng is not None
-        # A new id each time: a release that is under way, of an earlier stop, does not end this one.
+        # Use a new id each time, so that a late release of an earlier stop does not end this one.
         stop = self._rng.randbytes(ID_BYTES)
-        made = [*(each for each in self._made if each in self.stops), stop]
-        replaced, self._made = made[:-MADE], made[-MADE:]
+        own_stops = [*(each for each in self._own_stops if each in self.stops), stop]
+        replaced, self._own_stops = own_stops[:-MADE], own_stops[-MADE:]
         return self._order(Statement({stop: clipped(by)}, tuple(replaced), clipped(by)), contacts)
 
     def release(self, stops: Iterable[bytes], by: str, contacts: Collection[Contact]) -> Deferred[dict[str, str]]:
-        """End these stops and no other ones; fires as ``stop`` does.  Raises ``ValueError`` for what is no id."""
+        """Release these stops only; fires as ``stop`` does.  Raises ``ValueError`` for an invalid id."""
         named = tuple(dict.fromkeys(stops))[:MAX_RELEASED]
         if not are_ids(named):
-            raise ValueError(f"the id of a stop has {ID_BYTES} bytes")
+            raise ValueError(f"the id of a stop must have {ID_BYTES} bytes")
         return self._order(Statement({}, named, clipped(by)), contacts)
 
     def _order(self, order: Statement, contacts: Collection[Contact]) -> Deferred[dict[str, str]]:
@@ -164,51 +168,53 @@ class Halt:
         while len(self._ordered) > RECORDED_RELEASES:
             del self._ordered[next(iter(self._ordered))]
         own = self._entangled.identity
-        told = {own.node_id.hex(): self.take(own.public, order)}
+        answers = {own.node_id.hex(): self.take(own.public, order)}
         others = [contact for contact in contacts if contact.node_id != own.node_id]
-        return DeferredList([self._tell(contact, order, told) for contact in others]).addCallback(lambda _: told)
+        return DeferredList([self._send_order(contact, order, answers) for contact in others]).addCallback(
+            lambda _: answers
+        )
 
-    def _tell(self, contact: Contact, order: Statement, told: dict[str, str]) -> Deferred[None]:
+    def _send_order(self, contact: Contact, order: Statement, answers: dict[str, str]) -> Deferred[None]:
         assert self._entangled is not None
 
         def answered(answer: Any) -> None:
-            said = answer[0] if isinstance(answer, list) and answer else ""
-            told[uuid] = said if isinstance(said, str) else ""
+            activity = answer[0] if isinstance(answer, list) and answer else ""
+            answers[uuid] = activity if isinstance(activity, str) else ""
 
         def unanswered(failure: Any) -> None:
             failure.trap(EntangledError)
-            told[uuid] = UNHEARD if failure.check(NoAnswer) else failure.getErrorMessage()
+            answers[uuid] = UNHEARD if failure.check(NoAnswer) else failure.getErrorMessage()
 
         uuid = contact.node_id.hex()
-        asked = self._entangled.call(contact, METHOD, *order.packed(), changes=True)
-        return asked.addCallbacks(answered, unanswered)
+        request = self._entangled.call(contact, METHOD, *order.packed(), changes=True)
+        return request.addCallbacks(answered, unanswered)
 
-    # -- what others order ------------------------------------------------------------------------------------------
+    # -- orders of other nodes --------------------------------------------------------------------------------------
 
     def answer(self, peer: Contact, stops: list[object], released: list[object], by: str) -> Deferred[list[object]]:
-        """Obey what a peer orders; what this node does now, and the stops that it obeys, once they are written."""
+        """Obey a peer's order; fires with the node's activity and the obeyed stops once they are stored."""
         statement = statement_of([stops, released, by])
         if statement is None:
             raise Refused(
-                f"an order has at most {MAX_NAMED} stops [id, by], at most {MAX_RELEASED} ids of {ID_BYTES} bytes"
-                " that it releases, and a name"
+                f"an order must have at most {MAX_NAMED} stops [id, by], at most {MAX_RELEASED} ids of {ID_BYTES} bytes"
+                " to release, and the operator's name"
             )
         assert self._entangled is not None
-        said = self.take(peer.public, statement)
+        activity = self.take(peer.public, statement)
         obeyed = [[stop, by] for stop, by in list(self.stops.items())[-MAX_RELEASED:]]
 
         def saved(_: None) -> list[object]:
-            return [said, obeyed]
+            return [activity, obeyed]
 
         def unsaved(failure: Any) -> list[object]:
             failure.trap(EntangledError)
-            return [said + UNSAVED, obeyed]
+            return [activity + UNSAVED, obeyed]
 
         return self._entangled.store.written().addCallbacks(saved, unsaved)
 
     def take(self, sender: bytes, statement: Statement) -> str:
-        """Merge an order of ``sender``, which may order; what this node does now, in a few words."""
-        return self._settle(self._merge(sender, statement, may_release=True))
+        """Merge an order of ``sender``, which may order; returns a short text about the node's activity."""
+        return self._apply(self._merge(sender, statement, may_release=True))
 
     def _merge(self, sender: bytes, statement: Statement, may_release: bool) -> bool:
         was_stopped = self.is_stopped
@@ -220,59 +226,59 @@ class Halt:
     def _merge_records(self, records: list[Record]) -> None:
         assert self._entangled is not None
         own = self._entangled.identity.public
-        is_new = self._is_in_doubt = False
+        is_new = self._has_doubtful = False
         for record in records:
             statement = None
             if record.name == SLOT and record.value is not None and len(record.value) <= MAX_VALUE:
                 statement = statement_in(record.owner, record.value)
             if statement is None or not self._entangled.replica.may_stay(record.slot):
                 continue
-            # The same right for both ways: the owner has to be one who may call the method.
+            # The same permission as for calls: the owner must be allowed to call the method.
             may_release = record.owner == own or self._entangled.endpoint.door.may(record.owner, METHOD)
-            self._is_in_doubt |= not may_release and bool(statement.released)
+            self._has_doubtful |= not may_release and bool(statement.released)
             is_new |= self._merge(record.owner, statement, may_release)
         if is_new:
-            self._settle(is_new)
+            self._apply(is_new)
 
-    def _learnt(self, records: list[Record]) -> None:
+    def _on_records(self, records: list[Record]) -> None:
         self.is_known, self._is_asking = True, False
         self._merge_records(records)
         self._obey()
 
-    def _unlearnt(self, failure: Any) -> None:
-        """Nobody answered; what needs to know asks again."""
+    def _ignore_unreachable(self, failure: Any) -> None:
+        """Ignore that no node answered; agents call ``learn`` again."""
         failure.trap(EntangledError)
         self._is_asking = False
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
-    def _settle(self, is_new: bool) -> str:
-        """Obey, and keep and publish what is new."""
-        said = self._obey()
+    def _apply(self, is_new: bool) -> str:
+        """Obey, then save and publish changes."""
+        activity = self._obey()
         if is_new:
             self._save()
             self._publish()
             self._review_later()
-        return said
+        return activity
 
     def _obey(self) -> str:
-        said = ", ".join(obey() for obey in self._obeying) or NO_ROBOT
-        self._report(list(self.stops), said if self.is_stopped else "")
-        return said
+        activity = ", ".join(obey() for obey in self._obeying) or NO_ROBOT
+        self._report(list(self.stops), activity if self.is_stopped else "")
+        return activity
 
     def _save(self) -> None:
         if self._entangled is not None:
             self._entangled.store.note(NOTE, msgpack.packb([*self._set.packed(), list(self._ordered)]))
 
     def _restore(self, entangled: EntangledNode) -> None:
-        """Take up the stops of an earlier life; what cannot be read of them is a stop until it is released."""
+        """Load the stops of an earlier run; an unreadable entry counts as a stop until it is released."""
         own, note = entangled.identity.public, entangled.store.noted(NOTE)
         if note is not None:
             try:
                 *fields, ordered = msgpack.unpackb(note)
                 self._set = unpacked(fields)
                 self._ordered = dict.fromkeys(ordered if are_ids(ordered) else ())
-            except Exception:  # a rotten file may hold anything, and the decoder raises many kinds
+            except Exception:  # a corrupt file may have any content, and the decoder raises many kinds of exceptions
                 self._set.merge(own, Statement({derived_id(own, note): "a damaged store"}))
         record = entangled.store.slot(Slot(HALT, own, SLOT))
         written = None if record is None else statement_in(own, record.value)
@@ -283,7 +289,7 @@ class Halt:
             self._save()
 
     def _publish(self) -> None:
-        """Name this node's stops and releases in its record, for those that cannot be told now, or come later."""
+        """Write this node's stops and releases to its record, for devices that are unreachable now or join later."""
         if self._entangled is None:
             return
         own = self._entangled.identity.public
@@ -294,7 +300,7 @@ class Halt:
         value = bounded(msgpack.packb(Statement(stops, released, self._by).packed()))
         before, self._written = self._written, (stops, released)
         try:
-            self._entangled.put(HALT, SLOT, value, "team").addErrback(_unwritten)
+            self._entangled.put(HALT, SLOT, value, "team").addErrback(_ignore_unwritten)
         except NotRunning:
             self._written = before
 
@@ -304,7 +310,7 @@ class Halt:
             self._later(REVIEW * (1.0 + self._rng.random()), self._review)
 
     def _review(self) -> None:
-        """Name a stop that no record names any more, where this node may, and look again later."""
+        """Adopt stops that no record names any longer, if this node may, and check again later."""
         self._is_reviewing = False
         self._adopt()
         self._publish()
@@ -316,10 +322,10 @@ class Halt:
         own = self._entangled.identity.public
         statements = [statement_in(record.owner, record.value) for record in self.records if record.name == SLOT]
         named = {stop for statement in statements if statement is not None for stop in statement.stops}
-        lost = {stop: by for stop, by in self.stops.items() if stop not in named}
-        room = ADOPTED - len(self._set.of(own))
-        if room > 0 and lost and self._may_order():
-            self._settle(self._merge(own, Statement(dict(list(lost.items())[-room:])), may_release=True))
+        orphaned = {stop: by for stop, by in self.stops.items() if stop not in named}
+        free_entries = ADOPTED - len(self._set.of(own))
+        if free_entries > 0 and orphaned and self._may_order():
+            self._apply(self._merge(own, Statement(dict(list(orphaned.items())[-free_entries:])), may_release=True))
 
     def _may_order(self) -> bool:
         assert self._entangled is not None
@@ -327,14 +333,14 @@ class Halt:
 
 
 def answer_halt(entangled: EntangledNode, rng: random.Random, later: Later, report: Report) -> Halt:
-    """The stops as the node ``entangled`` knows them; peers may order stops and releases."""
+    """Create the stops of the node ``entangled`` and let peers order stops and releases."""
     halt = Halt(entangled, rng, later, report)
     entangled.endpoint.expose(METHOD, halt.answer, changes=True, idempotent=True)
     return halt
 
 
 def stops_in(records: list[Record]) -> dict[bytes, str]:
-    """The stops in force by these records alone, id to operator."""
+    """Return the stops in force by these records alone, id to operator."""
     found = StopSet()
     for record in records:
         statement = statement_in(record.owner, record.value) if record.name == SLOT else None
@@ -343,6 +349,6 @@ def stops_in(records: list[Record]) -> dict[bytes, str]:
     return found.in_force
 
 
-def _unwritten(failure: Any) -> None:
-    """Too few hold it just now; its owner brings it to them when they are there."""
+def _ignore_unwritten(failure: Any) -> None:
+    """Ignore that too few replicas are reachable: the owner writes the record again when they are."""
     failure.trap(EntangledError)

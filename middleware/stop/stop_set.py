@@ -1,13 +1,13 @@
-"""StopSet: the stops that a node knows, and the releases that ended some of them.  Pure.
+"""The stops that a node knows, and the releases that ended some of them.  Pure.
 
 A stop has a random id, and a release names the ids of the stops that it ends.  The team is stopped while any stop is
-not released.  Stops and releases are merged as in a two-phase set: in whatever order they arrive, and however often,
-the result is the same, and a released stop does not come back.  No stop outranks another one, so there is no number by
-which a sender could disable later stops.
+not released.  Stops and releases are merged as in a two-phase set: the order and repetition of messages make no
+difference, and a released stop does not return.  Stops have no priority, so a sender cannot disable later stops by a
+high number.
 
-Each sender has places of its own, so no sender can displace the stop of another one.  Where a table is full the node
-stands for longer, never for less: the two oldest stops of a sender are joined to one under an id of its own, which has
-to be released; of the releases the oldest is forgotten, and its stop may have to be released again.
+Each sender has its own entries, so it cannot displace another sender's stops.  If a table is full, the team is stopped
+for longer, never for less: the two oldest stops of a sender are merged into one with a new id, which must be released;
+of the releases the oldest is removed, and its stop may have to be released again.
 """
 
 from __future__ import annotations
@@ -23,26 +23,26 @@ from middleware.entangled.value import is_whole
 
 ID_BYTES = 16
 MAX_NAMED = 8
-"""Stops that one statement names."""
+"""Maximum number of stops in one statement."""
 MAX_OF_SENDER = 16
-"""Stops of one sender that are kept apart."""
+"""Maximum number of separate stops of one sender."""
 MAX_SENDERS = 64
-"""Senders whose stops are kept apart; further ones share the places of one."""
+"""Maximum number of senders with separate stops; further senders share one entry."""
 MAX_RELEASED = 512
-"""Releases that are remembered, and stops that one release may name."""
+"""Maximum number of stored releases, and of stops in one release."""
 MAX_BY = 64
-"""Characters in the name of the operator."""
+"""Maximum characters of the operator's name."""
 BY_BYTES = 48
-"""Bytes of that name in what a node sends: eight stops fit into a record that every device holds."""
+"""Maximum bytes of that name in messages: eight stops fit into a record that every device holds."""
 _SHARED = b""
-"""The sender under which the stops of senders beyond ``MAX_SENDERS`` are kept."""
+"""The sender for the stops of senders beyond ``MAX_SENDERS``."""
 
 
 @dataclass(frozen=True)
 class Statement:
-    """The orders of one sender: its stops (id to operator) that are in force, and the stops that it released.
+    """The orders of one sender: its stops in force (id to operator), and the stops that it released.
 
-    ``by`` is the operator who gave the newest order.
+    ``by`` is the operator of the newest order.
     """
 
     stops: Mapping[bytes, str]
@@ -50,12 +50,12 @@ class Statement:
     by: str = ""
 
     def packed(self) -> list[object]:
-        """The arguments of ``device.halt``, and the value of the record."""
+        """Return the arguments of ``device.halt``, which are also the value of the record."""
         return [[[stop, by] for stop, by in self.stops.items()], list(self.released), self.by]
 
 
 class StopSet:
-    """The stops by sender (a public key), and the ids of released ones; the newest are last."""
+    """The stops by sender (a public key), and the released ids; the newest are last."""
 
     def __init__(self) -> None:
         self._stops: dict[bytes, dict[bytes, str]] = {}
@@ -63,15 +63,15 @@ class StopSet:
 
     @property
     def in_force(self) -> dict[bytes, str]:
-        """The stops that are not released, id to operator; the team goes on where there are none."""
+        """The stops that are not released, id to operator; empty if the team is not stopped."""
         return {stop: by for stops in self._stops.values() for stop, by in stops.items()}
 
     def of(self, sender: bytes) -> dict[bytes, str]:
-        """The stops of ``sender`` that are in force, the newest last."""
+        """Return the stops of ``sender`` that are in force, the newest last."""
         return dict(self._stops.get(sender, {}))
 
     def merge(self, sender: bytes, statement: Statement, may_release: bool = True) -> bool:
-        """Merge what ``sender`` orders, its releases only where it ``may_release``; whether anything is new."""
+        """Merge an order of ``sender``, its releases only if ``may_release``; returns whether anything is new."""
         is_new = False
         for stop in statement.released if may_release else ():
             is_new |= self._release(stop)
@@ -81,7 +81,7 @@ class StopSet:
         return is_new
 
     def packed(self) -> list[object]:
-        """What ``unpacked`` reads."""
+        """Return the encoding for the store."""
         stops = [[sender, [[stop, by] for stop, by in stops.items()]] for sender, stops in self._stops.items()]
         return [stops, list(self._released)]
 
@@ -111,17 +111,17 @@ class StopSet:
 
 
 def derived_id(*parts: bytes) -> bytes:
-    """The id of a stop that has none of its own."""
+    """Return the id of a stop without a random id."""
     return hashlib.blake2s(b"".join(parts), digest_size=ID_BYTES, person=b"stop").digest()
 
 
 def clipped(by: str) -> str:
-    """The name of an operator in at most ``BY_BYTES`` bytes."""
+    """Cut the name of an operator to at most ``BY_BYTES`` bytes."""
     return by.encode(errors="ignore")[:BY_BYTES].decode(errors="ignore")
 
 
 def statement_of(fields: object) -> Statement | None:
-    """The statement that ``packed`` made, or None where the fields cannot be one."""
+    """Decode a statement; None if it is malformed."""
     if not isinstance(fields, list) or len(fields) != 3:
         return None
     stops, released, by = fields
@@ -132,14 +132,14 @@ def statement_of(fields: object) -> Statement | None:
 
 
 def statement_in(owner: bytes, value: bytes | None) -> Statement | None:
-    """The statement in a record of ``owner``, or None where there is none; never raises.
+    """Decode the statement in a record of ``owner``; None if there is none.  Never raises.
 
-    An earlier version wrote ``[number, is on, by]``.  Where that is on it counts as a stop, which a release has to
-    name; where it is off it names no stop, and ends none.
+    Earlier versions wrote ``[number, is on, by]``.  If "is on" is true, it counts as a stop, which must be released by
+    its id; otherwise it has no effect.
     """
     try:
         fields: Any = msgpack.unpackb(value or b"")
-    except Exception:  # the decoder raises many kinds on crafted bytes
+    except Exception:  # the decoder raises many kinds of exceptions on malicious bytes
         return None
     if (
         isinstance(fields, list)
@@ -154,23 +154,23 @@ def statement_in(owner: bytes, value: bytes | None) -> Statement | None:
 
 
 def unpacked(fields: object) -> StopSet:
-    """The set that ``packed`` made; raises ``ValueError`` where the fields cannot be one."""
+    """Decode a set from the store; raises ``ValueError`` if it is malformed."""
     stops, released = fields if isinstance(fields, list) and len(fields) == 2 else (None, None)
     found = StopSet()
     if not isinstance(stops, list) or len(stops) > MAX_SENDERS + 1 or not _are_ids(released):
-        raise ValueError("not a set of stops")
+        raise ValueError("malformed set of stops")
     for entry in stops:
         sender, listed = entry if isinstance(entry, list) and len(entry) == 2 else (None, None)
         of_sender = _stops_of(listed, MAX_OF_SENDER)
         if not isinstance(sender, bytes) or not of_sender:
-            raise ValueError("not the stops of a sender")
+            raise ValueError("malformed stops of a sender")
         found._stops[sender] = of_sender
     found._released = dict.fromkeys(released or ())
     return found
 
 
 def are_ids(values: Iterable[object]) -> bool:
-    """Whether each of ``values`` is the id of a stop."""
+    """Return whether each of ``values`` is a valid id of a stop."""
     return all(isinstance(value, bytes) and len(value) == ID_BYTES for value in values)
 
 

@@ -1,1 +1,1 @@
-"""Tasks, the orders about them, and the councils of nodes that grant their leases."""
+"""Tasks, operators' orders about them, and the quorum members that grant their leases."""

@@ -1,4 +1,4 @@
-"""Councils: those of the tasks of one node, in which it sits, which it asks, and which it has filled up."""
+"""The quorum members of tasks: chooses and replaces them, and creates their clients and this node's acceptor."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from middleware.entangled.record import Slot
 from middleware.tasks.task import TASKS, Task, group_key
 
 LARGE = 50
-"""Members from which on a council has five instead of three."""
+"""Number of contacts from which a task has five quorum members instead of three."""
 SILENT = 10.0
-"""Seconds of silence after which another takes the seat of a council member."""
+"""Seconds without an answer after which a quorum member is replaced."""
 
 
 class Councils:
-    """The councils of tasks, as ``entangled`` reaches them.
+    """The quorum members of tasks, reached through ``entangled``.
 
-    ``born_at`` is when the node began; ``moved`` is told a task whose council has changed, with the new one;
-    ``may_sit`` says whether the holder of a key may be a member of a council.
+    ``born_at`` is the time at which the node started.  ``moved`` is called with a task whose quorum members have
+    changed.  ``may_sit`` returns whether the owner of a key may be a quorum member.
     """
 
     def __init__(
@@ -48,29 +48,32 @@ class Councils:
         self._entangled = entangled
         self._clock = clock
         self._rng = rng
-        self._moved = moved
+        self._on_change = moved
         self._may_sit = may_sit
         self.judge = Judge(self._may_publish)
         self.desk = Desk(entangled.endpoint, entangled.identity, store, clock, born_at, self.judge, self._may_sit)
 
     async def pinned(self, task: Task) -> Task:
-        """A new ``task`` with its council: the nodes closest to its key now (consensus rule 1), signed by this node."""
+        """Return a new ``task`` with its quorum members, which this node signs.
+
+        They are the nodes closest to its key now (consensus rule 1).
+        """
         key = group_key(task.task_id)
         found = await self._entangled.find_node(key)
         candidates = [node for node in [*found, self._entangled.contact] if self._may_sit(node.public)]
-        members = odd(closest(candidates, key, self._seats(task)))
+        members = odd(closest(candidates, key, self._member_count(task)))
         charter = pin(self._entangled.identity, task.task_id, members)
         return replace(task, council=members, charter=charter.packed)
 
     def of(self, task: Task, floor: int = 0) -> Council:
-        """The council of ``task``, asked in this node's name; what is claimed lies above the token ``floor``."""
+        """Return a client for the quorum members of ``task``; its tokens are above ``floor``."""
         ttl = float(task.lease_ttl)
 
         def ask(member: Contact, method: str, arguments: tuple[Any, ...]) -> Deferred[Any]:
             return self.desk.ask(self._entangled.contact, member, method, arguments, ttl / 3)
 
         def moved() -> None:
-            self._moved(task.with_council(council.charter) if council.charter is not None else task)
+            self._on_change(task.with_council(council.charter) if council.charter is not None else task)
 
         pinned = task.task_id, self._entangled.contact.node_id.hex(), ttl, task.council
         read = self.judge.read
@@ -80,31 +83,31 @@ class Councils:
         return council
 
     def lessee(self, task: Task, changed: Callable[[], None], floor: int) -> Lessee:
-        """The claimant of the right to act on ``task``, in this node's name, with tokens above ``floor``."""
+        """Create this node's lease client for ``task``, with tokens above ``floor``."""
         lessee = Lessee(self.of(task, floor), self._clock, self._rng, changed, task.stop_time)
         self.desk.enter(lessee)
         return lessee
 
     def has_vacancy(self, task: Task, council: Council) -> bool:
-        """Whether a seat of ``council`` is empty, or was never taken for want of nodes."""
-        return 0 < len(council.members) < self._seats(task) or bool(council.silent(SILENT))
+        """Return whether a quorum member is silent, or there were too few nodes when they were chosen."""
+        return 0 < len(council.members) < self._member_count(task) or bool(council.silent(SILENT))
 
     async def successors(self, task: Task, council: Council) -> tuple[Contact, ...] | None:
-        """Who should be the council of ``task`` from now on: those of it that are there, and the closest of the others.
+        """Return the next quorum members of ``task``: the present ones that answer, and the closest other nodes.
 
-        None where there is nobody who would make it better.  Fails with ``EntangledError`` where nobody answers.
+        None if that would be no improvement.  Fails with ``EntangledError`` if no node answers.
         """
         key, silent = group_key(task.task_id), council.silent(SILENT)
-        gone = {member.node_id for member in silent}
+        silent_ids = {member.node_id for member in silent}
         nodes = await self._entangled.find_node(key)
-        found = [node for node in nodes if node.node_id not in gone and self._may_sit(node.public)]
+        found = [node for node in nodes if node.node_id not in silent_ids and self._may_sit(node.public)]
         candidates = closest([*found, self._entangled.contact], key, len(found) + 1)
-        return filled(council.members, silent, candidates, self._seats(task))
+        return filled(council.members, silent, candidates, self._member_count(task))
 
     def _may_publish(self, public: bytes, task_id: str) -> bool:
         return self._entangled.replica.may_store(Slot(TASKS, public, task_id))
 
-    def _seats(self, task: Task) -> int:
+    def _member_count(self, task: Task) -> int:
         tolerates = max(task.tolerates, 2 if len(self._entangled.overlay.contacts()) >= LARGE else 1)
         return 2 * tolerates + 1
 
@@ -112,26 +115,26 @@ class Councils:
 def filled(
     members: Sequence[Contact], silent: Sequence[Contact], candidates: Sequence[Contact], size: int
 ) -> tuple[Contact, ...] | None:
-    """The council that should follow that of ``members``, of whom some are ``silent``; None where it may stay.
+    """Return the quorum members that should follow ``members``, of which some are ``silent``; None for no change.
 
-    Who is there stays; ``candidates`` take the other seats in their order, up to ``size``.  A council changes only
-    where more of those that are there could be lost after than before: three for two, but never four for three.
+    Members that answer remain; ``candidates`` fill the other places in order, up to ``size``.  A change must increase
+    the number of answering members that may be lost: three instead of two, but never four instead of three.
     """
-    gone, seated = {member.node_id for member in silent}, {member.node_id for member in members}
-    here = [member for member in members if member.node_id not in gone]
-    others = [one for one in candidates if one.node_id not in seated]
-    following = (*here, *others)[: max(size, len(here))]
+    silent_ids, member_ids = {member.node_id for member in silent}, {member.node_id for member in members}
+    responding = [member for member in members if member.node_id not in silent_ids]
+    others = [one for one in candidates if one.node_id not in member_ids]
+    following = (*responding, *others)[: max(size, len(responding))]
     following = odd(following)
-    if _spare(len(following), len(following)) <= _spare(len(here), len(members)):
+    if _spare(len(following), len(following)) <= _spare(len(responding), len(members)):
         return None
     return following
 
 
 def odd(members: Sequence[Contact]) -> tuple[Contact, ...]:
-    """So many of the first ``members`` that their number is odd: of four no more may be lost than of three."""
+    """Return the first ``members``, an odd number of them: four tolerate no more failures than three."""
     return tuple(members[: len(members) - 1 + len(members) % 2])
 
 
-def _spare(here: int, size: int) -> int:
-    """How many of those that are ``here`` may be lost before no majority of ``size`` is left."""
-    return here - majority(size)
+def _spare(responding: int, size: int) -> int:
+    """Return the number of members ``responding`` that may be lost while the rest is a majority of ``size``."""
+    return responding - majority(size)

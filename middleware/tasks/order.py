@@ -1,4 +1,4 @@
-"""Order: what an operator wants of a task that is under way; a slot of its own under the task's group key."""
+"""An operator's order about a task, pause or resume, in a separate slot under the task's group key."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ WORDS = (PAUSE, RESUME)
 
 @dataclass(frozen=True)
 class Order:
-    """One wish, a word of ``WORDS``; of several the newest holds, by ``at`` in unix seconds of whoever wrote it."""
+    """One order, which is one of ``WORDS``; the newest is valid, by ``at`` (unix seconds on the writer's clock)."""
 
     word: str
     by: str
     at: float
 
     def packed(self) -> bytes:
-        """The value of the order's record."""
+        """Return the value of the order's record."""
         return bounded(bytes(msgpack.packb(vars(self))))
 
 
 def order_of(records: list[Record]) -> Order | None:
-    """The newest order to a group, or None where there was none; every node that holds the same names the same."""
+    """Return the newest order in the records of a group, or None; equal records give the same order at every node."""
     orders = [order for record in records if (order := _order_in(record)) is not None]
     return max(orders, key=lambda order: (order.at, order.word, order.by), default=None)
 

@@ -1,9 +1,9 @@
-"""Tasks: what is to be done, who can do it (Algorithm 4.4), and the record that says so.
+"""Tasks, their requirements (Algorithm 4.4), and their records.
 
-A task is a team record under one key, written once by the node that submits it; each participant writes a slot of its
-own under the task's group key, and the outcome is one more team record there.  So nothing is ever read, changed and
-written back.  What is written by nodes that may not order tasks carries a proof: another council (``COUNCIL``) the
-signatures of the council before it, the end of a task (``DONE``) those of the council that granted the lease.
+A task is a team record under one key, written once by the node that submits it.  Each participant writes its own slot
+under the task's group key, and the outcome is another team record there, so no record is ever changed by two nodes.
+Records of nodes that may not order tasks have a proof: new quorum members (``COUNCIL``) the signatures of the previous
+members, and the end of a task (``DONE``) the signatures of the members that granted the lease.
 """
 
 from __future__ import annotations
@@ -45,30 +45,34 @@ MAX_PRIORITY = 1000
 MAX_CHOICE = 64
 MAX_PLACES = 8
 MAX_WEIGHT = 1e9
-"""What is beyond it is no weight, and no number or place to agree on."""
+"""Upper bound of weights, and of the numbers and coordinates of a value."""
 
 
 def group_key(task_id: str) -> bytes:
-    """The key under which the participants of a task report."""
+    """Return the key under which the participants of a task report."""
     return hashed_key(f"task/{task_id}")
 
 
 @dataclass(frozen=True)
 class Task:
-    """One thing to be done, by one device (``exclusive``), decided by ``strategy``.
+    """A task for one device (``exclusive``), decided by ``strategy``.
 
-    ``requirements`` maps capability names to properties that a device must at least have; ``waiting_period`` is how
-    long the agents wait for each other's reports after the first one, in seconds; ``lease_ttl`` how long the right to
-    act outlives a silent holder; ``hysteresis`` by which share a late report must be better to take the task over;
-    ``council`` are the nodes whose majority grants that right, pinned when the task is made: so many that ``tolerates``
-    of them may be lost at once, where the team has as many; ``configuration`` counts
-    its changes.  ``charter`` is the proof of both (``middleware.consensus.lease.charter``).
-
-    Of several tasks the one with the highest ``priority`` has an agent's body, then the oldest; ``preemptible`` ones
-    are put aside for it and resumed.  ``deadline`` is in seconds after its creation, and ``stall_limit`` in seconds
-    without progress until the right to act is given back (0: none).  ``stop_time`` is how long the robot needs to
-    stand still, ``value`` what the task is worth, ``generation`` rises when an operator makes it anew, and ``group``
-    names the tasks that are divided together.
+    - ``requirements``: capability names and the minimum properties that a device must have
+    - ``waiting_period``: seconds for which agents wait for each other's reports after the first one
+    - ``lease_ttl``: seconds after which the lease of a silent holder expires
+    - ``hysteresis``: the share by which a report must be better than the acting agent's to take over the task
+    - ``council``: the quorum members that grant the lease, fixed when the task is published; if the team is large
+      enough, ``tolerates`` of them may fail at once
+    - ``configuration``: the number of the quorum members' configuration
+    - ``charter``: the proof of the members and their number (``middleware.consensus.lease.charter``)
+    - ``priority``: an agent's robot serves the task with the highest priority first, then the oldest
+    - ``preemptible``: the task is interrupted for one of higher priority, and resumed
+    - ``deadline``: seconds after its creation
+    - ``stall_limit``: seconds without progress after which the lease is released (0: none)
+    - ``stop_time``: seconds that the robot needs to stop
+    - ``value``: the value of the task
+    - ``generation``: increases when an operator creates the task again
+    - ``group``: tasks of one group are assigned together
     """
 
     task_id: str
@@ -96,18 +100,18 @@ class Task:
     charter: bytes = b""
 
     def with_council(self, charter: Charter) -> Task:
-        """This task with the council that ``charter`` names."""
+        """Return this task with the quorum members of ``charter``."""
         return replace(self, council=charter.members, configuration=charter.configuration, charter=charter.packed)
 
     def with_newer_council(self, other: Task) -> Task:
-        """This task with the council of ``other``, where that is a later one of the same task."""
-        mine, its = charter_of(self.charter), charter_of(other.charter)
-        is_newer = mine is not None and its is not None and mine.pin == its.pin and len(mine.links) < len(its.links)
-        return self.with_council(its) if is_newer and its is not None else self
+        """Return this task with the quorum members of ``other``, if these are newer."""
+        own, newer = charter_of(self.charter), charter_of(other.charter)
+        is_newer = own is not None and newer is not None and own.pin == newer.pin and len(own.links) < len(newer.links)
+        return self.with_council(newer) if is_newer and newer is not None else self
 
     def packed(self) -> bytes:
-        """The value of the task's record; what is as usual is left out, and what stands in its charter."""
-        content = _unusual(self)
+        """Return the value of the task's record, without default values and fields that the charter has."""
+        content = _non_default_fields(self)
         if self.charter:
             content.pop("council", None)
             content.pop("configuration", None)
@@ -118,20 +122,22 @@ class Task:
 
 @dataclass(frozen=True)
 class Member:
-    """What one participant reports to the others (its slot under the group key).
+    """One participant's report to the others, in its slot under the group key.
 
-    ``cost`` is the measured distance in metres, or None while it has nothing to report; ``assigned`` the uuid of the
-    agent that it computed as the consensus point; ``digest`` of the reports that it computed it from.
+    - ``cost``: the measured distance in metres, or None if there is nothing to report
+    - ``assigned``: the uuid of the agent that the participant's decision assigned; ``digest``: the digest of the
+      reports used
+    - ``epoch``: the round of the task that report and decision belong to; ``serial``: the number of the report in that
+      round.  Older reports than the newest known are ignored.
+    - ``valid_for``: seconds for which the report is valid (0: while its writer is present); ``age``: the seconds that
+      had passed when it was written
+    - ``available``: whether the robot is free for this task; ``load``: the participant's number of tasks
+    - ``state``: the agent's state (``agents.state``); ``progress``: the share of the task that is done, 0 to 1
+    - ``angle``: its direction as seen from the target; ``post``: the direction it moves to; in radians by the compass
 
-    ``epoch`` is the round of the task that the report and the decision belong to, and ``serial`` the place of the
-    report in it: what is older than something known already is ignored.  A report counts for ``valid_for`` seconds
-    (0: as long as its writer is present), of which ``age`` had passed when it was written.  ``available`` says whether
-    the body is free for this task, ``load`` how many tasks the participant has, ``state`` where exactly it stands
-    (``agents.state``), ``progress`` the share that is done, 0 to 1.  ``angle`` is the direction in which it stands as
-    seen from the target, and ``post`` the one it goes to, in radians by the compass.
-
-    What only some strategies go by: ``battery`` is the share that is left, ``value`` a number or a place to agree on
-    (in metres), ``choice`` a vote, ``weight`` what both count, and ``electorate`` the weight of all that may vote.
+    Fields that only some strategies read: ``battery`` is the charge left, 0 to 1; ``value`` a number or a place to
+    agree on, in metres; ``choice`` a vote; ``weight`` the weight of both; and ``electorate`` the total weight of all
+    that may vote.
     """
 
     uuid: str
@@ -159,15 +165,15 @@ class Member:
     electorate: float = 0.0
 
     def packed(self) -> bytes:
-        """The value of the member's record; what is as usual is left out."""
-        return bounded(bytes(msgpack.packb(_unusual(self))))
+        """Return the value of the member's record, without default values."""
+        return bounded(bytes(msgpack.packb(_non_default_fields(self))))
 
 
 @dataclass(frozen=True)
 class Result:
-    """How a task ended, one of ``OUTCOMES``, and ``why`` where that needs a word.
+    """The outcome of a task, one of ``OUTCOMES``, and ``why``, a reason for display.
 
-    ``bids`` are the reports that decided it, (name, metres) each.
+    ``bids`` are the reports of the decision, (name, metres) each.
     """
 
     outcome: str
@@ -178,17 +184,17 @@ class Result:
     why: str = ""
 
     def packed(self) -> bytes:
-        """The value of the result's record."""
+        """Return the value of the result's record."""
         return bounded(bytes(msgpack.packb(vars(self))))
 
     @property
     def rank(self) -> tuple[int, str, str]:
-        """Of several results the one with the highest rank holds: a total order, so that all agree."""
+        """The sort key: of several results the one with the highest key is valid at every node."""
         return self.token, self.outcome, self.by
 
 
 def refusals(capabilities: Capabilities, requirements: Capabilities) -> list[str]:
-    """Why a device with ``capabilities`` cannot do what ``requirements`` ask; empty where it can (Algorithm 4.4)."""
+    """Return the requirements that ``capabilities`` do not meet, as text; empty if all are met (Algorithm 4.4)."""
     reasons = []
     for name, properties in requirements.items():
         if name not in capabilities:
@@ -197,7 +203,7 @@ def refusals(capabilities: Capabilities, requirements: Capabilities) -> list[str
         for prop, needed in properties.items():
             has = capabilities[name].get(prop)
             if has is None:
-                reasons.append(f"{name} does not say its {prop}")
+                reasons.append(f"{name} has no property {prop}")
             elif isinstance(needed, str) or isinstance(has, str):
                 if has != needed:
                     reasons.append(f"{name} {prop} is {has}, not {needed}")
@@ -207,7 +213,7 @@ def refusals(capabilities: Capabilities, requirements: Capabilities) -> list[str
 
 
 def task_of(record: Record) -> Task | None:
-    """The task in a record, or None where its value is not one."""
+    """Decode the task in a record; None if it is invalid."""
     content = mapping_of(record)
     if content is None:
         return None
@@ -224,7 +230,7 @@ def task_of(record: Record) -> Task | None:
             return None
         task = task.with_council(charter)
     times = (task.waiting_period, task.lease_ttl, task.created, task.deadline, task.stop_time, task.stall_limit)
-    lawful = (
+    is_valid = (
         (bool(task.charter) or len(task.council) == len(council))
         and type(task.tolerates) is int
         and 1 <= task.tolerates <= MAX_TOLERATED
@@ -239,13 +245,13 @@ def task_of(record: Record) -> Task | None:
         and are_capabilities(task.requirements)
         and are_properties(task.parameters)
     )
-    return task if lawful and task.task_id == record.name else None
+    return task if is_valid and task.task_id == record.name else None
 
 
 def tasks_of(records: Iterable[Record]) -> dict[str, Task]:
-    """The tasks in ``records`` by their ids.
+    """Decode the tasks in ``records``, by id.
 
-    Of several records of one task (whoever changes its council writes one more) the newest council's counts.
+    Each change of quorum members adds a record; the one with the newest members is used.
     """
     known = [(task, record.owner) for record in records if (task := task_of(record)) is not None]
     known.sort(key=lambda pair: (pair[0].generation, pair[0].configuration, pair[0].created, pair[1]))
@@ -253,9 +259,9 @@ def tasks_of(records: Iterable[Record]) -> dict[str, Task]:
 
 
 def member_of(record: Record) -> Member | None:
-    """The member report in a record, or None.
+    """Decode the member report in a record, or None.
 
-    A cost that is no finite distance, or is older than it is valid for, counts as "nothing to report".
+    The cost is None if it is invalid or the report has expired.
     """
     content = mapping_of(record)
     if record.name != MEMBER or content is None:
@@ -270,7 +276,7 @@ def member_of(record: Record) -> Member | None:
     texts = (member.uuid, member.name, member.status, member.assigned, member.digest, member.why, member.state)
     counts = (member.token, member.epoch, member.serial, member.load)
     places = (member.progress, member.angle, member.post)
-    lawful = (
+    is_valid = (
         all(isinstance(text, str) for text in texts)
         and all(is_whole(count) for count in counts)
         and all(is_number(number) and number >= 0 for number in (member.age, member.valid_for))
@@ -283,18 +289,18 @@ def member_of(record: Record) -> Member | None:
         and is_weight(member.weight)
         and is_weight(member.electorate)
     )
-    if not lawful or node_id(record.owner).hex() != member.uuid:
-        return None  # nobody reports for another
+    if not is_valid or node_id(record.owner).hex() != member.uuid:
+        return None  # no node reports for another
     return member if is_bid(member.cost) and not is_stale(member, 0.0) else replace(member, cost=None)
 
 
 def is_bid(cost: object) -> bool:
-    """Whether ``cost`` is one that can win: finite, not negative, and no larger than people can be shown."""
+    """Return whether ``cost`` is a valid cost: finite and at least 0."""
     return is_number(cost) and cost >= 0  # type: ignore[operator]
 
 
 def is_value(value: object) -> bool:
-    """Whether ``value`` is a number or a place to agree on: a tuple of finite numbers, none of them enormous."""
+    """Return whether ``value`` is a number or a place to agree on: a tuple of numbers within ``MAX_WEIGHT``."""
     return (
         isinstance(value, tuple)
         and len(value) <= MAX_PLACES
@@ -303,22 +309,22 @@ def is_value(value: object) -> bool:
 
 
 def is_choice(choice: object) -> bool:
-    """Whether ``choice`` is an option that people can be shown, or "" for none."""
+    """Return whether ``choice`` is a printable option, or "" for none."""
     return isinstance(choice, str) and len(choice) <= MAX_CHOICE and choice.isprintable()
 
 
 def is_weight(weight: object) -> bool:
-    """Whether ``weight`` is what a vote or a value may count."""
+    """Return whether ``weight`` is a valid weight of a vote or value."""
     return is_number(weight) and 0.0 <= weight <= MAX_WEIGHT  # type: ignore[operator]
 
 
 def is_stale(member: Member, since: float) -> bool:
-    """Whether a report that came ``since`` seconds ago is older than it is valid for."""
+    """Return whether a report that arrived ``since`` seconds ago has expired."""
     return 0.0 < member.valid_for < member.age + since
 
 
 def result_of(record: Record, most: int = MAX_VALUE) -> Result | None:
-    """The outcome in a record, or None."""
+    """Decode the outcome in a record, or None."""
     content = mapping_of(record, most)
     if record.name != RESULT or content is None:
         return None
@@ -328,7 +334,7 @@ def result_of(record: Record, most: int = MAX_VALUE) -> Result | None:
         result = Result(**content)
     except (TypeError, ValueError):
         return None
-    lawful = (
+    is_valid = (
         result.outcome in OUTCOMES
         and isinstance(result.by, str)
         and is_number(result.took)
@@ -336,19 +342,19 @@ def result_of(record: Record, most: int = MAX_VALUE) -> Result | None:
         and isinstance(result.why, str)
         and all(isinstance(name, str) and is_number(cost) for name, cost in result.bids)
     )
-    return result if lawful else None
+    return result if is_valid else None
 
 
 def done_packed(result: Result, proof: bytes) -> bytes:
-    """The value of the record in which an agent says how the task ended that it held, with the proof that it did."""
+    """Return the value of the record with which an agent reports the end of its task, with the proof of its lease."""
     return bytes(msgpack.packb({**vars(result), "proof": proof}))
 
 
 def outcome_of(task: Task, records: Iterable[Record]) -> Result | None:
-    """How ``task`` ended, or None while it is open; of several results the highest token holds.
+    """Return the outcome of ``task``, or None while it is open; of several results the one with the highest token.
 
-    Those count that were written by who may order tasks (``RESULT``), and those of an agent of which a majority of the
-    council says that it ended the task under its token (``DONE``).
+    A result is valid if a node that may order tasks wrote it (``RESULT``), or an agent with the signatures of a
+    majority of the quorum members for the end under its token (``DONE``).
     """
     results = [
         result
@@ -359,7 +365,7 @@ def outcome_of(task: Task, records: Iterable[Record]) -> Result | None:
 
 
 def council_of(task: Task, records: Iterable[Record]) -> Task:
-    """``task`` with its newest council, as far as the records of its group prove one."""
+    """Return ``task`` with the newest quorum members that the records of its group prove."""
     pinned = charter_of(task.charter)
     newest = pinned
     for record in records:
@@ -377,7 +383,7 @@ def _done(task: Task, record: Record) -> Result | None:
     return _done_of(task.task_id, task.charter, record)
 
 
-@lru_cache(maxsize=64)  # signatures are checked, and the same record is read again and again
+@lru_cache(maxsize=64)  # checking signatures is slow, and the same record is read often
 def _done_of(task_id: str, charter: bytes, record: Record) -> Result | None:
     result = result_of(replace(record, name=RESULT), MAX_DONE)
     pinned, content = charter_of(charter), mapping_of(record, MAX_DONE)
@@ -388,6 +394,6 @@ def _done_of(task_id: str, charter: bytes, record: Record) -> Result | None:
     return result if is_proved else None
 
 
-def _unusual(one: Task | Member) -> dict[str, Any]:
-    """The fields that are not at their default; records are small, and there are many fields."""
+def _non_default_fields(one: Task | Member) -> dict[str, Any]:
+    """Return the fields that differ from their default; most fields of a record do not."""
     return {f.name: value for f in fields(one) if (value := getattr(one, f.name)) != f.default or f.default is MISSING}

@@ -53,7 +53,7 @@ class BehaviourTests(SynchronousTestCase):
         """A kind that nobody knows is refused with the list of those there are."""
         self.assertEqual(
             self.refusal(replace(TASK, kind="fetch")),
-            "no behaviour for a task of kind 'fetch'; there are find-target, turn-around, watch-target",
+            "no behaviour for tasks of kind 'fetch'; known kinds: find-target, turn-around, watch-target",
         )
 
     def test_kind_from_the_wire_is_never_imported(self) -> None:
@@ -68,7 +68,7 @@ class BehaviourTests(SynchronousTestCase):
         every: list[Any] = [{"turns": "x"}, {"turns": -1.0}, {"turns": []}, [], None, 7]
         for parameters in every:
             task = replace(TASK, parameters=parameters)
-            self.assertIn("cannot have these parameters", self.refusal(task))
+            self.assertIn("invalid parameters", self.refusal(task))
 
     def test_missing_vision_names_the_extra(self) -> None:
         """Where OpenCV is not installed a task that needs eyes says what to install."""

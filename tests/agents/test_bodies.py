@@ -156,7 +156,7 @@ class Told:
         told: dict[str, Value] = {"odom.x": 0.0, "odom.y": 0.0, "odom.yaw": 0.0}
         told |= {key.replace("_", "."): value for key, value in values.items()}
         self.behaviour.look(Observation(self.now, self.now, told), self.now)
-        self.behaviour._saw(self.now, self.behaviour._pose, Sighting(bearing, distance, True))
+        self.behaviour._add_sighting(self.now, self.behaviour._pose, Sighting(bearing, distance, True))
 
     def execute(self) -> Action | None:
         """What it does next."""

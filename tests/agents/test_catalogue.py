@@ -39,4 +39,4 @@ class CatalogueTests(SynchronousTestCase):
     def test_unknown_name_lists_the_known(self) -> None:
         """A task that is not predefined is refused with those that are."""
         error = self.assertRaises(UnknownTask, task_named, "dance", "t1", 0.0)
-        self.assertIn("'dance'; there are fetch-the-ball, find-red-target, turn-around, watch-target", str(error))
+        self.assertIn("'dance'; known tasks: fetch-the-ball, find-red-target, turn-around, watch-target", str(error))

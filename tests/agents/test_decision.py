@@ -83,7 +83,7 @@ class DecisionTests(SynchronousTestCase):
         """Without any report nobody is assigned, however long it takes."""
         for members in ([], [member("a", None)]):
             decision = decided(*members, since=None)
-            self.assertEqual((decision.assigned, decision.why), (None, "nobody has reported yet"))
+            self.assertEqual((decision.assigned, decision.why), (None, "no agent has reported yet"))
 
     def test_acting_member_keeps_the_task_within_the_hysteresis(self) -> None:
         """Whoever acts goes on when another is nearer by less than the hysteresis, and gives way to a better one."""

@@ -77,7 +77,7 @@ class DivisionTests(SynchronousTestCase):
         costs: Costs = {"t1": {"a": 1.0, "b": 2.0}, "t2": {"a": 1.5, "b": 5.0}}
         first = self.decided(costs)
         self.assertEqual(first["t1"].digest, first["t2"].digest)
-        self.assertEqual(first["t1"].why, "dog-b, 2.00, divided with 1 other among 2")
+        self.assertEqual(first["t1"].why, "dog-b, 2.00, assigned with 1 other task among 2 agents")
         costs["t2"]["b"] = 6.0
         other = self.decided(costs)
         self.assertNotEqual(first["t1"].digest, other["t1"].digest)
@@ -90,7 +90,7 @@ class DivisionTests(SynchronousTestCase):
         """What nobody is left for waits, and the reason says so."""
         found = self.decided({"t1": {"a": 1.0}, "t2": {"a": 2.0}})
         self.assertEqual((found["t1"].assigned, found["t2"].assigned), ("a", None))
-        self.assertEqual(found["t2"].why, "everybody who bid for it has enough to do")
+        self.assertEqual(found["t2"].why, "all bidders have reached their capacity")
 
     def test_who_acts_counts_for_its_task_alone(self) -> None:
         """Whoever acts on a task is given no other, however near it is, and a free one takes what is left."""

@@ -250,7 +250,7 @@ class EngagementTests(SynchronousTestCase):
         self.hear(self.report(2, 0.5))
         self.assertEqual(self.step().action, HOLD)
         self.assertEqual(self.events, ["halted", "released"])
-        self.assertIn("gives the task back", self.said)
+        self.assertIn("releases the task", self.said)
 
     def test_who_stands_by_keeps_its_place(self) -> None:
         """Who only waits, and holds nothing, stays in the line from its first step on and never goes to its end."""
@@ -401,7 +401,7 @@ class EngagementTests(SynchronousTestCase):
         self.step()
         self.council.grant(6)
         self.assertEqual(self.step().action, GO)
-        self.assertEqual(self.said[-3:], ["resumed by vaio", "reports 0.90 m", "goes: dog1, 0.90, best of 2"])
+        self.assertEqual(self.said[-3:], ["resumed by vaio", "reports 0.90 m", "acts: dog1, 0.90, best of 2"])
 
     def test_lease_is_kept_while_the_outcome_is_on_its_way(self) -> None:
         """A pause or another task that comes between the deed and its record does not give the lease to another."""
@@ -506,7 +506,7 @@ class EngagementTests(SynchronousTestCase):
         self.see(1.0)
         self.step()
         self.step()
-        faults = [line for line in self.said if "broken" in line and not line.startswith("stands")]
+        faults = [line for line in self.said if "broken" in line and not line.startswith("standby")]
         self.assertEqual(faults, ["broken has no opinion (ZeroDivisionError: no luck); nearest: 0.50, least of 2"])
         self.assertEqual(self.engagement.me.assigned, self.others[2].node_id.hex())
         self.assertEqual(len(self.flushLoggedErrors(ZeroDivisionError)), 1)

@@ -113,8 +113,8 @@ class ExplorationTests(SynchronousTestCase):
             exploration.bumped((0.1, 0.0, 2.0))
             for n in range(70):
                 exploration.saw((0.0, 0.0, math.remainder(n * 0.1, math.tau)), 0.1 if n else 0.0, math.nan)
-            self.assertGreater(abs(math.remainder(exploration._most_open((0.0, 0.0, 0.0)) - 2.0, math.tau)), 1.0)
-        far = {round(exploration._most_open((3.0, 0.0, 0.0))) for _ in range(200)}
+            self.assertGreater(abs(math.remainder(exploration._choose_heading((0.0, 0.0, 0.0)) - 2.0, math.tau)), 1.0)
+        far = {round(exploration._choose_heading((3.0, 0.0, 0.0))) for _ in range(200)}
         self.assertIn(2, far)
 
     def walks_at(self, exploration: Exploration, yaw: float) -> bool:

@@ -171,5 +171,5 @@ class GuardedTests(SynchronousTestCase):
         self.assertEqual(made.cost, 1.5)
         for kind in ("deployed:best", "deployed:other"):
             error = self.assertRaises(UnknownTask, behaviour_for, Task("t", kind, ""), random.Random(1), deployed)
-            self.assertIn("there are deployed:spin", str(error))
+            self.assertIn("deployed: deployed:spin", str(error))
         self.assertRaises(UnknownTask, behaviour_for, Task("t", "deployed:spin", ""), random.Random(1))

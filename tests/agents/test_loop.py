@@ -55,7 +55,7 @@ class LoopTests(SynchronousTestCase):
         self.team.desk.watch(uuid, lambda seq, jpeg, age: ages.append(age) if jpeg == b"seen" else None)
         self.team.clock.advance(0.2)
         frame = Frame(900, 1, 1, b"seen", 4.7)
-        agent._seen(Observation(self.team.clock.seconds() - 0.2, 5.0, {}, {}, frame))
+        agent._on_observation(Observation(self.team.clock.seconds() - 0.2, 5.0, {}, {}, frame))
         self.team.clock.advance(0.05)
         (age,) = ages
         self.assertLess(abs(age - 0.5), 0.01)
@@ -167,9 +167,9 @@ class LoopTests(SynchronousTestCase):
     def test_task_without_a_behaviour_is_left_and_said(self) -> None:
         """A task of an unknown kind, or with odd parameters, leaves a line on the device, and the next task is done."""
         self.submit(kind="os:system")
-        self.assertIn("no behaviour for a task of kind 'os:system'", self.lines("dog1")[-1])
+        self.assertIn("no behaviour for tasks of kind 'os:system'", self.lines("dog1")[-1])
         self.submit(task_id="t2", created=1.0, kind="find-target", parameters={"target_radius": 0.0})
-        self.assertIn("cannot have these parameters", self.lines("dog1")[-1])
+        self.assertIn("invalid parameters", self.lines("dog1")[-1])
         self.submit(task_id="t3", created=2.0)
         self.team.clock.advance(8.0)
         states = {each["id"]: each["status"] for each in self.team.state()["tasks"]}
@@ -183,7 +183,7 @@ class LoopTests(SynchronousTestCase):
         for odd in (task, replace(task, task_id="t2", created=1.0, strategy="loudest")):
             node.entangled.put(TASKS, odd.task_id, odd.packed(), "team")
             self.team.clock.advance(1.0)
-            self.assertIn(f"no strategy is called {odd.strategy!r}", self.lines("dog1")[-1])
+            self.assertIn(f"unknown strategy {odd.strategy!r}", self.lines("dog1")[-1])
 
     def test_old_task_that_is_done_is_not_begun_again(self) -> None:
         """A dog that comes after the end of a task does not take it up."""

@@ -18,7 +18,7 @@ class RegistryTests(SynchronousTestCase):
     def test_unknown_agent_is_refused_with_the_known(self) -> None:
         """A name that is no agent is refused with those there are."""
         error = self.assertRaises(UnknownAgent, agent_named, "serch")
-        self.assertEqual(str(error), "no agent is called 'serch'; there are search, or write module:Class")
+        self.assertEqual(str(error), "unknown agent 'serch'; use search, or module:Class")
 
     def test_agent_that_cannot_be_loaded_says_why(self) -> None:
         """A module or class that is not there is named."""

@@ -90,7 +90,7 @@ def why() -> dict[str, Any]:
         "differ": [],
         "rule": "nearest",
         "version": "1",
-        "hysteresis": "nobody acted before",
+        "hysteresis": "no agent acted before",
         "standby": ["dog1"],
         "digest": "1a2b3c4d",
         "agreed": "",

@@ -84,6 +84,6 @@ class StrategiesTests(SynchronousTestCase):
         late.stop()
         self.assertIn("it was stopped", early.named("spare", {}).find([Report("a", 1.0)]).reason)
         error = self.assertRaises(UnknownStrategy, late.named, "spare", {})
-        self.assertIn("after its node has left", str(error))
+        self.assertIn("the node has stopped", str(error))
         self.assertEqual((len(self.processes), self.alive), (1, 0))
         self.flushLoggedErrors()

@@ -89,7 +89,7 @@ class WorkerTests(SynchronousTestCase):
     def loaded(self, guard: Guard) -> Consensus:
         """What it finds as soon as its process has begun."""
         end = time.monotonic() + PATIENCE
-        while "still being loaded" in (found := guard.find(TEAM)).reason and time.monotonic() < end:
+        while "still loading" in (found := guard.find(TEAM)).reason and time.monotonic() < end:
             pass
         self.flushLoggedErrors()
         return found
@@ -116,11 +116,11 @@ class WorkerTests(SynchronousTestCase):
         guard = self.guard("Looping", DEADLINE_S)
         worst = 0.0
         end = time.monotonic() + PATIENCE
-        while "asked no more" not in guard.find(TEAM).reason and time.monotonic() < end:
+        while "not called again" not in guard.find(TEAM).reason and time.monotonic() < end:
             began = time.monotonic()
             self.assertEqual(guard.find(TEAM).assigned_agent, "b")
             worst = max(worst, time.monotonic() - began)
-        self.assertIn(f"no answer {STRIKES} times", guard.find(TEAM).reason)
+        self.assertIn(f"no result {STRIKES} times", guard.find(TEAM).reason)
         self.assertLess(worst, PATIENCE / STRIKES)
         self.assertIsNone(guard.strategy._process)  # type: ignore[attr-defined]
         self.flushLoggedErrors()

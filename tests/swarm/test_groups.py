@@ -125,7 +125,7 @@ class GroupTests(TeamCase):
         team = self.busy_team(("dog1", "dog2"))
         self.until(team, lambda: len(self.began) == 2)
         (left,) = set(TASKS) - set(self.began)
-        self.assertIn("everybody who bid for it has enough to do", {m.why for m in self.members(team, left)})
+        self.assertIn("all bidders have reached their capacity", {m.why for m in self.members(team, left)})
         team.add("dog3")
         self.until(team, lambda: left in self.began)
         self.assertEqual(self.began[left], ["dog3"])

@@ -125,8 +125,8 @@ class DeployTests(SynchronousTestCase):
         self.assertNotIn("farthest", self.messages("dog3"))
         self.assertIn("dog3  -", self.swarm("status"))
         self.verdicts("deployed:farthest", 2.0)
-        self.assertIn("no strategy 'deployed:farthest' here", self.messages("dog3"))
-        self.assertNotIn("no strategy", self.messages("dog1"))
+        self.assertIn("strategy 'deployed:farthest' is not deployed on this node", self.messages("dog3"))
+        self.assertNotIn("is not deployed", self.messages("dog1"))
 
     def test_rollback_and_next_version(self) -> None:
         """The operator's word takes version 2 back; an older word changes nothing; version 3 comes after both."""

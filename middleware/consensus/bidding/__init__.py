@@ -1,4 +1,5 @@
-"""How bids for one task reach its council, and how the announcement comes back: ``direct``, ``tree``, ``flood``.
+"""Bidding.
 
-``auctions`` runs on a node's endpoint; everything else here is pure.
+Bids for a task travel to its quorum members (``direct``, ``tree`` or ``flood``) and an announcement returns.
+``auctions`` uses a node's endpoint; all other modules are pure.
 """

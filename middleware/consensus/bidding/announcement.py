@@ -1,7 +1,8 @@
-"""Announcement: what one member of the council says has come in, signed by it; pure.
+"""Announcements: the best bids of an auction, signed by one quorum member; pure.
 
-It need not be right: it says who should act, and who may is decided elsewhere.  Of two the one with the higher number
-holds, of equal numbers the one of the member that stands earlier in the council.
+An announcement may be wrong without harm: it influences which agent should act, but only a lease gives the right to
+act.  Of two announcements the one with the higher number is valid; of equal numbers the one by the member with the
+lower rank.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from middleware.entangled.value import is_whole
 
 @dataclass(frozen=True)
 class Entry:
-    """One report that stands, and which of its agent's bids it is."""
+    """One report that stands, and the revision of its bid."""
 
     report: Report
     revision: int = 0
@@ -29,7 +30,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Announcement:
-    """What the member at place ``rank`` of the council announces as its ``number``-th word, from 1 on."""
+    """The ``number``-th announcement, from 1, of the quorum member with this ``rank``."""
 
     number: int
     rank: int
@@ -38,7 +39,7 @@ class Announcement:
 
     @property
     def precedence(self) -> tuple[int, int]:
-        """Of two announcements the one with more precedence holds."""
+        """The sort key: of two announcements the one with the higher key is valid."""
         return self.number, -self.rank
 
     @property
@@ -47,17 +48,17 @@ class Announcement:
         return tuple(entry.report for entry in self.entries)
 
     def signed(self, sign: Callable[[bytes], bytes], auction: Auction) -> Announcement:
-        """This announcement with the signature that ``sign`` makes, for ``auction``."""
+        """Return this announcement with the signature of ``sign`` for ``auction``."""
         return replace(self, signature=sign(self._signed_bytes(auction)))
 
     def is_genuine(self, auction: Auction) -> bool:
-        """Whether a member of the council pinned in ``auction`` signed exactly this, for this auction."""
+        """Return whether a quorum member of ``auction`` signed exactly this announcement for it."""
         if self.rank >= len(auction.council):
             return False
         return verified(auction.council[self.rank].public, self._signed_bytes(auction), self.signature)
 
     def packed(self) -> list[object]:
-        """The announcement as it stands in a message."""
+        """Return the encoding for messages."""
         return [self.number, self.rank, self._packed_entries(), self.signature]
 
     def _packed_entries(self) -> list[object]:
@@ -69,7 +70,7 @@ class Announcement:
 
 
 def announcement_of(content: object) -> Announcement | None:
-    """The announcement that ``packed`` made, or None where it cannot be one; never raises."""
+    """Decode an announcement; None if it is malformed.  Never raises."""
     if not isinstance(content, list) or len(content) != 4:
         return None
     number, rank, packed, signature = content

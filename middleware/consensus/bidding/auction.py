@@ -1,7 +1,7 @@
-"""Auction: one round of bidding for one task, as its messages name it; pure.
+"""Auctions: one round of bidding for one task; pure.
 
-It travels in the head of each message, so that a node on the way needs no record of the task, and each bid is signed
-together with it: nobody can carry a bid over to another task, epoch, strategy or council.
+Each message starts with its auction, so that forwarding nodes need no record of the task.  Each bid is signed together
+with its auction, so that no node can reuse it for another task, epoch, strategy or quorum.
 """
 
 from __future__ import annotations
@@ -23,9 +23,10 @@ MAX_WAITING = 600.0
 
 @dataclass(frozen=True)
 class Auction:
-    """The bidding for ``task_id`` in ``epoch``, decided by ``strategy`` and announced by one of ``council``.
+    """The bidding for ``task_id`` in ``epoch``, decided by ``strategy`` and announced by a member of ``council``.
 
-    ``waiting`` is the waiting period in seconds, counted from the first bid; an ``exclusive`` one is never flooded.
+    ``waiting`` is the waiting period in seconds from the first bid; the bids of an ``exclusive`` auction are never
+    flooded.
     """
 
     task_id: str
@@ -37,33 +38,33 @@ class Auction:
 
     @cached_property
     def key(self) -> bytes:
-        """Where in the ring of ids the bids are going: the key of the task's group."""
+        """The id in the key space to which bids travel: the key of the task's group."""
         return hashed_key(f"task/{self.task_id}")
 
     @cached_property
     def digest(self) -> bytes:
-        """What tells this auction from every other, in 16 bytes."""
+        """A unique identifier of this auction, 16 bytes."""
         return hashlib.blake2s(msgpack.packb(self.packed()), digest_size=16).digest()
 
     def rank(self, node_id: bytes) -> int | None:
-        """The place of a node in the council, 0 for its first member, or None where it is no member."""
+        """Return a node's index among the quorum members, or None if it is not a member."""
         return next((place for place, member in enumerate(self.council) if member.node_id == node_id), None)
 
     def packed(self) -> list[object]:
-        """The auction as it stands in a message."""
+        """Return the encoding for messages."""
         council = [contact.packed() for contact in self.council]
         return [self.task_id, self.epoch, council, self.strategy, float(self.waiting), self.exclusive]
 
 
 def auction_of(fields: object) -> Auction | None:
-    """The auction that ``packed`` made, or None where the fields cannot be one; never raises."""
+    """Decode an auction; None if it is malformed.  Never raises."""
     if not isinstance(fields, list) or len(fields) != 6:
         return None
     task_id, epoch, council, strategy, waiting, exclusive = fields
     if not isinstance(council, list) or not 0 < len(council) <= MAX_COUNCIL:
         return None
     members = [contact for each in council if (contact := unpacked(each)) is not None]
-    lawful = (
+    is_valid = (
         isinstance(task_id, str)
         and 0 < len(task_id) <= MAX_NAME
         and is_whole(epoch)
@@ -74,4 +75,4 @@ def auction_of(fields: object) -> Auction | None:
         and 0 <= waiting <= MAX_WAITING
         and isinstance(exclusive, bool)
     )
-    return Auction(task_id, epoch, tuple(members), strategy, float(waiting), exclusive) if lawful else None
+    return Auction(task_id, epoch, tuple(members), strategy, float(waiting), exclusive) if is_valid else None

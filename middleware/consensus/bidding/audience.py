@@ -1,4 +1,4 @@
-"""Audience: those who offered bids to this node and are owed what is announced; pure."""
+"""The nodes that offered bids to this node and receive its announcements; pure."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from middleware.consensus.bidding.errand import Notice
 from middleware.entangled.contact import Contact
 
 MAX_LISTENERS = 1024
-"""Beyond it the one that came first goes; it will ask by itself."""
+"""Maximum number of listeners; the oldest is removed, and asks for the announcement itself."""
 PAUSES = (0.0, 1.0, 2.0, 4.0)
-"""Seconds after each failed errand until the next; after the last a listener is left to ask by itself."""
+"""Seconds after each failed message until the next; after the last one a listener must ask itself."""
 NOTHING = (0, 0)
 
 
 @dataclass
 class _Listener:
-    """``knows`` is the precedence of the last announcement that it has confirmed."""
+    """``knows`` is the precedence of the last announcement that the listener has confirmed."""
 
     contact: Contact
     is_shared: bool
@@ -31,8 +31,8 @@ class _Listener:
 class Audience:
     """The listeners of one node in one auction.
 
-    One that is shared with the rest of the council hears an announcement from the member who made it, the others hear
-    all of them from here.
+    A listener that is shared with the other quorum members receives an announcement from the member that made it; the
+    others receive all announcements from this node.
     """
 
     def __init__(self) -> None:
@@ -42,17 +42,17 @@ class Audience:
         return len(self._listeners)
 
     def has(self, contact: Contact) -> bool:
-        """Whether ``contact`` is one of them."""
+        """Return whether ``contact`` is a listener."""
         return contact.node_id in self._listeners
 
     @property
     def is_shared(self) -> bool:
-        """Whether most listeners are shared, as where every bidder tells the whole council."""
+        """Whether most listeners are shared, as in a small team, in which every bidder sends to all quorum members."""
         shared = sum(1 for listener in self._listeners.values() if listener.is_shared)
         return 2 * shared > len(self._listeners)
 
     def add(self, contact: Contact, is_shared: bool = False) -> None:
-        """Let ``contact`` hear what is announced; it has shown that it lives."""
+        """Add ``contact`` as a listener, or update it; it is reachable at present."""
         known = self._listeners.get(contact.node_id)
         if known is not None:
             known.contact, known.failures, known.ask_at = contact, 0, 0.0
@@ -63,18 +63,18 @@ class Audience:
         self._listeners[contact.node_id] = _Listener(contact, is_shared)
 
     def knows(self, contact: Contact, announcement: Announcement) -> None:
-        """Take note that a listener has this announcement."""
+        """Record that a listener has this announcement."""
         listener = self._listeners.get(contact.node_id)
         if listener is not None:
             listener.knows = max(listener.knows, announcement.precedence)
 
     def due(self, announcement: Announcement | None, is_mine: bool) -> float:
-        """When somebody is owed something."""
+        """Return the time of the next message to a listener."""
         owed = self._owed(announcement, is_mine)
         return min((listener.ask_at for listener in owed), default=math.inf)
 
     def notices(self, announcement: Announcement | None, is_mine: bool, now: float) -> list[Notice]:
-        """What is owed now; nobody is owed two things at once."""
+        """Return the messages that are due now, at most one per listener."""
         out = []
         for listener in self._owed(announcement, is_mine):
             if announcement is not None and listener.ask_at <= now:
@@ -83,14 +83,14 @@ class Audience:
         return out
 
     def answered(self, notice: Notice) -> None:
-        """Take note that a listener confirmed."""
+        """Record that a listener confirmed the announcement."""
         listener = self._listeners.get(notice.to.node_id)
         if listener is not None:
             listener.is_asked, listener.failures, listener.ask_at = False, 0, 0.0
         self.knows(notice.to, notice.announcement)
 
     def failed(self, notice: Notice, now: float) -> None:
-        """Take note that a listener did not answer."""
+        """Record that a listener did not answer."""
         listener = self._listeners.get(notice.to.node_id)
         if listener is not None:
             listener.is_asked = False
@@ -99,7 +99,7 @@ class Audience:
             listener.failures += 1
 
     def _owed(self, announcement: Announcement | None, is_mine: bool) -> list[_Listener]:
-        """The listeners that do not know ``announcement`` and are not being told it."""
+        """Return the listeners that do not know ``announcement`` and have no message under way."""
         if announcement is None:
             return []
         return [

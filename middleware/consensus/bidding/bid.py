@@ -1,7 +1,7 @@
-"""Bid: one agent's report for one auction, signed by the agent itself; pure.
+"""Bids: one agent's report for one auction, signed by the agent; pure.
 
-Whoever carries it may drop it or hold it back, but cannot change it.  A later bid of the same agent has a higher
-revision and takes the place of the earlier; one without a report takes it back.
+A forwarding node may drop or delay a bid, but cannot change it.  A later bid of the same agent has a higher revision
+and replaces the earlier one; a bid without a report withdraws it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _DEFAULTS = {f.name: f.default for f in fields(Report) if f.default is not MISSI
 
 @dataclass(frozen=True)
 class Bid:
-    """What the holder of ``public`` reports, or None where it takes its bid back."""
+    """The report of the agent with the key ``public``, or None if it withdraws its bid."""
 
     public: bytes
     report: Report | None
@@ -40,20 +40,20 @@ class Bid:
 
     @cached_property
     def rank(self) -> tuple[int, bytes]:
-        """Of two bids of one agent the one with the higher rank holds, also where the agent says two things at once."""
+        """The sort key: of two bids of one agent the higher one is valid, even if both have the same revision."""
         content = msgpack.packb(packed_report(self.report))
         return self.revision, hashlib.blake2s(content, digest_size=8).digest()
 
     def signed(self, identity: Identity, auction: Auction) -> Bid:
-        """This bid with its owner's signature for ``auction``."""
+        """Return this bid with its agent's signature for ``auction``."""
         return replace(self, signature=identity.sign(self._signed_bytes(auction)))
 
     def is_genuine(self, auction: Auction) -> bool:
-        """Whether its owner signed exactly this, for exactly this auction."""
+        """Return whether its agent signed exactly this bid for this auction."""
         return verified(self.public, self._signed_bytes(auction), self.signature)
 
     def packed(self) -> list[object]:
-        """The bid as it stands in a message; the agent's uuid follows from the key."""
+        """Return the encoding for messages; the agent's uuid is derived from the key."""
         return [self.public, packed_report(self.report), self.revision, self.signature]
 
     def _signed_bytes(self, auction: Auction) -> bytes:
@@ -61,25 +61,25 @@ class Bid:
 
 
 def bid_of(content: object) -> Bid | None:
-    """The bid that ``packed`` made, or None where it cannot be one; never raises."""
+    """Decode a bid; None if it is malformed.  Never raises."""
     if not isinstance(content, list) or len(content) != 4:
         return None
     public, packed, revision, signature = content
-    lawful = (
+    is_valid = (
         isinstance(public, bytes)
         and len(public) == 32
         and is_whole(revision)
         and isinstance(signature, bytes)
         and len(signature) == 64
     )
-    if not lawful:
+    if not is_valid:
         return None
     report = None if packed is None else report_of(packed, node_id(public).hex())
     return Bid(public, report, revision, signature) if packed is None or report is not None else None
 
 
 def packed_report(report: Report | None) -> dict[str, object] | None:
-    """What a report says beyond its agent; what is as usual is left out."""
+    """Encode a report without its agent; fields with their default value are left out."""
     if report is None:
         return None
     content = {f.name: getattr(report, f.name) for f in fields(report) if f.name != "agent"}
@@ -87,35 +87,35 @@ def packed_report(report: Report | None) -> dict[str, object] | None:
 
 
 def report_of(content: object, agent: str) -> Report | None:
-    """The report of ``agent`` in what ``packed_report`` made, or None; a cost that is no finite distance is none."""
+    """Decode the report of ``agent``; None if it is malformed or its cost is invalid."""
     if not isinstance(content, Mapping) or not is_cost(content.get("cost")):
         return None
-    others: dict[str, Any] = {name: _as_sent(value) for name, value in content.items() if name != "cost"}
+    others: dict[str, Any] = {name: _from_wire(value) for name, value in content.items() if name != "cost"}
     for name, value in others.items():
-        usual = _DEFAULTS.get(name, MISSING)
-        if usual is MISSING or not _is_like(value, usual):
+        default = _DEFAULTS.get(name, MISSING)
+        if default is MISSING or not _matches_type(value, default):
             return None
-    # Numbers stay as they came: the signature is over their bytes.
+    # Numbers keep their type, because the signature is over the encoded bytes.
     return Report(agent, content["cost"], **others)
 
 
 def is_cost(value: object) -> bool:
-    """Whether ``value`` is what acting may cost: finite, not negative, not enormous."""
+    """Return whether ``value`` is a valid cost: a finite number of at least 0, within the limit."""
     return is_number(value) and value >= 0  # type: ignore[operator]
 
 
-def _as_sent(value: object) -> object:
-    """What was packed: a tuple travels as a list."""
+def _from_wire(value: object) -> object:
+    """Return the value before encoding: tuples are encoded as lists."""
     return tuple(value) if isinstance(value, list) else value
 
 
-def _is_like(value: object, usual: object) -> bool:
-    """Whether a field that is usually ``usual`` may have ``value``."""
+def _matches_type(value: object, default: object) -> bool:
+    """Return whether ``value`` is valid for a field with the default ``default``."""
     if isinstance(value, tuple):
-        return isinstance(usual, tuple) and len(value) <= MAX_ITEMS and all(map(_is_item, value))
-    if isinstance(usual, float):
+        return isinstance(default, tuple) and len(value) <= MAX_ITEMS and all(map(_is_item, value))
+    if isinstance(default, float):
         return is_number(value)
-    return type(value) is type(usual) and (isinstance(value, bool) or _is_item(value))
+    return type(value) is type(default) and (isinstance(value, bool) or _is_item(value))
 
 
 def _is_item(value: object) -> bool:

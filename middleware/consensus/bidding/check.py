@@ -1,7 +1,8 @@
-"""How a bidder reaches the council: directly in a small team, and by a check that its bid counted; pure.
+"""The bidder's side: send bids directly to the quorum members of a small team, and check that a bid was counted; pure.
 
-Trees lose whole branches with the node that holds them.  So a bidder that is announced nothing asks the council
-itself, and one whose bid should have changed what was announced sends it there within half the waiting period.
+If a forwarding node of a tree fails, all bids of its subtree are lost.  So a bidder that receives no announcement asks
+a quorum member, and a bidder whose bid should have changed the announcement sends the bid there, within half the
+waiting period.
 """
 
 from __future__ import annotations
@@ -17,17 +18,17 @@ from middleware.consensus.bidding.rule import Rule
 from middleware.entangled.contact import Contact
 
 SILENCE = 0.6
-"""Seconds after the waiting period within which the announcement comes down a tree of 10,000, losses included."""
+"""Seconds after the waiting period in which an announcement reaches all of 10,000 nodes, with packet loss."""
 SPREAD = 0.25
-"""Share of the waiting period over which the questions of many are spread."""
+"""Share of the waiting period over which the requests of many nodes are spread at random."""
 LEAST_PAUSE, MOST_PAUSE = 0.5, 10.0
-"""Seconds between two questions of one bidder, at least and, while nobody answers, at most."""
+"""Minimum and maximum seconds between two requests of one bidder; the maximum applies while no member answers."""
 MAX_RELAYED = 3
-"""Questions of a node that only has others' bids."""
+"""Maximum requests of a node that only forwards bids."""
 
 
 class Check:
-    """The own bid of one node and whether it counted; of a node that only has others' bids, whether it was told."""
+    """Checks that the own bid of one node was counted, or that a forwarding node received the announcement."""
 
     def __init__(self, auction: Auction, own_id: bytes, rule: Rule, rng: random.Random) -> None:
         self.own: Bid | None = None
@@ -36,43 +37,43 @@ class Check:
         self._members = [member for member in auction.council if member.node_id != own_id]
         self._rule = rule
         self._rng = rng
-        self._ask_at = math.inf
-        self._is_asked = False
+        self._request_at = math.inf
+        self._is_under_way = False
         self._is_strict = False
         self._relayed = 0
 
     @property
     def due(self) -> float:
-        """When there is something to ask."""
-        return math.inf if self._is_asked or not self._members else self._ask_at
+        """The time of the next request."""
+        return math.inf if self._is_under_way or not self._members else self._request_at
 
     @property
     def is_alone(self) -> bool:
-        """Whether every member of the council, one after the other, did not answer."""
+        """Whether all quorum members in turn did not answer."""
         return self.failures >= len(self._members) > 0
 
     def bid(self, bid: Bid, announcement: Announcement | None, is_strict: bool, now: float) -> None:
-        """Watch over ``bid``; with ``is_strict`` also where it changes only who stands by."""
+        """Check ``bid`` from now on; with ``is_strict`` also if it changes only the standbys."""
         self.own, self._is_strict = bid, is_strict
         if announcement is None:
-            if self._ask_at == math.inf:
+            if self._request_at == math.inf:
                 self.expect(now, SILENCE)
         elif not self.is_counted(announcement):
-            self._ask_from(now + self._auction.waiting * SPREAD)
+            self._request_from(now + self._auction.waiting * SPREAD)
 
     def expect(self, since: float, silence: float) -> None:
-        """Expect an announcement ``silence`` seconds after the waiting period that began at ``since``."""
+        """Expect an announcement ``silence`` seconds after the waiting period that started at ``since``."""
         waiting = self._auction.waiting
-        self._ask_from(since + waiting + silence)
+        self._request_from(since + waiting + silence)
 
     def heard(self, announcement: Announcement, now: float) -> None:
-        """Compare what is announced with the own bid."""
-        self._ask_at = math.inf
+        """Compare an announcement with the own bid."""
+        self._request_at = math.inf
         if not self.is_counted(announcement):
-            self._ask_from(now)
+            self._request_from(now)
 
     def is_counted(self, announcement: Announcement) -> bool:
-        """Whether the own bid, if there is one, is in the announcement, or would not have changed it."""
+        """Return whether the own bid is in the announcement, would not change it, or does not exist."""
         if self.own is None:
             return True
         entry = next((e for e in announcement.entries if e.report.agent == self.own.agent), None)
@@ -86,89 +87,93 @@ class Check:
         return self._rule.decided(combined) == self._rule.decided(announcement.reports)
 
     def offers(self, announcement: Announcement | None, age: float, now: float) -> list[Offer]:
-        """The question to the council, where it is time."""
+        """Return the request to a quorum member if it is due."""
         if now < self.due:
             return []
-        self._ask_at = math.inf
+        self._request_at = math.inf
         if announcement is not None and self.is_counted(announcement):
             return []
         if self.own is None:
             self._relayed += 1
             if self._relayed > MAX_RELAYED:
                 return []
-        self._is_asked = True
+        self._is_under_way = True
         member = self._members[self.failures % len(self._members)]
         return [Offer(member, (self.own,) if self.own is not None else (), age, is_straight=True)]
 
     def answered(self, announcement: Announcement | None, now: float) -> None:
-        """A member of the council has the bid now; ``announcement`` is what this node knows."""
-        self._is_asked = False
+        """Record that a quorum member has the bid; ``announcement`` is the newest that this node knows."""
+        self._is_under_way = False
         self.failures = 0
         if announcement is None or not self.is_counted(announcement):
-            self._ask_at = min(self._ask_at, now + max(LEAST_PAUSE, self._auction.waiting))
+            self._request_at = min(self._request_at, now + max(LEAST_PAUSE, self._auction.waiting))
 
     def failed(self, to: Contact, now: float) -> None:
-        """A member of the council did not answer: the next one is asked."""
-        self._is_asked = False
+        """Record that a quorum member did not answer; the next request goes to the next member."""
+        self._is_under_way = False
         self.failures += 1
-        self._ask_at = min(self._ask_at, now + (min(MOST_PAUSE, LEAST_PAUSE * self.failures) if self.is_alone else 0.0))
+        self._request_at = min(
+            self._request_at, now + (min(MOST_PAUSE, LEAST_PAUSE * self.failures) if self.is_alone else 0.0)
+        )
 
-    def _ask_from(self, moment: float) -> None:
-        self._ask_at = min(self._ask_at, moment + self._rng.uniform(0.0, self._auction.waiting * SPREAD))
+    def _request_from(self, moment: float) -> None:
+        self._request_at = min(self._request_at, moment + self._rng.uniform(0.0, self._auction.waiting * SPREAD))
 
 
 MAX_TRIES = 3
-"""Errands to one member for one bid; after them the announcement tells whether the others had it."""
+"""Maximum messages to one member for one bid; later the announcement shows whether the others received it."""
 RETRY_PAUSE_S = 0.5
 
 
 class Direct:
-    """What one bidder owes to each member of the council."""
+    """The messages with a bid that one bidder has to send to each quorum member."""
 
     def __init__(self, auction: Auction, own_id: bytes) -> None:
         self._members = [member for member in auction.council if member.node_id != own_id]
         self._bid: Bid | None = None
-        self._owed: dict[bytes, tuple[int, float]] = {}
+        self._pending: dict[bytes, tuple[int, float]] = {}
         self._under_way: dict[bytes, Bid] = {}
         self._silent: set[bytes] = set()
 
     @property
     def is_alone(self) -> bool:
-        """Whether every member that was to be told did not answer."""
+        """Whether no quorum member answered."""
         return 0 < len(self._members) <= len(self._silent)
 
     @property
     def due(self) -> float:
-        """When there is something to send."""
-        return min((at for node_id, (_, at) in self._owed.items() if node_id not in self._under_way), default=math.inf)
+        """The time of the next message."""
+        return min(
+            (at for node_id, (_, at) in self._pending.items() if node_id not in self._under_way), default=math.inf
+        )
 
     def bid(self, bid: Bid, now: float) -> None:
-        """Owe ``bid``, and nothing that went before it, to every member."""
+        """Send ``bid`` to every member, instead of any earlier bid."""
         self._bid = bid
-        self._owed = {member.node_id: (0, now) for member in self._members}
+        self._pending = {member.node_id: (0, now) for member in self._members}
 
     def offers(self, age: float, now: float) -> list[Offer]:
-        """What goes out now."""
+        """Return the messages that are due now."""
         out: list[Offer] = []
         for member in self._members:
-            _, at = self._owed.get(member.node_id, (0, math.inf))
+            _, at = self._pending.get(member.node_id, (0, math.inf))
             if self._bid is not None and at <= now and member.node_id not in self._under_way:
                 self._under_way[member.node_id] = self._bid
                 out.append(Offer(member, (self._bid,), age, is_shared=True))
         return out
 
     def answered(self, offer: Offer) -> None:
-        """A member has confirmed."""
+        """Record that a member confirmed the bid."""
         self._silent.discard(offer.to.node_id)
         if self._under_way.pop(offer.to.node_id, None) is self._bid:
-            self._owed.pop(offer.to.node_id, None)
+            self._pending.pop(offer.to.node_id, None)
 
     def failed(self, offer: Offer, now: float) -> None:
-        """A member did not answer."""
+        """Record that a member did not answer."""
         self._silent.add(offer.to.node_id)
-        asked = self._under_way.pop(offer.to.node_id, None)
-        tries, _ = self._owed.pop(offer.to.node_id, (0, now))
-        if asked is not self._bid:
-            self._owed[offer.to.node_id] = (0, now)
+        sent_bid = self._under_way.pop(offer.to.node_id, None)
+        tries, _ = self._pending.pop(offer.to.node_id, (0, now))
+        if sent_bid is not self._bid:
+            self._pending[offer.to.node_id] = (0, now)
         elif tries + 1 < MAX_TRIES:
-            self._owed[offer.to.node_id] = (tries + 1, now + RETRY_PAUSE_S)
+            self._pending[offer.to.node_id] = (tries + 1, now + RETRY_PAUSE_S)

@@ -1,4 +1,4 @@
-"""Errand: one message of an auction that is to be sent and acknowledged; pure."""
+"""Outgoing messages of an auction, with or without acknowledgement; pure."""
 
 from __future__ import annotations
 
@@ -9,15 +9,19 @@ from middleware.consensus.bidding.bid import Bid
 from middleware.entangled.contact import Contact
 
 MAX_BIDS = 64
-"""Bids in one message: to check their signatures takes 5 ms.  What is more goes in the next one."""
+"""Maximum number of bids in one message: checking their signatures takes 5 ms.
+
+Further bids go into the next message.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class Offer:
-    """Bids for ``to``.  ``age`` is how many seconds ago the first bid that is known of was made.
+    """Bids for ``to``.
 
-    ``is_shared``: the bidder tells every member of the council itself.  ``is_straight``: it asks for the announcement,
-    which did not come, or has a bid that the announcement should not have missed.
+    - ``age``: the seconds since the first known bid was made
+    - ``is_shared``: the bidder itself sends to every quorum member
+    - ``is_straight``: the sender asks a quorum member for a missing announcement, or its bid is missing there
     """
 
     to: Contact
@@ -37,7 +41,7 @@ class Notice:
 
 @dataclass(frozen=True, eq=False)
 class Cry:
-    """Bids for a neighbour while no council is in reach; nobody acknowledges it."""
+    """Flooded bids for a neighbour while no quorum member is reachable, without acknowledgement."""
 
     to: Contact
     bids: tuple[Bid, ...]

@@ -1,6 +1,7 @@
-"""Flood: bids go from neighbour to neighbour while no member of the council is in reach; pure.
+"""Flooding: bids go from neighbour to neighbour while no quorum member is reachable; pure.
 
-For tasks that need no exclusive right.  Nothing is confirmed: eight ways to each node make up for what is lost.
+Only for tasks without an exclusive lease.  Messages are not acknowledged: each node has about eight neighbours, which
+compensates for losses.
 """
 
 from __future__ import annotations
@@ -17,11 +18,11 @@ from middleware.entangled.kademlia.distance import closest
 
 NEIGHBOURS = 8
 NEAREST = 4
-"""Of these neighbours, how many are the nearest ones, so that no part of the ring of ids is left out."""
+"""Number of these neighbours that are the nearest by id, so that every part of the key space is reached."""
 
 
 class Flood:
-    """What one node cries out, and what it has heard."""
+    """The flooded bids that one node has received and sends."""
 
     def __init__(
         self, own_id: bytes, rule: Rule, contacts: Callable[[], Iterable[Contact]], rng: random.Random
@@ -31,33 +32,33 @@ class Flood:
         self._contacts = contacts
         self._rng = rng
         self._neighbours: list[Contact] = []
-        self._callers: dict[bytes, Contact] = {}
-        self._cries = False
+        self._senders: dict[bytes, Contact] = {}
+        self._is_changed = False
 
     def join(self, bids: Iterable[Bid], sender: Contact | None = None) -> bool:
-        """Take bids in, the own one or what ``sender`` cried; whether they changed anything."""
+        """Add bids, the own one or those of ``sender``; returns whether they changed anything."""
         changed = self.summary.join(bids)
-        if sender is not None and len(self._callers) < NEIGHBOURS:
-            self._callers.setdefault(sender.node_id, sender)
-        self._cries = self._cries or changed
+        if sender is not None and len(self._senders) < NEIGHBOURS:
+            self._senders.setdefault(sender.node_id, sender)
+        self._is_changed = self._is_changed or changed
         return changed
 
     def cries(self) -> list[Cry]:
-        """What goes out now, to each neighbour once for each change."""
-        if not self._cries:
+        """Return the messages that are due now: one per neighbour for each change."""
+        if not self._is_changed:
             return []
-        self._cries = False
-        return [Cry(neighbour, self.summary.bids()) for neighbour in self._around()]
+        self._is_changed = False
+        return [Cry(neighbour, self.summary.bids()) for neighbour in self._choose_neighbours()]
 
-    def _around(self) -> list[Contact]:
-        """The neighbours: the nearest, some anywhere, and those that count this node among theirs."""
+    def _choose_neighbours(self) -> list[Contact]:
+        """Return the neighbours: the nearest, some random ones, and senders that have this node as a neighbour."""
         if not self._neighbours:
             known = list(self._contacts())
             near = closest(known, self._own_id, NEAREST)
             far = [contact for contact in known if contact not in near]
             self._neighbours = near + self._rng.sample(far, min(len(far), NEIGHBOURS - len(near)))
         once = {contact.node_id: contact for contact in self._neighbours}
-        for node_id, contact in self._callers.items():
+        for node_id, contact in self._senders.items():
             if len(once) < NEIGHBOURS:
                 once.setdefault(node_id, contact)
         return list(once.values())

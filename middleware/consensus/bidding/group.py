@@ -1,4 +1,4 @@
-"""Group: the participants of one task, as one of them sees them; what it reports goes out, what all report comes in.
+"""The group of participants of one task, as one participant sees it: publishes its report and collects all reports.
 
 Thesis, section 4.2.5: agents assigned to the same task write to one part of the DHT and watch it.
 """
@@ -24,21 +24,21 @@ if TYPE_CHECKING:
     from middleware.consensus.bidding.auctions import Bidding
 
 Heard = Callable[[list[Member], Result | None], None]
-"""Told of every member that is present, oneself included, and how the task ended (None: it is open)."""
+"""Called with all present members, including the own one, and the task's outcome (None: it is open)."""
 
 Enter = Callable[[Callable[[tuple[Report, ...]], None]], "Bidding"]
-"""Begins to bid, given what is to be told of the bids that the council announces."""
+"""Starts bidding; its argument is called with the reports that the quorum members announce."""
 
 Later = Callable[[float, Callable[[], None]], Callable[[], None]]
-"""Calls after so many seconds; calling what it returns prevents that."""
+"""Calls a function after a delay in seconds; returns a function that cancels the call."""
 
 
 class Roll:
-    """The members of one task, as one of them sees them, from two sources; ``view`` is what the strategy goes by.
+    """The members of one task, merged from two sources; ``view`` is the part of a report that the strategy reads.
 
-    Records under the group's key say who is present; the council announces the bids that decide.  The later of the two
-    counts.  A member that is not present bids nothing, whatever was announced; what was announced of one that has not
-    come yet is kept until it comes.
+    Records under the group's key show the present members; announcements of the quorum members have the best bids.  The
+    later report of the two counts.  Absent members do not bid, but an announced bid of a member whose record has not
+    arrived yet is kept.
     """
 
     def __init__(self, view: View | None = None) -> None:
@@ -52,55 +52,56 @@ class Roll:
         return len(self._present)
 
     def present(self, members: Iterable[Member]) -> None:
-        """Take what the records say now; where a report is another than before, it is the later word."""
+        """Process the records; a changed report replaces an announced one."""
         before, self._present = self._present, {member.uuid: member for member in members}
         for uuid, member in self._present.items():
             if uuid in before and self._view.report(before[uuid]) != self._view.report(member):
-                self._forget(uuid)
-        gone = before.keys() - self._present.keys()
-        for uuid in gone:
-            self._forget(uuid)
-        self._left = (self._left | gone) - self._present.keys()
+                self._drop_announced(uuid)
+        departed = before.keys() - self._present.keys()
+        for uuid in departed:
+            self._drop_announced(uuid)
+        self._left = (self._left | departed) - self._present.keys()
 
     def announced(self, reports: Iterable[Report]) -> None:
-        """Take what the council announces; whom it does not name, it says nothing about.
+        """Process an announcement; members that it does not name are unchanged.
 
-        Except those of whom it spoke before their records came: what these say may be later.
+        Except members that were announced before their records arrived: their records may be newer.
         """
         named = {report.agent: report for report in reports if report.agent not in self._left}
         for uuid in self._early - named.keys():
-            self._forget(uuid)
+            self._drop_announced(uuid)
         self._early |= named.keys() - self._present.keys()
         self._announced.update(named)
 
     def awaited(self) -> list[Report]:
-        """What was announced of those who have not come yet."""
+        """Return the announced reports of members whose records have not arrived."""
         return [report for uuid, report in self._announced.items() if uuid not in self._present]
 
     def uuids(self) -> Set[str]:
-        """Who is present."""
+        """Return the uuids of the present members."""
         return self._present.keys()
 
     def members(self) -> list[Member]:
-        """Everybody that is present, with the bid that counts."""
+        """Return the present members with their valid reports."""
         return [
             self._view.told(member, self._announced[uuid]) if uuid in self._announced else member
             for uuid, member in self._present.items()
         ]
 
-    def _forget(self, uuid: str) -> None:
+    def _drop_announced(self, uuid: str) -> None:
         self._announced.pop(uuid, None)
         self._early.discard(uuid)
 
 
 class Group:
-    """One participant's place in the group of ``task``.
+    """One participant's connection to the group of ``task``.
 
-    ``quietly`` takes what may fail without anybody waiting, ``ordered`` all records there are, for an operator's orders
-    among them.  With ``enter`` bids go to the task's council as well (``dissemination``), which announces those that
-    decide; the records stay as what people see, and as who is present.  ``view`` is what the task's strategy goes by.
-
-    Of a team of many ``devices`` only the ``panel`` writes records.
+    - ``heard``: called with the members and the outcome after each change
+    - ``quietly``: takes writes whose failure is only logged
+    - ``ordered``: called with all records, which include an operator's orders
+    - ``enter``: starts bidding for the task; None: reports are exchanged by records only
+    - ``view``: the part of a report that the strategy reads
+    - ``panel``: decides which participants of a team of many ``devices`` write records
     """
 
     def __init__(
@@ -135,23 +136,23 @@ class Group:
         self._is_left = False
         panel.heard((), devices(), seconds())
         self._bidding = enter(self._announced) if enter is not None else None
-        self._watch = entangled.watch(self._key, self._changed)
+        self._watch = entangled.watch(self._key, self._on_records)
 
     def report(self, member: Member) -> None:
-        """Tell the other participants; gone with this node, should it go."""
+        """Publish the agent's report; its record is removed when this node leaves."""
         self._me = member
         self._write()
         if self._bidding is None:
             return
-        self._bidding.expect(self._expected())
+        self._bidding.expect(self._expected_bidders())
         report = self._view.report(member)
         if report is not None:
             self._bidding.report(report)
-        elif self._bidding.is_standing:  # who has not measured anything yet does not abstain
+        elif self._bidding.is_standing:  # an agent without a first measurement does not abstain
             self._bidding.withdraw()
 
     def withdraw(self) -> None:
-        """Take this node's report back."""
+        """Withdraw this node's report."""
         self._me = None
         if self._panel.is_written:
             self._quietly(self._entangled.remove(self._key, MEMBER))
@@ -160,41 +161,41 @@ class Group:
             self._bidding.withdraw()
 
     def conclude(self, result: Result, proof: bytes) -> Deferred[Stored]:
-        """Record how the task ended, with the proof of its council; stays when this node goes."""
+        """Record the outcome with its proof; the record remains when this node leaves."""
         return self._entangled.put(self._key, DONE, done_packed(result, proof), "team")
 
     def leave(self) -> None:
-        """Hear no more of it."""
+        """Stop watching the group."""
         self._is_left = True
         self._cancel()
         self._watch.stop()
         if self._bidding is not None:
             self._bidding.leave()
 
-    def _changed(self, records: list[Record]) -> None:
+    def _on_records(self, records: list[Record]) -> None:
         self._roll.present(m for record in records if (m := member_of(record)) is not None)
         self._outcome = outcome_of(self._task, records)
         self._panel.heard(self._roll.uuids(), self._devices(), self._seconds())
         if self._bidding is not None:
-            self._bidding.expect(self._expected())
-        self._tell()
+            self._bidding.expect(self._expected_bidders())
+        self._notify()
         self._ordered(records)
         self._write()
 
     def _announced(self, reports: tuple[Report, ...]) -> None:
         self._roll.announced(reports)
         self._panel.announced([report.agent for report in reports], self._seconds())
-        self._tell()
+        self._notify()
         self._write()
-        if self._awaited():
-            self._later(BELIEVED, self._tell)
+        if self._awaited_members():
+            self._later(BELIEVED, self._notify)
 
-    def _tell(self) -> None:
+    def _notify(self) -> None:
         if not self._is_left:
-            self._heard([*self._roll.members(), *self._awaited()], self._outcome)
+            self._heard([*self._roll.members(), *self._awaited_members()], self._outcome)
 
-    def _awaited(self) -> list[Member]:
-        """Who was announced and is believed to be here: its record is on its way."""
+    def _awaited_members(self) -> list[Member]:
+        """Return the announced members that are assumed present although their records have not arrived."""
         now = self._seconds()
         if not self._panel.is_partial(now):
             return []
@@ -204,12 +205,12 @@ class Group:
             if self._panel.believes(report.agent, now)
         ]
 
-    def _expected(self) -> float:
-        """How many are to bid until the council need not wait any longer."""
+    def _expected_bidders(self) -> float:
+        """Return the number of bidders after which the quorum members need not wait longer."""
         return math.inf if self._panel.is_partial(self._seconds()) else len(self._roll)
 
     def _write(self) -> None:
-        """Write the record, where the panel has use for it, or look again when it may."""
+        """Write the record if the panel requires it, or set a timer for later."""
         self._cancel()
         if self._me is None:
             return

@@ -1,8 +1,8 @@
-"""Panel: the few whose records stand for a large group; pure.
+"""Reporters: the few participants of a large group that write records for all; pure.
 
-In a small team each that takes part in a task writes a record, and all hear of each: that is n x n messages.  In a
-larger one all bid to the council, which costs each of them the same whatever their number, and these alone write: whom
-the council announces, who acts or thinks that it is to, and, while there are few records, those whose turn comes.
+In a small team each participant of a task writes a record, and all receive it: n x n messages.  In a larger team all
+send their bids to the quorum members, at constant cost per node, and only the reporters write records: the announced
+agents, agents that act or expect to, and, while there are few records, others in a staggered order.
 """
 
 from __future__ import annotations
@@ -16,28 +16,30 @@ from middleware.entangled.kademlia.distance import distance
 from middleware.tasks.task import Member
 
 MOST_OPEN = 12
-"""Devices of a team up to which everybody writes."""
+"""Maximum number of devices of a team in which every participant writes."""
 SEATS = 8
-"""Records of others that are enough, where nothing else asks for one's own: with those announced the panel has some
-more.  A group of no more than these all write, whatever the size of the team."""
+"""Number of other records that are sufficient.  Announced agents write in addition.
+
+Groups up to this size write all records, whatever the size of the team.
+"""
 LISTENING = 0.3
-"""Seconds in which a newcomer hears which records there are."""
+"""Seconds in which a new participant receives the existing records."""
 SPACING = 0.02
-"""Seconds between two turns, on the average: five write before the first of them is heard of."""
+"""Average seconds between two turns: five participants write before the first of their records arrives."""
 SETTLING = 1.0
-"""Seconds after the last turn within which its record is known to all."""
+"""Seconds after the last turn until its record has reached all."""
 PAUSE = 1.0
-"""Seconds between two records of one member of the panel that differ in nothing that matters at once."""
+"""Minimum seconds between two records of one reporter without urgent changes."""
 BELIEVED = 1.0
-"""Seconds for which who is announced counts as present, while its record is on its way."""
+"""Seconds for which an announced agent counts as present before its record arrives."""
 PATIENCE = 3.0
-"""Seconds after the waiting period for which the council's announcement is waited for."""
+"""Seconds after the waiting period for which the announcement is awaited."""
 
 
 class Panel:
-    """The panel of one task, as the participant ``uuid`` sees it; ``place``, 0 to 1, says how late its turn comes.
+    """The reporters of one task, as the participant ``uuid`` sees them; ``place``, 0 to 1, is the order of its turn.
 
-    What is heard is told to it; ``due`` says when to write.  Until it has heard of a large team it is one of all.
+    ``due`` returns when to write.  In a small team all participants are reporters.
     """
 
     def __init__(self, uuid: str, place: float = 0.0) -> None:
@@ -45,76 +47,76 @@ class Panel:
         self.place = place
         self._devices = 1
         self._is_standing = False
-        self._turn_at = self._whole_at = math.inf
+        self._turn_at = self._complete_at = math.inf
         self._announced: dict[str, float] = {}
-        self._told: Member | None = None
-        self._told_at = -math.inf
+        self._written: Member | None = None
+        self._written_at = -math.inf
 
     def is_partial(self, now: float) -> bool:
-        """Whether the records are those of a panel only: others may take part who wrote none."""
-        return self._devices > MOST_OPEN and now < self._whole_at
+        """Return whether only reporters have written records, so that there may be other participants."""
+        return self._devices > MOST_OPEN and now < self._complete_at
 
     def counts(self, now: float) -> bool:
-        """Whether this participant is one that the others know of: nobody else is decided for."""
+        """Return whether the others know this participant; only known agents can be assigned."""
         return not self.is_partial(now) or self.is_written or self._uuid in self._announced
 
     @property
     def is_written(self) -> bool:
-        """Whether a record of this participant stands, or one of its former life."""
-        return self._told is not None or self._is_standing
+        """Whether there is a record of this participant, possibly from an earlier run."""
+        return self._written is not None or self._is_standing
 
     @property
     def has_word(self) -> bool:
-        """Whether the council has announced a bid."""
+        """Whether the quorum members have announced a bid."""
         return bool(self._announced)
 
     def heard(self, present: Collection[str], devices: int, now: float) -> None:
-        """Take in whose records stand, by their uuids, and how many devices the team has."""
+        """Process the uuids with records, and the number of devices in the team."""
         self._devices = devices
         self._is_standing = self._uuid in present
         if len(present) - self._is_standing >= SEATS:
-            self._turn_at = self._whole_at = math.inf
+            self._turn_at = self._complete_at = math.inf
         elif self._turn_at == math.inf:
             begins, lasts = now + LISTENING, SPACING * devices
             self._turn_at = begins + self.place * lasts
-            self._whole_at = begins + lasts + SETTLING
+            self._complete_at = begins + lasts + SETTLING
 
     def announced(self, agents: Collection[str], now: float) -> None:
-        """Take in whom the council announces."""
+        """Process the announced agents."""
         self._announced = {agent: self._announced.get(agent, now) for agent in agents}
 
     def believes(self, agent: str, now: float) -> bool:
-        """Whether ``agent``, of whom there is no record, may still write one because it was announced."""
+        """Return whether ``agent`` counts as present without a record, because it was announced recently."""
         return now < self._announced.get(agent, -math.inf) + BELIEVED
 
     def due(self, me: Member, now: float) -> float:
-        """When ``me`` is to be written, as things stand: now, later, or never (infinity)."""
-        if me == self._told:
+        """Return when the record of ``me`` is to be written: now, later, or never (infinity)."""
+        if me == self._written:
             return math.inf
         if not self.is_partial(now):
             return now
         is_needed = me.uuid in self._announced or me.status == EXECUTING or me.token > 0 or me.assigned == me.uuid
-        if self._told is None:
+        if self._written is None:
             return now if is_needed or self._is_standing else self._turn_at
-        if _urgent(me) != _urgent(self._told):
+        if _urgent_part(me) != _urgent_part(self._written):
             return now
-        if is_needed or me.assigned != self._told.assigned:
-            return self._told_at + PAUSE
+        if is_needed or me.assigned != self._written.assigned:
+            return self._written_at + PAUSE
         return math.inf
 
     def wrote(self, me: Member | None, now: float) -> None:
-        """Take note that ``me`` is what the record says from now on; None: there is none any more."""
-        self._told, self._told_at = me, now
+        """Record that ``me`` was written; None: the record was removed."""
+        self._written, self._written_at = me, now
 
 
 def panel_of(uuid: str, key: bytes) -> Panel:
-    """The panel of the task with the group's ``key``, as ``uuid`` sees it.
+    """Return the reporters of the task with the group's ``key``, as ``uuid`` sees them.
 
-    The farthest come first: the nearest hold the records, and most of them sit in the council already.
+    The farthest nodes come first: the nearest hold the records, and most of them are quorum members.
     """
     return Panel(uuid, 1.0 - distance(bytes.fromhex(uuid), key) / (1 << (8 * ID_BYTES)))
 
 
-def _urgent(member: Member) -> tuple[object, ...]:
-    """What of a report the others must know at once: what it does, and whether it can."""
+def _urgent_part(member: Member) -> tuple[object, ...]:
+    """Return the part of a report that the others must know immediately: the agent's activity and availability."""
     return member.status, member.token, member.available, member.cost is None, member.assigned == member.uuid

@@ -1,6 +1,6 @@
-"""Party: all that one node has to do with one auction: bid in it, relay it, or count it; pure.
+"""One node's part in one auction: it bids, forwards bids, or announces the result; pure.
 
-What comes in is told to it, ``errands`` says what goes out, ``due`` when to ask for that again.
+``errands`` returns the outgoing messages, and ``due`` the time of the next call.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from middleware.consensus.strategy import Report
 from middleware.entangled.contact import Contact
 
 RELAY_SILENCE = 0.4
-"""Seconds of silence after which a node asks for all that are behind it, before they do so themselves."""
+"""Seconds of silence after which a forwarding node asks on behalf of all behind it, before they ask themselves."""
 
 MOST_REVISION = 2**32
-"""What is announced beyond it was made up, and is not outbid."""
+"""Higher announced revisions are considered forged, and the node does not try to exceed them."""
 
 OnSummary = Callable[[tuple[Report, ...]], None]
-"""Told of the reports that stand, each time that these are others."""
+"""Called with the reports that stand, after each change."""
 
 
 class Party:
-    """The part of the node ``me`` in ``auction``; ``sign`` makes its signature, ``contacts`` gives whom it knows."""
+    """The part of the node ``me`` in ``auction``; ``sign`` signs for it, ``contacts`` returns its contacts."""
 
     def __init__(
         self,
@@ -72,12 +72,12 @@ class Party:
 
     @property
     def summary(self) -> Summary:
-        """The bids that this node has gathered."""
+        """The bids that this node has collected."""
         return self._gatherer.summary
 
     @property
     def due(self) -> float:
-        """When there is something to do, if nothing happens before."""
+        """The time of the next message."""
         told_at = self.audience.due(self.announcement, self._is_mine)
         checked_at = self._check.due if self._teller is None else math.inf
         return min(self._direct.due, self._flooded_at, told_at, self._gatherer.due, checked_at)
@@ -89,7 +89,7 @@ class Party:
 
     @property
     def is_outlived(self) -> bool:
-        """Whether a bid of this agent's former life is announced in place of the own one, which has to be made anew."""
+        """Whether an announced bid from this agent's earlier run replaced its own, so that it has to bid again."""
         return self.own is not None and self.own.revision < self.next_revision - 1
 
     def expect(self, bidders: float) -> None:
@@ -97,11 +97,11 @@ class Party:
         if self._teller is not None:
             self._teller.expected = bidders
 
-    def bid(self, bid: Bid, way: str, now: float) -> None:
-        """Make the own bid, or take it back."""
+    def bid(self, bid: Bid, path: str, now: float) -> None:
+        """Make or withdraw the own bid."""
         self._first_at = min(self._first_at, now)
         self.next_revision = max(self.next_revision, bid.revision + 1)
-        is_direct = way == DIRECT
+        is_direct = path == DIRECT
         if is_direct:
             self._direct.bid(bid, now)
         if self._teller is not None:
@@ -110,16 +110,19 @@ class Party:
             self._branch.join([bid], now)
         self._check.bid(bid, self.announcement, is_direct, now)
         if self._flooded_at != math.inf or self._flood.summary.standing:
-            self._cry(now)
+            self._flood_own_bid(now)
 
     def has_room(self, sender: Contact) -> bool:
-        """Whether the bids of ``sender`` may come this way: the council hears everybody, others so many."""
+        """Return whether this node takes the bids of ``sender``.
+
+        Quorum members take all, other nodes a limited number.
+        """
         return self._teller is not None or len(self.audience) < MAX_CHILDREN or self.audience.has(sender)
 
     def offered(
         self, bids: Iterable[Bid], sender: Contact, age: float, is_shared: bool, now: float
     ) -> Announcement | None:
-        """Take what ``sender`` offers; what it is to be told in return."""
+        """Process the bids of ``sender``; returns the announcement, if there is one."""
         self._first_at = min(self._first_at, now - age)
         self.audience.add(sender, is_shared and self._teller is not None)
         if self._teller is not None:
@@ -134,7 +137,7 @@ class Party:
         return self.announcement
 
     def announced(self, announcement: Announcement, now: float) -> None:
-        """Take a genuine announcement; one that is not newer than the one known changes nothing."""
+        """Process a checked announcement; older ones are ignored."""
         if self.announcement is not None and announcement.precedence <= self.announcement.precedence:
             return
         self.announcement = announcement
@@ -146,10 +149,10 @@ class Party:
                 own = self.own
                 is_mine = own is not None and (own.revision, own.report) == (entry.revision, entry.report)
                 self.next_revision = max(self.next_revision, entry.revision + (1 if is_mine else 2))
-        self._tell()
+        self._notify()
 
     def cried(self, bids: Iterable[Bid], sender: Contact, now: float) -> None:
-        """Take what a neighbour cries; an exclusive task is not decided so."""
+        """Process flooded bids; an exclusive task is not decided by them."""
         if self.auction.exclusive:
             return
         self._first_at = min(self._first_at, now)
@@ -159,13 +162,13 @@ class Party:
             self._flooded_at = min(self._flooded_at, max(now, self._first_at + self.auction.waiting))
 
     def errands(self, now: float) -> list[Errand]:
-        """What goes out now."""
+        """Return the messages that are due now."""
         age = max(0.0, now - self._first_at) if self._first_at != math.inf else 0.0
         out: list[Errand] = []
         if self._teller is not None:
-            made = self._teller.announcement(self.announcement, self.audience.is_shared, now)
-            if made is not None:
-                self.announced(made, now)
+            new_announcement = self._teller.announcement(self.announcement, self.audience.is_shared, now)
+            if new_announcement is not None:
+                self.announced(new_announcement, now)
         out += self._gatherer.offers(age, now)
         if self._teller is None:
             out += self._check.offers(self.announcement, age, now)
@@ -174,11 +177,11 @@ class Party:
         out += self._flood.cries()
         if now >= self._flooded_at:
             self._flooded_at = math.inf
-            self._tell()
+            self._notify()
         return out
 
     def answered(self, errand: Errand, now: float) -> None:
-        """Take note that an errand was confirmed; what came in return was told before."""
+        """Record that a message was confirmed."""
         if isinstance(errand, Notice):
             self.audience.answered(errand)
         elif isinstance(errand, Offer):
@@ -190,7 +193,7 @@ class Party:
                 self._gatherer.answered(errand, now)
 
     def failed(self, errand: Errand, now: float) -> None:
-        """Take note that nobody answered an errand."""
+        """Record that a message was not answered."""
         if isinstance(errand, Notice):
             self.audience.failed(errand, now)
         elif isinstance(errand, Offer):
@@ -202,21 +205,21 @@ class Party:
                 self._gatherer.failed(errand, now)
             is_alone = self._check.is_alone or self._direct.is_alone or self._branch.is_alone
             if is_alone and self._teller is None:
-                self._cry(now)
+                self._flood_own_bid(now)
 
     @property
     def _is_mine(self) -> bool:
-        """Whether what is announced is this node's own word."""
+        """Whether the current announcement is this node's own."""
         return self.announcement is not None and self.announcement.rank == self._rank
 
-    def _cry(self, now: float) -> None:
-        """No council is in reach: let the neighbours know."""
+    def _flood_own_bid(self, now: float) -> None:
+        """Flood the own bid, since no quorum member is reachable."""
         own = self._check.own
         if own is not None and not self.auction.exclusive and self._flood.join([own]):
             self._flooded_at = min(self._flooded_at, max(now, self._first_at + self.auction.waiting))
 
-    def _tell(self) -> None:
-        """Tell what stands, of the announcement and of what was cried."""
+    def _notify(self) -> None:
+        """Report the announced and flooded reports that stand, if they have changed."""
         announced = self.announcement.reports if self.announcement is not None else ()
         cried = self._flood.summary.standing
         reports = self._rule.merged(announced, cried) if cried else announced

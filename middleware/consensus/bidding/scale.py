@@ -1,4 +1,4 @@
-"""Scale: which way the bids of a team of this size go, without going back and forth at the border; pure."""
+"""Choose the path of bids by the team's size, with hysteresis; pure."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from middleware.entangled.kademlia.distance import distance
 
 DIRECT, TREE = "direct", "tree"
 MOST_DIRECT = 30
-"""Bidders up to whom each of them tells the whole council: 3 members then hear 90 bids."""
+"""Maximum number of bidders for the direct path: 3 quorum members then receive 90 bids."""
 LEAST_TREE = 24
-"""Bidders from whom on a team that once was larger stays with the tree."""
+"""Number of bidders down to which a team that was larger keeps the tree."""
 
 
 class Scale:
-    """Begins with the direct way."""
+    """The current path; initially direct."""
 
     def __init__(self) -> None:
         self.way = DIRECT
 
     def counted(self, bidders: int) -> str:
-        """The way for that many bidders, given the way so far."""
+        """Return the path for that many bidders, given the current path."""
         if bidders > MOST_DIRECT:
             self.way = TREE
         elif bidders < LEAST_TREE:
@@ -31,19 +31,19 @@ class Scale:
 
 
 WHOLE = 50
-"""Up to that many contacts are taken for everybody, in a network that is not large: a roster holds 64."""
+"""Up to this many contacts are assumed to be the whole team in a small network: a roster holds 64."""
 NEAR = 8
-"""Contacts by whose distance a large team is measured: a node knows its k nearest for certain."""
+"""Number of nearest contacts by which the size of a large team is estimated: a node knows these reliably."""
 
 
 def team_size(own_id: bytes, contacts: Iterable[Contact], is_large: bool) -> int:
-    """About how many nodes there are, this one included: as many as are known, or more where those known lie dense.
+    """Estimate the number of nodes, including this one, from the density of known ids.
 
-    Ids are spread evenly, so of N nodes the n-th nearest is about n / N of the whole range away.  In a network that
-    ``is_large`` hardly anybody knows all, and a newcomer knows few.
+    Ids are uniformly distributed, so the n-th nearest of N nodes is about n / N of the key space away.  In a network
+    that ``is_large`` few nodes know all others, and a new node knows few.
     """
-    apart = sorted(distance(own_id, contact.node_id) for contact in contacts)
-    known = len(apart) + 1
-    if len(apart) < NEAR or (len(apart) <= WHOLE and not is_large):
+    distances = sorted(distance(own_id, contact.node_id) for contact in contacts)
+    known = len(distances) + 1
+    if len(distances) < NEAR or (len(distances) <= WHOLE and not is_large):
         return known
-    return max(known, NEAR * (1 << (8 * ID_BYTES)) // max(1, apart[NEAR - 1]))
+    return max(known, NEAR * (1 << (8 * ID_BYTES)) // max(1, distances[NEAR - 1]))

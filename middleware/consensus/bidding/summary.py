@@ -1,8 +1,8 @@
-"""Summary: what one node knows of the bids of one auction; a join, the same in any order and however often; pure.
+"""The bids of one auction that one node knows; a join: order and repetition make no difference; pure.
 
-Of each agent only the bid of the highest revision counts.  Of those the auction's rule says which stand, and only they
-travel on.  A bid that took the place of another is kept and travels even where it does not stand: else a late copy of
-the earlier one would stand again.
+Of each agent only the bid with the highest revision counts.  The auction's rule selects the bids that stand, and only
+these are forwarded.  A bid that replaced another one is kept and forwarded even if it does not stand; otherwise a late
+copy of the earlier bid would stand again.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ MAX_SUPERSEDING = 256
 
 
 class Summary:
-    """The bids that stand under ``rule``, and those that superseded others."""
+    """The bids that stand under ``rule``, and those that replaced others."""
 
     def __init__(self, rule: Rule) -> None:
         self._rule = rule
@@ -30,15 +30,15 @@ class Summary:
         return self._standing
 
     def bids(self) -> tuple[Bid, ...]:
-        """What has to travel on, in the order of the agents' ids."""
+        """Return the bids to forward, sorted by the agents' ids."""
         return tuple(self._bids[agent] for agent in sorted(self._bids))
 
     def of(self, agent: str) -> Bid | None:
-        """The bid of an agent, as far as it is kept."""
+        """Return the bid of an agent, or None if it is not kept."""
         return self._bids.get(agent)
 
     def join(self, bids: Iterable[Bid]) -> bool:
-        """Take ``bids`` in; whether anything is another than before."""
+        """Add ``bids``; returns whether the summary has changed."""
         before = dict(self._bids)
         newer: dict[str, Bid] = {}
         for bid in bids:
@@ -53,16 +53,16 @@ class Summary:
             known_reports = [bid.report for bid in self._bids.values() if bid.report is not None]
             self._standing = self._rule.merged(known_reports, ())
         else:
-            fresh = [bid.report for bid in newer.values() if bid.report is not None]
-            self._standing = self._rule.merged(self._standing, fresh)
-        self._shed()
+            new_reports = [bid.report for bid in newer.values() if bid.report is not None]
+            self._standing = self._rule.merged(self._standing, new_reports)
+        self._remove_unneeded()
         return self._bids != before
 
-    def _shed(self) -> None:
-        """Let go of every bid that neither stands nor superseded another, and of superseding ones beyond the limit."""
+    def _remove_unneeded(self) -> None:
+        """Remove bids that neither stand nor replaced others, and replacing ones beyond the limit."""
         standing = {report.agent for report in self._standing}
-        kept = {agent: bid for agent, bid in self._bids.items() if agent in standing or bid.revision}
-        spare = [agent for agent in kept if agent not in standing]
-        for agent in spare[: max(0, len(spare) - MAX_SUPERSEDING)]:
-            del kept[agent]
-        self._bids = kept
+        needed = {agent: bid for agent, bid in self._bids.items() if agent in standing or bid.revision}
+        not_standing = [agent for agent in needed if agent not in standing]
+        for agent in not_standing[: max(0, len(not_standing) - MAX_SUPERSEDING)]:
+            del needed[agent]
+        self._bids = needed

@@ -1,7 +1,7 @@
-"""Teller: a member of the council gathers bids, shares them with its fellows, and announces what stands; pure.
+"""The announcing side of an auction: a quorum member collects bids, shares them with the other members, and announces.
 
-The first member announces; the next one steps in where the first is silent.  That two of them may announce at once
-harms nothing: see ``announcement``.
+The first member announces; the next one replaces it if it is silent.  Two members may announce at once without harm:
+see ``announcement``.  Pure.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ from middleware.consensus.bidding.summary import Summary
 from middleware.consensus.strategy import Report
 
 STAND_IN = 0.4
-"""Seconds after which the next member announces what the one before it should have: the tries of one errand."""
+"""Seconds after which the next member announces instead of a silent one: the timeout of one message."""
 LATER = 0.05
-"""Seconds over which what comes after the announcement is gathered."""
+"""Seconds over which bids after the announcement are collected."""
 GATHER = 0.1
-"""Seconds over which what comes one by one is gathered for the fellows."""
+"""Seconds over which single bids are collected before they are sent to other members."""
 INFORMED = 2
-"""Fellows that are kept informed: the first of the council that answer, who announce and stand in."""
+"""Number of other members that are kept informed: the first that answer, since they announce or replace."""
 AGAIN, MOST_PAUSE = 1.0, 30.0
-"""Seconds after which a fellow that did not answer is tried again, at first and at most; doubled each time."""
+"""Initial and maximum seconds after which a silent member is tried again; doubled each time."""
 MAX_COUNTED = 4096
 
 
 class Teller:
-    """The member at place ``rank`` of the council of ``auction``; ``sign`` makes its signature."""
+    """The quorum member with this ``rank`` in ``auction``; ``sign`` signs for it."""
 
     def __init__(self, auction: Auction, rank: int, rule: Rule, sign: Callable[[bytes], bytes]) -> None:
         self.summary = Summary(rule)
@@ -42,7 +42,7 @@ class Teller:
         self._sign = sign
         self._number = 0
         self._closes_at = math.inf
-        self._speak_at = math.inf
+        self._announce_at = math.inf
         self._bidders: set[str] = set()
         self._fellows = [member for member in auction.council if member.node_id != auction.council[rank].node_id]
         self._known: dict[bytes, dict[str, tuple[int, bytes]]] = {member.node_id: {} for member in self._fellows}
@@ -52,40 +52,40 @@ class Teller:
 
     @property
     def due(self) -> float:
-        """When there is something to say."""
+        """The time of the next message or announcement."""
         idle = [at for node_id, at in self._send_at.items() if node_id not in self._under_way]
-        return min([self._speak_at, *idle])
+        return min([self._announce_at, *idle])
 
     def join(self, bids: Iterable[Bid], sender: bytes, is_shared: bool, age: float, now: float) -> None:
-        """Take bids in that ``sender`` gave."""
+        """Add bids from ``sender``."""
         bids = tuple(bids)
         if len(self._bidders) < MAX_COUNTED:
             self._bidders.update(bid.agent for bid in bids)
         changed = self.summary.join(bids)
         for fellow in self._known:
             if is_shared or fellow == sender:
-                self._knows(fellow, bids)
-        self._inform(now + GATHER)
+                self._record_known(fellow, bids)
+        self._schedule_sharing(now + GATHER)
         if self._closes_at == math.inf and bids:
             self._closes_at = now + max(0.0, self._auction.waiting - age)
-            self._speak_at = self._closes_at + self._rank * STAND_IN
+            self._announce_at = self._closes_at + self._rank * STAND_IN
         elif changed:
-            self._speak_at = min(self._speak_at, max(now + LATER, self._closes_at) + self._rank * STAND_IN)
+            self._announce_at = min(self._announce_at, max(now + LATER, self._closes_at) + self._rank * STAND_IN)
         if len(self._bidders) >= self.expected and now < self._closes_at:
             self._closes_at = now
-            self._speak_at = now + self._rank * STAND_IN
+            self._announce_at = now + self._rank * STAND_IN
 
     def heard(self, announcement: Announcement) -> None:
-        """Take note of what a fellow announced."""
+        """Record the number of another member's announcement."""
         self._number = max(self._number, announcement.number)
 
     def announcement(self, last: Announcement | None, is_strict: bool, now: float) -> Announcement | None:
-        """What has to be announced now, after ``last``; with ``is_strict`` also where only stand-bys changed."""
-        if now < self._speak_at:
+        """Return the announcement that is due after ``last``; with ``is_strict`` also if only standbys changed."""
+        if now < self._announce_at:
             return None
-        self._speak_at = math.inf
+        self._announce_at = math.inf
         entries = self._entries()
-        if last is not None and not self._is_news(last, entries, is_strict):
+        if last is not None and not self._changes_decision(last, entries, is_strict):
             return None
         if not entries and last is None:
             return None
@@ -93,47 +93,47 @@ class Teller:
         return Announcement(self._number, self._rank, entries).signed(self._sign, self._auction)
 
     def offers(self, age: float, now: float) -> list[Offer]:
-        """What fellows should know."""
+        """Return the messages to other members that are due now."""
         out = []
         for fellow in self._fellows:
             if now < self._send_at[fellow.node_id] or fellow.node_id in self._under_way:
                 continue
             self._send_at[fellow.node_id] = math.inf
-            fresh = self._fresh_for(fellow.node_id)
-            if fresh:
+            missing = self._missing_bids(fellow.node_id)
+            if missing:
                 self._under_way.add(fellow.node_id)
-                out.append(Offer(fellow, fresh, age))
+                out.append(Offer(fellow, missing, age))
         return out
 
     def answered(self, offer: Offer, now: float) -> None:
-        """A fellow has confirmed."""
+        """Record that a member confirmed the bids."""
         self._under_way.discard(offer.to.node_id)
-        self._knows(offer.to.node_id, offer.bids)
+        self._record_known(offer.to.node_id, offer.bids)
         self._silent.pop(offer.to.node_id, None)
-        self._inform(now + GATHER)
+        self._schedule_sharing(now + GATHER)
 
     def failed(self, offer: Offer, now: float) -> None:
-        """A fellow did not answer."""
+        """Record that a member did not answer."""
         self._under_way.discard(offer.to.node_id)
         tries = self._silent.get(offer.to.node_id, 0)
         self._silent[offer.to.node_id] = tries + 1
         pause = min(MOST_PAUSE, AGAIN * 2.0 ** min(tries, 8))
         self._send_at[offer.to.node_id] = min(self._send_at[offer.to.node_id], now + pause)
-        self._inform(now)
+        self._schedule_sharing(now)
 
-    def _inform(self, moment: float) -> None:
-        """Let the first fellows that answer have what they do not have, from ``moment`` on."""
+    def _schedule_sharing(self, moment: float) -> None:
+        """Schedule the missing bids for the first members that answer, from ``moment`` on."""
         for fellow in [node_id for node_id in self._known if node_id not in self._silent][:INFORMED]:
-            if self._fresh_for(fellow):
+            if self._missing_bids(fellow):
                 self._send_at[fellow] = min(self._send_at[fellow], moment)
 
-    def _knows(self, fellow: bytes, bids: Iterable[Bid]) -> None:
-        """Take note that a fellow has ``bids``; only what has to travel on is kept in mind."""
+    def _record_known(self, fellow: bytes, bids: Iterable[Bid]) -> None:
+        """Record that a member has ``bids``; only bids to forward are remembered."""
         known = {**self._known[fellow], **{bid.agent: bid.rank for bid in bids}}
         self._known[fellow] = {b.agent: known[b.agent] for b in self.summary.bids() if b.agent in known}
 
-    def _fresh_for(self, fellow: bytes) -> tuple[Bid, ...]:
-        """What a fellow does not have yet, as much as one message takes."""
+    def _missing_bids(self, fellow: bytes) -> tuple[Bid, ...]:
+        """Return the bids that a member is missing, at most as many as fit into one message."""
         known = self._known[fellow]
         return tuple(bid for bid in self.summary.bids() if known.get(bid.agent) != bid.rank)[:MAX_BIDS]
 
@@ -141,17 +141,17 @@ class Teller:
         bids = {bid.agent: bid for bid in self.summary.bids()}
         return tuple(Entry(report, bids[report.agent].revision) for report in self.summary.standing)
 
-    def _is_news(self, last: Announcement, entries: tuple[Entry, ...], is_strict: bool) -> bool:
-        """Whether those who know ``last`` would decide otherwise if they knew what is known here."""
+    def _changes_decision(self, last: Announcement, entries: tuple[Entry, ...], is_strict: bool) -> bool:
+        """Return whether nodes that know ``last`` would decide otherwise with the bids known here."""
         announced = last.reports
-        combined = self._rule.merged(_current(last.entries, self.summary), tuple(e.report for e in entries))
+        combined = self._rule.merged(_not_replaced(last.entries, self.summary), tuple(e.report for e in entries))
         if is_strict and set(combined) != set(announced):
             return True
         return self._rule.decided(combined) != self._rule.decided(announced)
 
 
-def _current(entries: tuple[Entry, ...], summary: Summary) -> tuple[Report, ...]:
-    """The reports that were announced and that, as far as is known here, nothing took the place of."""
+def _not_replaced(entries: tuple[Entry, ...], summary: Summary) -> tuple[Report, ...]:
+    """Return the announced reports that no known bid has replaced."""
     current = []
     for entry in entries:
         known = summary.of(entry.report.agent)

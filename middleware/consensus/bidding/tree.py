@@ -1,8 +1,8 @@
-"""Branch: one node of the tree along which bids gather on their way to the task's key; pure.
+"""One node of the tree in which bids travel to the task's key (convergecast); pure.
 
-It joins what its children offer and sends that on to one contact nearer to the key, which confirms; where it does not,
-the next nearest is tried, and at last the council.  It waits the longer the nearer it is to the key, so that what comes
-from behind it goes on in one message (convergecast; the tree is that of Scribe, without anybody keeping it).
+The node merges the bids of its children and sends them to one contact nearer to the key, which confirms.  If that
+contact does not answer, the next nearest is tried, and finally the quorum members.  Nodes nearer to the key wait
+longer, so that they forward all bids in one message.  The tree is as in Scribe, but without stored links.
 """
 
 from __future__ import annotations
@@ -19,32 +19,32 @@ from middleware.entangled.contact import Contact
 from middleware.entangled.kademlia.distance import closest, distance
 
 HOLD_PER_BIT = 0.02
-"""Seconds to wait for each bit that the own id shares with the key: a hop gains three bits and takes 30 ms and more."""
+"""Seconds to wait per bit that the own id shares with the key: a hop gains three bits and takes at least 30 ms."""
 HOLD_SHARE = 0.5
-"""The longest such wait, as a share of the waiting period."""
+"""The maximum wait, as a share of the waiting period."""
 LATER = 0.05
-"""Seconds over which what comes after the first message is gathered."""
+"""Seconds over which bids after the first message are collected."""
 AGAIN, MOST_PAUSE = 1.0, 30.0
-"""Seconds after which all are tried again where none of them answered, at first and at most; doubled each time."""
+"""Initial and maximum seconds after which all contacts are tried again when none answered; doubled each time."""
 
 
 MAX_CHILDREN = 64
-"""Nodes that may send their bids to one that is not of the council; a further one is refused, and tries the next.
+"""Maximum number of nodes that may send their bids to a node that is not a quorum member; others use the next contact.
 
-Who joined early is known to far more nodes than others are, and all of them would send to the one that stands nearest
-to the key: 340 of 10,000.
+Nodes that joined early are known to far more nodes than others, which would all send to the one nearest to the key: 340
+of 10,000.
 """
 
 
 MAX_HOPS = 4
-"""Contacts that are tried before the council itself."""
+"""Number of contacts that are tried before the quorum members."""
 
 
 def hops(auction: Auction, own_id: bytes, contacts: Iterable[Contact]) -> list[Contact]:
-    """Whom to send to, in the order of trying: the nearest contacts to the key, then the council.
+    """Return the contacts to send to, in order: the nearest contacts to the key, then the quorum members.
 
-    Only contacts nearer than this node count, so no bid goes round in a circle (Kademlia, section 2).
-    Where the nearest is a member of the council it is the goal, and the other members follow.
+    Only contacts nearer than this node are used, so bids do not circulate (Kademlia, section 2).  If the nearest
+    contact is a quorum member, it is the destination, and the other members follow.
     """
     own = distance(own_id, auction.key)
     nearer = [c for c in contacts if distance(c.node_id, auction.key) < own]
@@ -56,12 +56,15 @@ def hops(auction: Auction, own_id: bytes, contacts: Iterable[Contact]) -> list[C
 
 
 def shared_bits(a: bytes, b: bytes) -> int:
-    """How many of the first bits two ids share."""
+    """Return the length of the common prefix of two ids in bits."""
     return 8 * len(a) - distance(a, b).bit_length()
 
 
 class Branch:
-    """The way of bids through the node ``own_id``, which is not of the council; ``contacts`` gives those it knows."""
+    """The forwarding of bids through the node ``own_id``, which is not a quorum member.
+
+    ``contacts`` returns the node's contacts.
+    """
 
     def __init__(self, auction: Auction, own_id: bytes, rule: Rule, contacts: Callable[[], Iterable[Contact]]) -> None:
         self.summary = Summary(rule)
@@ -81,36 +84,36 @@ class Branch:
 
     @property
     def due(self) -> float:
-        """When there is something to send."""
+        """The time of the next message."""
         return math.inf if self._under_way is not None else self._send_at
 
     def join(self, bids: Iterable[Bid], now: float) -> None:
-        """Take bids in."""
+        """Add bids."""
         if self.summary.join(bids):
             self._send_at = min(self._send_at, now + (LATER if self._has_sent else self._hold))
 
     def offers(self, age: float, now: float) -> list[Offer]:
-        """What goes out now."""
+        """Return the message that is due now."""
         if now < self.due:
             return []
         self._send_at = math.inf
-        fresh = tuple(b for b in self.summary.bids() if self._confirmed.get(b.agent) != b.rank)
+        unconfirmed = tuple(b for b in self.summary.bids() if self._confirmed.get(b.agent) != b.rank)
         parent = self._parent if self._parent is not None else self._next_parent()
-        if not fresh or parent is None:
+        if not unconfirmed or parent is None:
             return []
         self._parent, self._has_sent = parent, True
-        self._under_way = Offer(parent, fresh[:MAX_BIDS], age)
+        self._under_way = Offer(parent, unconfirmed[:MAX_BIDS], age)
         return [self._under_way]
 
     def answered(self, offer: Offer, now: float) -> None:
-        """The parent has confirmed."""
+        """Record that the parent confirmed the bids."""
         self.is_alone, self._rounds = False, 0
-        self._settled(offer, now)
+        self._on_sent(offer, now)
         self._confirmed.update((bid.agent, bid.rank) for bid in offer.bids)
 
     def failed(self, offer: Offer, now: float) -> None:
-        """The parent did not answer: another has to have everything."""
-        self._settled(offer, now)
+        """Record that the parent did not answer; the next parent gets all bids."""
+        self._on_sent(offer, now)
         self._refused.add(offer.to.node_id)
         self._confirmed.clear()
         self._parent = self._next_parent()
@@ -121,7 +124,7 @@ class Branch:
             self._send_at = now + min(MOST_PAUSE, AGAIN * 2.0 ** min(self._rounds, 8))
             self._rounds += 1
 
-    def _settled(self, offer: Offer, now: float) -> None:
+    def _on_sent(self, offer: Offer, now: float) -> None:
         if offer is self._under_way:
             self._under_way = None
             sent = {bid.agent: bid.rank for bid in offer.bids}

@@ -1,8 +1,8 @@
-"""Consensus-based bundle algorithm: each agent bids for what suits it, and everybody believes the highest bid.
+"""The result of the consensus-based bundle algorithm (CBBA), computed from all reports at once.
 
-Choi, Brunet, How, IEEE Transactions on Robotics 25(4), 2009.  Where the agents talk by themselves
-(``benchmarks.consensus.bidder``) they end at the sequential greedy assignment; here it is found at once from all
-reports, and then mended by exchanges.
+Choi, Brunet, How, IEEE Transactions on Robotics 25(4), 2009.  The distributed algorithm
+(``benchmarks.consensus.bidder``) converges to the sequential greedy assignment; here the assignment is computed
+directly and then improved by moves and swaps.
 """
 
 from __future__ import annotations
@@ -14,68 +14,71 @@ from middleware.consensus.item import Item, Sharing, capacities, exact, listed, 
 from middleware.consensus.strategy import Consensus, Report, standing
 
 SWEEPS = 50
-"""Passes of exchanges over an assignment at most."""
+"""Maximum number of passes of moves and swaps over an assignment."""
 
 
 class Cbba(Sharing):
-    """The greedy assignment, task by task the cheapest pair, improved by exchanges; with one task the nearest."""
+    """The sequential greedy assignment, improved by moves and swaps; for a single task the nearest agent."""
 
     name = "cbba"
     version = "1"
 
     def find_group(self, contacts: Sequence[Report], items: Sequence[Item]) -> tuple[Consensus, ...]:
-        """One consensus point for each item, one agent each, in the order of their names."""
+        """Decide all items, one agent each, sorted by task name."""
         items = listed(items)
         wanted = {item.task for item in items}
         counted = [r for r in standing(contacts) if r.task in wanted]
-        room = capacities(counted)
-        costs: dict[str, dict[str, int]] = {agent: {} for agent in room}
+        capacity_left = capacities(counted)
+        costs: dict[str, dict[str, int]] = {agent: {} for agent in capacity_left}
         for report in counted:
             costs[report.agent][report.task] = exact(report.cost)
-        owners = exchanged(greedy(costs, room), costs, room)
+        owners = exchanged(greedy(costs, capacity_left), costs, capacity_left)
         return shared_out(self.name, counted, items, {task: [agent] for task, agent in owners.items()})
 
 
 def greedy(costs: Mapping[str, Mapping[str, float]], capacities: Mapping[str, int]) -> dict[str, str]:
-    """Who has each task, when always the cheapest pair of agent and task is made next; equal ones go by id."""
-    room = dict(capacities)
+    """Return the agent of each task: always the cheapest remaining pair is assigned next; ties are broken by id."""
+    capacity_left = dict(capacities)
     owner: dict[str, str] = {}
     pairs: Iterable[tuple[float, str, str]] = sorted((c, a, t) for a, row in costs.items() for t, c in row.items())
     for _, agent, task in pairs:
-        if task not in owner and room.get(agent, 1) > 0:
+        if task not in owner and capacity_left.get(agent, 1) > 0:
             owner[task] = agent
-            room[agent] = room.get(agent, 1) - 1
+            capacity_left[agent] = capacity_left.get(agent, 1) - 1
     return owner
 
 
 def exchanged(
     owners: Mapping[str, str], costs: Mapping[str, Mapping[str, int]], capacities: Mapping[str, int]
 ) -> dict[str, str]:
-    """Who has each task after tasks have gone to other agents, or two were swapped, as long as that costs less.
+    """Improve an assignment by moving tasks to other agents and swapping pairs while that lowers the total cost.
 
-    What a greedy assignment loses against the best one is mostly won back so.
-    ``costs`` are by agent and task; an agent that names none for a task cannot have it.
+    ``costs`` are by agent and task; an agent without a cost for a task cannot get it.  The passes recover most of the
+    gap between a greedy and an optimal assignment.
     """
     owner = dict(sorted(owners.items()))
-    held = Counter(owner.values())
-    room = {agent: capacities.get(agent, 1) - held[agent] for agent in costs}
-    free = {agent for agent, places in room.items() if places > 0}
+    task_counts = Counter(owner.values())
+    capacity_left = {agent: capacities.get(agent, 1) - task_counts[agent] for agent in costs}
+    free = {agent for agent, places in capacity_left.items() if places > 0}
     known = {agent: sorted(costs[agent].keys() & owner.keys()) for agent in costs}
     for _ in range(SWEEPS):
-        changed = [_moved(task, owner, costs, room, free) | _swapped(task, owner, costs, known) for task in owner]
+        changed = [
+            _move_task(task, owner, costs, capacity_left, free) | _swap_task(task, owner, costs, known)
+            for task in owner
+        ]
         if not any(changed):
             break
     return owner
 
 
-def _moved(
+def _move_task(
     task: str,
     owner: dict[str, str],
     costs: Mapping[str, Mapping[str, int]],
-    room: dict[str, int],
+    capacity_left: dict[str, int],
     free: set[str],
 ) -> bool:
-    """Give the task to the agent that has room, as all that are ``free`` have, and to which it costs least."""
+    """Assign the task to the agent with the lowest cost among the agents with capacity left (``free``)."""
     offers = [(costs[agent][task], agent) for agent in free if task in costs[agent]]
     now = owner[task]
     if not offers or min(offers)[0] >= costs[now][task]:
@@ -83,25 +86,25 @@ def _moved(
     then = min(offers)[1]
     owner[task] = then
     for agent, more in ((now, 1), (then, -1)):
-        room[agent] += more
-        (free.add if room[agent] > 0 else free.discard)(agent)
+        capacity_left[agent] += more
+        (free.add if capacity_left[agent] > 0 else free.discard)(agent)
     return True
 
 
-def _swapped(
+def _swap_task(
     task: str, owner: dict[str, str], costs: Mapping[str, Mapping[str, int]], known: Mapping[str, list[str]]
 ) -> bool:
-    """Swap the task for the one of another agent, of those that its own has ``known``, by which both gain most."""
-    mine = owner[task]
-    row = costs[mine]
+    """Swap the task for the one that lowers the total cost most; ``known`` has the tasks that each agent bid for."""
+    own_agent = owner[task]
+    row = costs[own_agent]
     least, best = 0, ""
-    for other in known[mine]:
-        theirs = owner[other]
-        if theirs != mine and task in costs[theirs]:
-            gain = row[other] + costs[theirs][task] - row[task] - costs[theirs][other]
+    for other in known[own_agent]:
+        other_agent = owner[other]
+        if other_agent != own_agent and task in costs[other_agent]:
+            gain = row[other] + costs[other_agent][task] - row[task] - costs[other_agent][other]
             if gain < least:
                 least, best = gain, other
     if not best:
         return False
-    owner[task], owner[best] = owner[best], mine
+    owner[task], owner[best] = owner[best], own_agent
     return True

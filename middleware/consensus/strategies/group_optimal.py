@@ -1,7 +1,7 @@
-"""Group optimum: several tasks are shared out so that all together they cost least.
+"""Group optimum: assign several tasks so that the total cost is minimal.
 
-The reports are gathered where one agent solves for all (a council member), each agent naming its cheapest tasks; what
-nobody named is looked at a second time with all reports that there are.
+One agent, a quorum member, gathers the reports and solves the problem for all.  At first each agent's cheapest tasks
+are considered; tasks that remain without an agent are solved again with all reports.
 """
 
 from __future__ import annotations
@@ -13,35 +13,36 @@ from middleware.consensus.strategies import hungarian
 from middleware.consensus.strategy import Consensus, Report, standing
 
 BIDS = 20
-"""Bids that count of each agent at first; that many fit into one datagram, and cost about 1 % of the optimum."""
+"""Number of bids per agent in the first pass; that many fit into one datagram and lead to about 1 % above the optimum.
+"""
 
 
 class GroupOptimal(Sharing):
-    """The cheapest way to serve as many tasks as can be served; with one task it is the nearest."""
+    """The cheapest assignment that serves as many tasks as possible; for a single task the nearest agent."""
 
     name = "group_optimal"
     version = "1"
     bids = BIDS
 
     def find_group(self, contacts: Sequence[Report], items: Sequence[Item]) -> tuple[Consensus, ...]:
-        """One consensus point for each item, in the order of their names."""
+        """Decide all items, sorted by task name."""
         items = listed(items)
         slots = {item.task: item.slots for item in items}
         counted = [r for r in standing(contacts) if r.task in slots]
-        room = capacities(counted)
+        capacity_left = capacities(counted)
         rows = [task for task, places in slots.items() for _ in range(places)]
         bids = cheapest(counted, self.bids)
         while True:
-            owners = _solved(rows, room, bids)
-            holes = {task for task, places in slots.items() if len(owners.get(task, ())) < places}
-            more = {(r.task, r.agent): exact(r.cost) for r in counted if r.task in holes}
+            owners = _solve(rows, capacity_left, bids)
+            uncovered = {task for task, places in slots.items() if len(owners.get(task, ())) < places}
+            more = {(r.task, r.agent): exact(r.cost) for r in counted if r.task in uncovered}
             if more.items() <= bids.items():
                 return shared_out(self.name, counted, items, owners)
             bids |= more
 
 
 def cheapest(contacts: Iterable[Report], most: int) -> dict[tuple[str, str], int]:
-    """What the tasks cost that each agent would rather have, ``most`` of each, by task and agent."""
+    """Return the costs of the ``most`` cheapest tasks of each agent, by task and agent."""
     own: dict[str, list[Report]] = {}
     for report in contacts:
         own.setdefault(report.agent, []).append(report)
@@ -52,36 +53,36 @@ def cheapest(contacts: Iterable[Report], most: int) -> dict[tuple[str, str], int
     }
 
 
-def _solved(rows: list[str], room: dict[str, int], bids: dict[tuple[str, str], int]) -> dict[str, list[str]]:
-    """The agents of each task; an agent is never twice at one task."""
-    columns = [agent for agent, places in room.items() for _ in range(min(places, len(rows)))]
+def _solve(rows: list[str], capacity_left: dict[str, int], bids: dict[tuple[str, str], int]) -> dict[str, list[str]]:
+    """Return the agents of each task; each agent at most once per task."""
+    columns = [agent for agent, places in capacity_left.items() for _ in range(min(places, len(rows)))]
     of_agent: dict[str, list[int]] = {}
     for column, agent in enumerate(columns):
         of_agent.setdefault(agent, []).append(column)
     of_task: dict[str, list[tuple[str, int]]] = {}
     for (task, agent), cost in bids.items():
         of_task.setdefault(task, []).append((agent, cost))
-    nobody = sum(sorted(bids.values())[-len(rows) :]) + 1
+    unassigned = sum(sorted(bids.values())[-len(rows) :]) + 1
     width = max(len(columns), len(rows))
     banned: set[tuple[int, str]] = set()
     while True:
         costs = []
         for number, task in enumerate(rows):
-            line = [nobody] * width
+            line = [unassigned] * width
             for agent, cost in of_task.get(task, ()):
                 if (number, agent) not in banned:
                     for column in of_agent.get(agent, ()):
                         line[column] = cost
             costs.append(line)
         owners: dict[str, list[str]] = {}
-        twice = False
+        has_duplicate = False
         for number, column in enumerate(hungarian.assigned(costs)):
-            if costs[number][column] < nobody:
+            if costs[number][column] < unassigned:
                 agent = columns[column]
                 if agent in owners.setdefault(rows[number], []):
                     banned.add((number, agent))
-                    twice = True
+                    has_duplicate = True
                 else:
                     owners[rows[number]].append(agent)
-        if not twice:
+        if not has_duplicate:
             return {task: sorted(agents) for task, agents in owners.items()}

@@ -1,7 +1,6 @@
-"""Hungarian: the cheapest assignment of rows to columns, exactly, by shortest augmenting paths.
+"""Solve the assignment problem exactly by shortest augmenting paths (Jonker and Volgenant, Computing 38, 1987).
 
-Jonker, Volgenant, Computing 38, 1987.  Costs are whole numbers, so that sums are exact and every machine finds the
-same: of several optima the one whose columns, read row by row, come first.
+Costs are whole numbers, so sums are exact and every machine computes the same assignment.
 """
 
 from __future__ import annotations
@@ -9,13 +8,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 Costs = Sequence[Sequence[float]]
-"""Whole numbers, as ``int`` or, while they are small, as ``float``, which reckons as exactly and faster."""
+"""Whole numbers; ``float`` instead of ``int`` while the sums are exact, for speed."""
 BEYOND = 2**52
-"""Sums from here on are not exact in floating point."""
+"""From here on sums are not exact in floating point."""
 
 
 def assigned(costs: Costs) -> list[int]:
-    """The column of each row; there are at least as many columns as rows, and all rows are equally long."""
+    """Return the column of each row.
+
+    There are at least as many columns as rows, and all rows have the same length.  Of several optima the result is the
+    lexicographically first.
+    """
     if not costs:
         return []
     if max(map(max, costs)) * len(costs) < BEYOND:
@@ -24,16 +27,17 @@ def assigned(costs: Costs) -> list[int]:
 
 
 def solved(costs: Costs) -> tuple[list[int], list[float]]:
-    """One cheapest assignment, and the price of each column: none above 0, and 0 where nobody has it.
+    """Return one optimal assignment and the price of each column.
 
-    Each row has a column that is cheapest for it, its price taken off; that proves the assignment.
+    Prices are at most 0, and 0 for columns without a row.  Each row's column minimises cost minus price for that row,
+    which proves optimality.
     """
     wide = len(costs[0])
-    prices: list[float] = [0 * costs[0][0]] * wide  # of the same kind as the costs, or sums were not exact
+    prices: list[float] = [0 * costs[0][0]] * wide  # of the costs' type, so that integer sums stay exact
     owner = [-1] * wide
     free = list(range(len(costs)))
     for _ in range(2):
-        free = _bid(costs, prices, owner, free)
+        free = _run_auction(costs, prices, owner, free)
     for row in free:
         _augment(costs, prices, owner, row)
     columns = [0] * len(costs)
@@ -43,10 +47,10 @@ def solved(costs: Costs) -> tuple[list[int], list[float]]:
     return columns, prices
 
 
-def _bid(costs: Costs, prices: list[float], owner: list[int], free: list[int]) -> list[int]:
-    """Let each free row outbid others for the column it likes best; gives the rows that are free afterwards."""
-    lost: list[int] = []
-    patience = len(free)
+def _run_auction(costs: Costs, prices: list[float], owner: list[int], free: list[int]) -> list[int]:
+    """Let each free row bid for its best column (auction phase); returns the rows that remain free."""
+    unassigned: list[int] = []
+    bids_left = len(free)
     free = free[::-1]
     while free:
         row = free.pop()
@@ -61,36 +65,36 @@ def _bid(costs: Costs, prices: list[float], owner: list[int], free: list[int]) -
             prices[best] -= second - least
         displaced, owner[best] = owner[best], row
         if displaced >= 0:
-            patience -= 1
-            if second > least and patience > 0:
+            bids_left -= 1
+            if second > least and bids_left > 0:
                 free.append(displaced)
             else:
-                lost.append(displaced)
-    return lost
+                unassigned.append(displaced)
+    return unassigned
 
 
 def _augment(costs: Costs, prices: list[float], owner: list[int], row: int) -> None:
-    """Give ``row`` a column along the cheapest chain of changes, and mend the prices."""
+    """Assign a column to ``row`` along the shortest augmenting path and update the prices."""
     length = [cost - price for cost, price in zip(costs[row], prices, strict=True)]
     before = [row] * len(length)
     unscanned = list(range(len(length)))
     scanned: list[int] = []
     while True:
         reached = min(unscanned, key=length.__getitem__)
-        so_far = length[reached]
+        shortest = length[reached]
         if owner[reached] < 0:
             break
         unscanned.remove(reached)
         scanned.append(reached)
         through = owner[reached]
         line = costs[through]
-        base = so_far - line[reached] + prices[reached]
+        base = shortest - line[reached] + prices[reached]
         for column in unscanned:
-            if (there := base + line[column] - prices[column]) < length[column]:
-                length[column] = there
+            if (candidate_length := base + line[column] - prices[column]) < length[column]:
+                length[column] = candidate_length
                 before[column] = through
     for column in scanned:
-        prices[column] += length[column] - so_far
+        prices[column] += length[column] - shortest
     where = {owner[column]: column for column in scanned}
     while True:
         through = before[reached]
@@ -101,7 +105,10 @@ def _augment(costs: Costs, prices: list[float], owner: list[int], row: int) -> N
 
 
 def first_of_equals(costs: Costs, columns: Sequence[int], prices: Sequence[float]) -> list[int]:
-    """Of all assignments that cost as little, the first: row by row the lowest column that the others leave open."""
+    """Of all assignments of equal cost, return the lexicographically first one.
+
+    Each row in turn gets the lowest column that still leaves an optimal assignment for the rows after it.
+    """
     rows = len(columns)
     columns = [*columns, *sorted(set(range(len(prices))) - set(columns))]
     owner = {column: row for row, column in enumerate(columns)}
@@ -109,36 +116,36 @@ def first_of_equals(costs: Costs, columns: Sequence[int], prices: Sequence[float
     for line, own in zip(costs, columns, strict=False):
         least = line[own] - prices[own]
         tight.append([c for c, (cost, price) in enumerate(zip(line, prices, strict=True)) if cost - price == least])
-    # Who has a column that no row has may change it for any that costs nothing to leave open.
+    # A column without a row may be exchanged for any column with price 0 at no cost.
     tight.append([column for column, price in enumerate(prices) if price == 0])
     for row in range(rows):
         for wanted in tight[row]:
-            if wanted >= columns[row] or _changed_hands(row, wanted, columns, owner, tight):
+            if wanted >= columns[row] or _exchange_columns(row, wanted, columns, owner, tight):
                 break
     return columns[:rows]
 
 
-def _changed_hands(row: int, wanted: int, columns: list[int], owner: dict[int, int], tight: list[list[int]]) -> bool:
-    """Give ``wanted`` to ``row`` by a ring of changes among those after it; False where there is none."""
-    came = {wanted: row}
+def _exchange_columns(row: int, wanted: int, columns: list[int], owner: dict[int, int], tight: list[list[int]]) -> bool:
+    """Give ``wanted`` to ``row`` by a cycle of exchanges with later rows; returns False if there is no such cycle."""
+    reached_from = {wanted: row}
     line = [wanted]
     rows = len(tight) - 1
-    is_asked = False
+    has_expanded_unassigned = False
     for column in line:
         if column == columns[row]:
             while True:
-                through = came[column]
-                left, columns[through], owner[column] = columns[through], column, through
+                through = reached_from[column]
+                freed, columns[through], owner[column] = columns[through], column, through
                 if through == row:
                     return True
-                column = left
+                column = freed
         holder = owner[column]
-        if holder >= rows and is_asked:
-            continue  # of those who have what no row has one is asked for all: they may change for the same
-        is_asked |= holder >= rows
+        if holder >= rows and has_expanded_unassigned:
+            continue  # all unassigned columns have the same exchanges: expand only the first
+        has_expanded_unassigned |= holder >= rows
         if holder > row:
             for other in tight[min(holder, rows)]:
-                if other not in came:
-                    came[other] = holder
+                if other not in reached_from:
+                    reached_from[other] = holder
                     line.append(other)
     return False

@@ -1,4 +1,4 @@
-"""Nearest: the agent with the shortest distance acts (the thesis' demonstration, section 5)."""
+"""Nearest: the agent with the lowest cost acts (the demonstration of the thesis, section 5)."""
 
 from __future__ import annotations
 
@@ -7,42 +7,45 @@ from collections.abc import Callable, Sequence
 from middleware.consensus.strategy import Consensus, Report, led_by, refusal, standing
 
 KEPT = 4
-"""How many of the best a summary keeps: one to act, the others to stand by; signed, that many fill a datagram."""
+"""Number of reports in a summary: one agent acts, the others are standbys.  Four signed reports fill a datagram."""
 
 
 class Nearest:
-    """The lowest cost wins; equal costs are decided by the agent's id, so that there is never none and never two."""
+    """The lowest cost wins; ties are broken by uuid, so exactly one agent is assigned if any report is valid."""
 
     name = "nearest"
     version = "2"
     reads: tuple[str, ...] = ()
 
     def find(self, contacts: Sequence[Report]) -> Consensus:
-        """The consensus point; None is assigned where no report counts (``strategy.refusal`` says why)."""
+        """Decide; no agent is assigned if no report is valid (``strategy.refusal`` gives the reason for each)."""
         order = best_of(contacts, self.weigh)
         if not order:
             return Consensus(None, strategy=self.name, reason="no report counts")
         return led_by(self.name, order, order, f"{order[0].cost:.2f}, least of {len(order)}")
 
     def improves(self, current: Report, offer: Report, hysteresis: float) -> bool:
-        """Whether ``offer`` weighs less than ``current`` by more than the share ``hysteresis``.
+        """Return whether ``offer`` weighs less than ``current`` by more than the share ``hysteresis``.
 
-        One that counts for nothing is better than no other, and any that counts is better than it.
+        A valid offer improves on an invalid ``current``; an invalid offer never improves.
         """
         if refusal(offer):
             return False
         return bool(refusal(current)) or self.weigh(offer) < self.weigh(current) * (1.0 - hysteresis)
 
     def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
-        """The best of both."""
+        """Return the best reports of both."""
         return tuple(best_of((*a, *b), self.weigh))
 
     def weigh(self, report: Report) -> float:
-        """The lowest weight wins."""
+        """Return the rank of a report; the lowest wins."""
         return report.cost
 
 
 def best_of(contacts: Sequence[Report], rank: Callable[[Report], float]) -> list[Report]:
-    """The lowest by ``rank``, one of each agent, the lowest first; of several tasks only the first by name counts."""
+    """Return the best reports by ``rank``, one per agent, the best first.
+
+    Of several tasks only the one whose id sorts first counts.
+    """
     counted = standing(contacts, rank)
     return sorted((r for r in counted if r.task == counted[0].task), key=lambda r: (rank(r), r.agent))[:KEPT]

@@ -1,4 +1,4 @@
-"""Weighted vote: which of several options it is; more than half of all weight decides."""
+"""Weighted vote: the option with more than half of the total weight wins."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from middleware.consensus.strategy import Consensus, Report, led_by, standing
 
 
 class WeightedVote(Nearest):
-    """Each agent's newest vote counts by its weight; who reports without a choice may vote but has not yet.
+    """The newest vote of each agent counts with its weight; an agent that reports without a choice has not voted yet.
 
-    An option with more than half of the weight of all that may vote wins at once: no other majority can exist, whoever
-    counts, as long as all reports name the same ``electorate``.  When all have voted and none has so much, the heaviest
-    option wins, and of equally heavy ones that with the lowest hash.  The cheapest agent among the winning side acts.
+    An option with more than half of the weight of all eligible agents wins at once: no other majority can exist,
+    whatever subset of reports a node has, provided that all reports name the same ``electorate``. If all agents have
+    voted without such a majority, the heaviest option wins; ties are broken by the lowest hash. The agent with the
+    lowest cost among the voters of the winning option acts.
     """
 
     name = "weighted_vote"
@@ -23,7 +24,7 @@ class WeightedVote(Nearest):
     reads = ("choice", "weight", "electorate")
 
     def find(self, contacts: Sequence[Report]) -> Consensus:
-        """The consensus point; its ``choice`` is "" where nothing is decided yet."""
+        """Decide; ``choice`` is "" while the vote is undecided."""
         counted = self.merge(contacts, ())
         if not counted:
             return Consensus(None, strategy=self.name, reason="no report counts")
@@ -34,16 +35,16 @@ class WeightedVote(Nearest):
             weights[choice] = math.fsum(r.weight for r in counted if r.choice == choice)
         cast = math.fsum(r.weight for r in counted if r.choice)
         best = min(weights, key=lambda option: (-weights[option], _hash(option)), default="")
-        told = ", ".join(f"{option}: {weight:g}" for option, weight in weights.items())
+        tally = ", ".join(f"{option}: {weight:g}" for option, weight in weights.items())
         is_decided = best != "" and (2.0 * weights[best] > all_weight or cast >= all_weight > 0.0)
         if not is_decided:
-            why = f"{told or 'no vote'}; more than half of {all_weight:g} decides"
+            why = f"{tally or 'no vote'}; more than half of {all_weight:g} decides"
             return led_by(self.name, (), counted, why)
         side = sorted((r for r in counted if r.choice == best), key=lambda r: (r.cost, r.agent))
-        return led_by(self.name, side, counted, f"{best} of {told}", choice=best)
+        return led_by(self.name, side, counted, f"{best} of {tally}", choice=best)
 
     def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
-        """Everybody's newest vote, about the first task by name."""
+        """Return the newest vote of each agent, for the task whose id sorts first."""
         counted = standing((*a, *b), lambda report: -report.sequence)
         return tuple(r for r in counted if r.task == counted[0].task)
 

@@ -91,8 +91,8 @@ class GroupOptimalTests(SynchronousTestCase):
         reports = [Report("a", 1.0, task="s"), Report("a", 2.0, task="t")]
         found = GroupOptimal().find_group(reports, [Item("s"), Item("t"), Item("u")])
         self.assertEqual([point.assigned_agent for point in found], ["a", None, None])
-        self.assertEqual(found[1].reason, "everybody who bid for it has enough to do")
-        self.assertEqual(found[2].reason, "nobody bid for it")
+        self.assertEqual(found[1].reason, "all bidders have reached their capacity")
+        self.assertEqual(found[2].reason, "no agent bid for it")
 
     def test_equal_optima(self) -> None:
         """Among equal optima it is always the same one."""

@@ -144,13 +144,13 @@ class GuardTests(SynchronousTestCase):
     def test_lying(self) -> None:
         """One that names who did not report, somebody twice, crowds, novels, or no consensus at all, has no opinion."""
         for lie, why in (
-            (Consensus("zorro"), "who did not report"),
-            (Consensus("b", ("zorro",)), "who did not report"),
-            (Consensus("b", assigned=("zorro",)), "who did not report"),
+            (Consensus("zorro"), "which did not report"),
+            (Consensus("b", ("zorro",)), "which did not report"),
+            (Consensus("b", assigned=("zorro",)), "which did not report"),
             (Consensus("b", ("b",)), "twice"),
-            (Consensus("b", ("a",) * 1_000_000), "more than there are"),
+            (Consensus("b", ("a",) * 1_000_000), "more agents or numbers"),
             (Consensus("b", reason="x" * 10_000_000), "too long"),
-            (Consensus("b", value=(math.nan,)), "no place"),
+            (Consensus("b", value=(math.nan,)), "not a tuple of valid numbers"),
             (Consensus(["b"]), "TypeError"),  # type: ignore[arg-type]
             ("b", "str"),
             (None, "NoneType"),
@@ -159,15 +159,15 @@ class GuardTests(SynchronousTestCase):
 
     def test_mutable_state(self) -> None:
         """One that answers equal reports in two ways is caught, at once or when it is asked again."""
-        self.assert_falls_back(Guard(Moody(), twice=True), "two answers")
+        self.assert_falls_back(Guard(Moody(), twice=True), "two results")
         later = Guard(Moody())
         self.assertEqual(later.find(TEAM).assigned_agent, "b")
-        self.assertIn("two answers", later.find(TEAM).reason)
+        self.assertIn("two results", later.find(TEAM).reason)
         self.flushLoggedErrors()
 
     def test_order(self) -> None:
         """One that goes by the order of reports is caught, or gets them in one order."""
-        self.assert_falls_back(Guard(OrderBound(), twice=True), "two answers")
+        self.assert_falls_back(Guard(OrderBound(), twice=True), "two results")
         self.assertEqual(Guard(OrderBound()).find(TEAM), Guard(OrderBound()).find(TEAM[::-1]))
 
     def test_late(self) -> None:
@@ -177,7 +177,7 @@ class GuardTests(SynchronousTestCase):
         for _ in range(10):
             self.assertEqual(guard.find(TEAM).assigned_agent, "b")
         self.assertEqual(slow.asked, STRIKES)
-        self.assertIn("asked no more", guard.find(TEAM).reason)
+        self.assertIn("not called again", guard.find(TEAM).reason)
         self.flushLoggedErrors()
 
     def test_late_now_and_then(self) -> None:
@@ -213,12 +213,12 @@ class GuardTests(SynchronousTestCase):
                 return self.answer  # type: ignore[return-value]
 
         for answer, why in (
-            (good[:1], "one answer for each task"),
-            (good[::-1], "one answer for each task"),
-            ((good[0], replace(good[0], task="t")), "gives 'a' more than it takes"),
-            ((good[0], replace(good[1], assigned_agent="zorro")), "who did not report"),
-            (("s", "t"), "no tuple of Consensus"),
-            (None, "no tuple of Consensus"),
+            (good[:1], "one decision for each task"),
+            (good[::-1], "one decision for each task"),
+            ((good[0], replace(good[0], task="t")), "gives 'a' more tasks than its capacity"),
+            ((good[0], replace(good[1], assigned_agent="zorro")), "which did not report"),
+            (("s", "t"), "not return a tuple of Consensus"),
+            (None, "not return a tuple of Consensus"),
         ):
             bad = Bad()
             bad.answer = answer

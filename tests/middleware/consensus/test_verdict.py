@@ -110,14 +110,14 @@ class VerdictTests(SynchronousTestCase):
             (2, "dog2 is better by more than 10% than dog1, who acted"),
         ):
             self.assertEqual(decided(3, acting, assigned=assigned).hysteresis, words)
-        self.assertEqual(decided(1, THREE).hysteresis, "nobody acted before")
+        self.assertEqual(decided(1, THREE).hysteresis, "no agent acted before")
         found = Consensus(THREE[2].uuid, task="t1", reason="divided with 2 others among 3")
         shared = verdict_from("t1", 1, THREE[0], THREE[1:], "group_optimal", "1", found, found.assigned_agent, 0.1)
-        self.assertEqual(shared.hysteresis, "nobody acted before; divided with 2 others among 3")
+        self.assertEqual(shared.hysteresis, "no agent acted before; divided with 2 others among 3")
         open_ = Consensus(None, reason="no vote; more than half of 3 decides")
         words = verdict_from("t1", 1, THREE[0], THREE[1:], "weighted_vote", "1", open_, None, 0.1).hysteresis
         self.assertEqual(words, "no vote; more than half of 3 decides")
-        self.assertIn("nobody is better", decided(2, [member(1, 0.5, EXECUTING), member(2, 0.7)]).hysteresis)
+        self.assertIn("no agent is better", decided(2, [member(1, 0.5, EXECUTING), member(2, 0.7)]).hysteresis)
         self.assertEqual(decided(1, [member(1, None)]).hysteresis, "no report counts")
 
     def test_decoder_is_total(self) -> None:

@@ -108,7 +108,7 @@ class DeploymentTests(FleetCase):
         told = f"1 {manifest.digest[:8]} by laptop {key[:8]} runs, not confined"
         self.assertEqual(self.dog.presence.device.deployed, {"best": told})
         error = self.assertRaises(UnknownStrategy, strategy_for, "deployed:other", deployed=self.deployment.modules)
-        self.assertIn("there are deployed:best", str(error))
+        self.assertIn("deployed: deployed:best", str(error))
         self.assertRaises(UnknownStrategy, strategy_for, "deployed:best")
 
     def test_objections(self) -> None:

@@ -228,7 +228,7 @@ class RefusalTests(SynchronousTestCase):
             ({"camera": {"colour": "rgb"}}, []),
             ({"arm": {}}, ["has no arm"]),
             ({"camera": {"width": 640}}, ["camera width is 208, less than 640"]),
-            ({"camera": {"height": 1}}, ["camera does not say its height"]),
+            ({"camera": {"height": 1}}, ["camera has no property height"]),
             ({"camera": {"colour": "grey"}}, ["camera colour is rgb, not grey"]),
             ({"camera": {"width": "wide"}}, ["camera width is 208, not wide"]),
             ({"arm": {}, "camera": {"width": 209}}, ["has no arm", "camera width is 208, less than 209"]),

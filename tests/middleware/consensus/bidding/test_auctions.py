@@ -114,8 +114,8 @@ class DisseminationTests(AuctionCase):
         self.patch(party, "MAX_CHILDREN", 2)
         self.patch(asker, "error_of", noted)
         for node in outside:
-            around = replace(node.dissemination._around, contacts=lambda: [known])
-            node.dissemination._around = around
+            around = replace(node.dissemination._environment, contacts=lambda: [known])
+            node.dissemination._environment = around
         self.assert_agreed(fleet)
         self.assertEqual(sum("send their bids here" in text for text in refused), len(outside) - 1 - 2)
 
@@ -189,7 +189,7 @@ class HostileTests(AuctionCase):
             forged = Announcement(99, rank, lie).signed(liar.entangled.identity.sign, auction)
             answer = self.ask(fleet, liar, victim, "bid.announce", auction.packed(), forged.packed())
             self.assertIsInstance(answer, Refused)
-            self.assertIn("no member of the task's council signed", str(answer))
+            self.assertIn("no quorum member of the task made it", str(answer))
         fleet.run(2.0)
         for place in range(5):
             self.assertEqual(self.views[place][-1][0].agent, fleet.nodes[1].uuid)
@@ -203,7 +203,7 @@ class HostileTests(AuctionCase):
         forged = Announcement(99, 0, (Entry(Report(liar.uuid, 0.0)),)).signed(liar.entangled.identity.sign, auction)
         party = next(iter(node.dissemination._parties))
         with self.assertRaises(Refused):
-            node.dissemination._heard(party, forged.packed())
+            node.dissemination._process_announcement(party, forged.packed())
 
     def test_bids_for_others(self) -> None:
         """A bid that its agent did not sign, for this very auction, is refused whole."""
