@@ -84,11 +84,11 @@ class ModuleTests(SynchronousTestCase):
             ("x = 1", "a strategy has to define Strategy"),
             ("Strategy = 7", "a strategy has to define Strategy"),
             (SPIN, "a strategy has to define Strategy"),
-            ("class Strategy: pass", "a strategy has find"),
+            ("class Strategy: pass", "a strategy has to define find"),
         ):
             self.assertIn(reason, self.refusal(source), source[:40])
         self.assertIn("a behaviour has to define Behaviour", self.refusal(GOOD, BEHAVIOUR))
-        self.assertIn("a behaviour has look", self.refusal("class Behaviour: pass", BEHAVIOUR))
+        self.assertIn("a behaviour has to define look", self.refusal("class Behaviour: pass", BEHAVIOUR))
 
     def test_what_is_no_strategy_is_refused(self) -> None:
         """A strategy that loops, names a stranger, depends on the order or prefers a report to itself is refused."""
