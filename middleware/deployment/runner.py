@@ -219,7 +219,7 @@ class Runner:
     def _kill(self, why: str) -> None:
         if self.state in (State.LOST, State.OUT):
             return
-            self._log.warn("{name}: process killed: {why}", name=self.manifest.name, why=why)
+        self._log.warn("{name}: process killed: {why}", name=self.manifest.name, why=why)
         self._losses += 1
         self._set_state(State.OUT if self._losses >= STRIKES else State.LOST)
         self._end(why)

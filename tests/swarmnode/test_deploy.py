@@ -135,11 +135,11 @@ class DeployTests(SynchronousTestCase):
         first = self.deployed()
         self.push(FARTHEST + "# two\n")
         self.assertEqual({label[:2] for label in self.deployed().values()}, {"2 "})
-        self.assertIn("went back from version 2: strategy farthest 1 ", self.swarm("rollback farthest"))
+        self.assertIn("rolled back from version 2: strategy farthest 1 ", self.swarm("rollback farthest"))
         self.team.clock.advance(2.0)
         self.assertEqual(self.deployed(), first)
-        self.assertIn("2 was taken back", self.swarm("status"))
-        self.assertIn("nothing before version 1", self.refused("rollback farthest"))
+        self.assertIn("2 was withdrawn", self.swarm("status"))
+        self.assertIn("no version before 1", self.refused("rollback farthest"))
         self.assertIn(
             "not above 2", self.refused(f"push {self.file(FARTHEST)} --name farthest --kind strategy --version 2")
         )
@@ -151,17 +151,17 @@ class DeployTests(SynchronousTestCase):
         self.let_in("farthest")
         path = self.file("def f(:\n")
         self.assertIn("line 1", self.refused(f"push {path} --name farthest --kind strategy"))
-        self.assertIn("cannot be read", self.refused("push /nowhere --name farthest --kind strategy"))
-        self.assertIn("--name must match", self.refused(f"push {path} --name Far/thest --kind strategy"))
+        self.assertIn("cannot read", self.refused("push /nowhere --name farthest --kind strategy"))
+        self.assertIn("does not match", self.refused(f"push {path} --name Far/thest --kind strategy"))
         self.assertIn(
-            "nothing called 'farthest' was pushed; there is nothing at all", self.refused("rollback farthest")
+            "no module 'farthest' was pushed; pushed modules: none", self.refused("rollback farthest")
         )
         big = self.file("#" * 300_000)
         self.assertIn("bytes", self.refused(f"push {big} --name farthest --kind strategy"))
         self.push()
         again = f"push {self.file(FARTHEST)} --name farthest --kind behaviour"
         self.assertIn("is a strategy", self.refused(again))
-        self.assertIn("nothing called 'nearest' was pushed; there is farthest", self.refused("rollback nearest"))
+        self.assertIn("no module 'nearest' was pushed; pushed modules: farthest", self.refused("rollback nearest"))
         self.assertEqual(self.swarm("status").count("farthest"), 1)
 
     def test_keys_and_json(self) -> None:

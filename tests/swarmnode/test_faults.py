@@ -54,7 +54,7 @@ class ChaosTests(SynchronousTestCase):
         self.team(faults=False)
         code, output = self.chaos("dog1 loss")
         self.assertEqual((code, output), (1, ""))
-        self.assertIn('dog1: it allows no faults; write "allow = true" below [faults]', self.shell.said)
+        self.assertIn('dog1: it does not allow faults; set "allow = true" in [faults]', self.shell.said)
 
     def test_wrong_words(self) -> None:
         """A kind, a number and a device that there are not are one line each, which says what to give."""

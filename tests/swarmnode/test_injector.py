@@ -23,7 +23,7 @@ class InjectorTests(SynchronousTestCase):
         return next(device for device in self.stage.devices() if device.name == name)
 
     def asked(self, name: str) -> dict[str, Any]:
-        told: dict[str, Any] = self.stage._called(self.named(name), ASKED)
+        told: dict[str, Any] = self.stage._call(self.named(name), ASKED)
         return told
 
     def turn(self) -> tuple[Any, str]:

@@ -116,7 +116,7 @@ class KnockTests(SynchronousTestCase):
     def test_a_bootstrap_node_may_sign_anything(self, body: object) -> None:
         """An answer that is signed and holds something else raises nothing but Malformed, or is a refusal."""
         whole = knock._sign_body(INVITE.public, HEARD, msgpack.packb(body), signer())
-        said = knock._answered(INVITE.public, EPHEMERAL, whole, random.Random(2))
+        said = knock._encrypt_reply(INVITE.public, EPHEMERAL, whole, random.Random(2))
         with contextlib.suppress(Malformed):
             found = read(said)
             self.assertTrue(isinstance(found, Reply) and isinstance(found.said, str))

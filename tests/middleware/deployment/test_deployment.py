@@ -245,4 +245,4 @@ class DeploymentTests(FleetCase):
         self.deployment = self.allow(FileShelf(folder, full))
         manifest, source = self.version(1)
         self.push(manifest, source)
-        self.assert_refused("best 1 is not on file: No space left on device", runs=1)
+        self.assert_refused("cannot store best 1: No space left on device", runs=1)

@@ -95,11 +95,11 @@ class ModuleTests(SynchronousTestCase):
         for body, reason in (
             ("def find(self, c):\n  while True: pass", "takes more than"),
             ("def find(self, c): return Consensus('x' * 40 if c else None)", "did not report"),
-            ("def find(self, c): return Consensus('x' * 40)", "where nobody reported"),
+            ("def find(self, c): return Consensus('x' * 40)", "without any report"),
             ("def find(self, c): return Consensus(c[0].agent if c else None)", "depends on the order"),
             ("def find(self, c): return None", "raises AttributeError"),
             ("def improves(self, a, b, h): return True", "better than itself"),
-            ("def merge(self, a, b): return tuple(r for r in (*a, *b) if r.cost > 2)", "what merge keeps"),
+            ("def merge(self, a, b): return tuple(r for r in (*a, *b) if r.cost > 2)", "find after merge"),
         ):
             indented = "".join(f"  {line}\n" for line in body.splitlines())
             self.assertIn(reason, self.refusal(f"{BASE}class Strategy(Nearest):\n{indented}"))
