@@ -48,12 +48,12 @@ def main(words: Sequence[str] | None = None, out: TextIO | None = None, ask: Ask
     options = parser().parse_args(words)
     try:
         asker = Asker(options.node, ask)
-        row = asker.links()
+        links = asker.links()
         names = {device.uuid: device.name for device, _ in asker.devices()}
     except (Refusal, NoControl) as problem:
         sys.stderr.write(printable(f"swarm links: {problem}") + "\n")
         return FAILED if isinstance(problem, Refusal) else WRONG
-    rated = sorted(((each, _rate(each)) for each in row), key=lambda pair: (pair[1].score, pair[0]["id"]))
+    rated = sorted(((each, _rate(each)) for each in links), key=lambda pair: (pair[1].score, pair[0]["id"]))
     out.write(_as_json(rated, names) if options.json else _as_text(rated, names))
     return FAILED if any(found.round_trip is None for _, found in rated) else 0
 

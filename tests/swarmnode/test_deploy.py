@@ -141,7 +141,7 @@ class DeployTests(SynchronousTestCase):
         self.assertIn("2 was withdrawn", self.swarm("status"))
         self.assertIn("no version before 1", self.refused("rollback farthest"))
         self.assertIn(
-            "not above 2", self.refused(f"push {self.file(FARTHEST)} --name farthest --kind strategy --version 2")
+            "not higher than 2", self.refused(f"push {self.file(FARTHEST)} --name farthest --kind strategy --version 2")
         )
         self.push(FARTHEST + "# three\n")
         self.assertEqual({label[:2] for label in self.deployed().values()}, {"3 "})
