@@ -61,7 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             sys.stderr.write(f"swarm: no verb {verb!r}; verbs: {', '.join(about)}; see swarm --help\n")
             return 2
         lines = "".join(f"  {name:13}{purpose}\n" for name, purpose in about.items())
-        example = "swarm init --team lab --name vaio\n  swarm demo"
+        example = "swarm init lab --first vaio --page\n  swarm demo"
         sys.stdout.write(f"usage: swarm VERB [options]\n\n{lines}\nexamples:\n  {example}\n\nSee swarm VERB --help.\n")
         return 0
     drop_tls()

@@ -57,7 +57,7 @@ def parser() -> argparse.ArgumentParser:
     example = " nearest.py --name nearest-left --kind strategy"
     push = verb("push", "Publish a new version of a module, signed by this node.", example)
     push.add_argument("file", metavar="FILE", help="Python source, one file")
-    push.add_argument("--name", required=True, help=f"name of the module; tasks use it after {PREFIX}")
+    push.add_argument("--name", required=True, help=f"name of the module; tasks refer to it as {PREFIX}NAME")
     push.add_argument("--kind", required=True, choices=KINDS, help="kind of the module")
     push.add_argument("--version", type=int, metavar="N", help="version, higher than the last one (default: next)")
     back = verb("rollback", "Roll a module back to the previous version.", " nearest-left")

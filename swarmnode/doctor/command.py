@@ -33,7 +33,7 @@ def parser() -> argparse.ArgumentParser:
         description="Diagnose why a node does not reach its team, and print the remedies.",
         epilog="Example: swarm doctor dog1.toml",
     )
-    doctor.add_argument("settings", nargs="?", metavar="SETTINGS", help="settings file of the node (default: none)")
+    doctor.add_argument("settings", nargs="?", metavar="SETTINGS", help="settings file (default: a running node)")
     doctor.add_argument("--node", metavar="NAME", help="running node on this machine, if several run")
     doctor.add_argument("--json", action="store_true", help="print JSON, on one line")
     return doctor

@@ -45,7 +45,7 @@ def main(
 ) -> int:
     """Run the command; returns its exit code."""
     purpose = "Join a closed team with a code of its operator."
-    example = "J4TR8-0ZQ5M-W1N7C-XK2PD@192.168.1.10:8484"
+    example = "K9TJ7-17QR2-Z31JA-KH77T@192.168.1.10:8484"
     join = options("join", purpose, needs_key=False, is_asked=False, example=example)
     join.add_argument("code", metavar="CODE", help="code shown by swarm invite, with or without @HOST:PORT")
     join.add_argument(

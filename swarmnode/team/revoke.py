@@ -17,7 +17,7 @@ def main(words: Sequence[str] | None = None, desk: Desk | None = None) -> int:
     revoke = options("revoke", purpose, example="dog1")
     revoke.add_argument("name", metavar="NAME", help="name of a member or an invitation, or its key in hexadecimal")
     revoke.add_argument("--invitation", action="store_true", help="revoke the invitation of that name, not the member")
-    revoke.add_argument("--all", action="store_true", help="of a bootstrap node: also revoke all that it admitted")
+    revoke.add_argument("--all", action="store_true", help="also revoke all that a bootstrap node admitted or renewed")
     return run(revoke, words, desk, _revoke)
 
 

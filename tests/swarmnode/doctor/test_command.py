@@ -77,7 +77,7 @@ class CommandTests(SynchronousTestCase):
         self.facts = replace(WELL, open_files=(("dog1.toml", 0o644),))
         code, printed, _ = self.run_it(str(self.settings))
         self.assertEqual(code, 1)
-        for part in ("ERROR  key-readable: ", "    why: Its mode is 0644.", "    do:  chmod 600 dog1.toml"):
+        for part in ("ERROR  key-readable: ", "    why: Its mode is 0644.", "    do:  Run chmod 600 dog1.toml"):
             self.assertIn(part, printed)
 
     def test_running_node_is_asked(self) -> None:

@@ -82,11 +82,11 @@ class DiagnosisTests(SynchronousTestCase):
             (
                 {"known": (replace(SILENT_NEAR, is_resolved=False),), "lan": CALLED},
                 "error client-isolation",
-                "The router answers",
+                "The router replies",
             ),
             ({"known": (MEMBER, OFF)}, "warning off", "192.168.1.33"),
             ({"known": (OFF,)}, "warning off", ""),
-            ({"known": (guarded,), "lan": CALLED}, "error peer-firewall", "Open UDP 8484"),
+            ({"known": (guarded,), "lan": CALLED}, "error peer-firewall", "Allow incoming UDP 8484"),
             ({**alone, "host": "192.168.7.7"}, "error wrong-interface", "192.168.1.7"),
             ({**alone, "host": "127.0.0.1"}, "error wrong-interface", "on another machine"),
             (
@@ -109,7 +109,7 @@ class DiagnosisTests(SynchronousTestCase):
         self.check(
             ({"lan": CALLED}, "warning multicast-blocked", "This network does not forward multicast"),
             ({"lan": own}, "warning multicast-blocked", "This network does not forward multicast"),
-            ({"lan": Lan((), True, False)}, "warning multicast-blocked", "This machine does not let"),
+            ({"lan": Lan((), True, False)}, "warning multicast-blocked", "This machine does not receive"),
             ({"lan": Lan((), False, False)}, "warning multicast-blocked", "This machine cannot send"),
         )
 

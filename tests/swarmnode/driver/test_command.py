@@ -85,7 +85,7 @@ class DriverCommandTests(SynchronousTestCase):
         code, output, complaint = self.ground.swarm_driver(f"probe {ROBOT}")
         self.assertEqual((code, complaint), (0, ""))
         self.assertRegex(output, r"first observation after 0\.\d\d s")
-        self.assertRegex(output, r"rate +31\.\d of 31\.25 a second")
+        self.assertRegex(output, r"rate +31\.\d of 31\.25 per second")
         for told in ("mode          T4", "power.level   80 %", "104 x 80 jpeg", "bad frames    0 of ", "range.near"):
             self.assertIn(told, output)
         self.assertNotIn("!", output)
@@ -162,7 +162,7 @@ class DriverCommandTests(SynchronousTestCase):
         """No terminal, a robot that does not move, no robot, two robots: each is one line, with exit code 2."""
         for words, told in (
             (["drive", *BLIND.split()], "is not a terminal"),
-            (["drive", "--kind", "camera"], "a camera does not move"),
+            (["drive", "--kind", "camera"], "a robot of kind camera does not move"),
             (["drive"], "name the robot by --kind"),
             (["probe", "--kind", "aibo", "--config", "x.toml"], "not by both"),
             (["probe", "--kind", "warp"], "known are aibo"),
@@ -201,7 +201,7 @@ class DriverCommandTests(SynchronousTestCase):
         code, output, _ = self.ground.swarm_driver(f"monitor {BLIND} --seconds 1 --picture {self.mktemp()}")
         self.assertEqual((code, "! no picture received" in output), (1, True))
         code, output, _ = self.ground.swarm_driver(f"monitor {ROBOT} --seconds 5 --picture /no/such/folder/x.jpg")
-        self.assertEqual((code, "! /no/such/folder/x.jpg cannot be written" in output), (1, True))
+        self.assertEqual((code, "! cannot write /no/such/folder/x.jpg" in output), (1, True))
         self.connector.is_open = False
         code, output, _ = self.ground.swarm_driver(f"monitor {BLIND}")
         self.assertEqual((code, "! no data within 8 s" in output), (1, True))
