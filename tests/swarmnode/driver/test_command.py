@@ -164,7 +164,7 @@ class DriverCommandTests(SynchronousTestCase):
             (["drive", *BLIND.split()], "is not a terminal"),
             (["drive", "--kind", "camera"], "a robot of kind camera does not move"),
             (["drive"], "name the robot by --kind"),
-            (["probe", "--kind", "aibo", "--config", "x.toml"], "not by both"),
+            (["probe", "--kind", "aibo", "--config", "x.toml"], "not both"),
             (["probe", "--kind", "warp"], "known are aibo"),
             (["probe", "--kind", "aibo"], "option host is missing"),
             (["probe", "--kind", "aibo", "--option", "host"], "KEY=VALUE"),
