@@ -32,14 +32,14 @@ class Asker:
         answer = self._request("dht get", key=key, concern=concern)
         if not isinstance(answer, list):
             raise Refusal(f"the node's reply to a read of {key!r} is not a list of records; update the node")
-        return [_record(hashed_key(key), each) for each in answer]
+        return [_parse_record(hashed_key(key), each) for each in answer]
 
     def devices(self) -> list[tuple[Device, Record]]:
         """Return the team's devices in the order of joining, each with its record; raises ``Refusal``."""
         answer = self._request("devices")
         if not isinstance(answer, list):
             raise Refusal("the node's reply about the devices is not a list of records; update the node")
-        return devices_of([_record(DEVICES, each) for each in answer])
+        return devices_of([_parse_record(DEVICES, each) for each in answer])
 
     def put(self, key: str, name: str, value: bytes) -> int:
         """Store ``value`` in the node's slot; returns the number of replicas that stored it.  Raises ``Refusal``."""
@@ -66,7 +66,7 @@ class Asker:
         raise Refusal("the node closed the connection without a reply; check the log of the node")
 
 
-def _record(key: bytes, fields: dict[str, Any]) -> Record:
+def _parse_record(key: bytes, fields: dict[str, Any]) -> Record:
     value = word.value(fields["value"])
     content = value.encode() if isinstance(value, str) else bytes(value)
     owner = bytes.fromhex(fields["owner"])

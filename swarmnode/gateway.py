@@ -167,7 +167,7 @@ class Gateway:
             from middleware.admission.membership import MemoryMembership
 
             seams = replace(seams, membership=MemoryMembership(self._node.team.guest(seed, name)))
-        settings = _settings_of(self._settings, self._node, name, can)
+        settings = _make_settings(self._settings, self._node, name, can)
         assembly = assembled(settings, seams)
         assert isinstance(assembly.driver, PhoneDriver) and assembly.agent is not None
         phone = _Phone(assembly.node, assembly.agent, assembly.driver, partial(self._on_silence, uuid))
@@ -254,7 +254,7 @@ class _Phone:
         )
 
 
-def _settings_of(settings: Settings, node: SwarmNode, name: str, can: Mapping[str, Any]) -> Settings:
+def _make_settings(settings: Settings, node: SwarmNode, name: str, can: Mapping[str, Any]) -> Settings:
     """Return the settings of a phone's node: it joins through this node, without faults and deployment."""
     known = (node.entangled.contact.address, *settings.node.known_nodes)
     of_node = replace(

@@ -82,12 +82,12 @@ def page(
         operator = YardOperator(TcpConnector(), reactor, address.yard.host, address.yard.port)
     client = TeamClient(node)
     desk = TeamDesk(client, TASKS, DEMO, operator)
-    tls = None if door is None else door(settings, node.store, reactor, wall, seams.rng, _names)
+    tls = None if door is None else door(settings, node.store, reactor, wall, seams.rng, _machine_names)
     team = TeamFallbacks(node, reactor.seconds)
     phones = gateway(settings, node, seams, reactor, client.view)
 
     def urls() -> list[str]:
-        return web.urls(_names())
+        return web.urls(_machine_names())
 
     authority, fingerprint = (b"", "") if tls is None else (tls.signer.pem, tls.signer.fingerprint)
     board = Board(
@@ -133,7 +133,7 @@ def hosts_of(settings: Settings, machine: str) -> frozenset[str]:
     return frozenset({machine.lower(), *local, *settings.web.names})
 
 
-def _names() -> Sequence[str]:
+def _machine_names() -> Sequence[str]:
     """Return the names of this machine in the network: its address, and its mDNS name."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:

@@ -92,7 +92,7 @@ class Options(usage.Options):
         flags = {name.replace("-", "_"): value for name, value in self.items() if name not in ("config", KEY_FILE)}
         try:
             if self[KEY_FILE] is not None:
-                flags["team_key"] = _team_key(self[KEY_FILE])
+                flags["team_key"] = _read_team_key(self[KEY_FILE])
             if self["config"]:
                 settings = Settings.load(self["config"])
             elif self["name"] is None:
@@ -107,7 +107,7 @@ class Options(usage.Options):
             drop_tls()
 
 
-def _team_key(file: str) -> str:
+def _read_team_key(file: str) -> str:
     """Return the secret in a private file, or from standard input, without the newline at its end."""
     content = sys.stdin.buffer.read(MAX_FILE + 1) if file == "-" else read_bytes(Path(file))
     try:

@@ -17,7 +17,7 @@ from middleware.config.settings import TABLES
 
 def json_schema() -> dict[str, Any]:
     """Return the schema; settings with a further conversion step accept fewer values than it allows."""
-    tables = {name: _struct_of(name, cls) for name, cls in TABLES.items()}
+    tables = {name: _make_struct(name, cls) for name, cls in TABLES.items()}
     optional: list[tuple[str, Any, Any]] = [
         (name, table, msgspec.field(default_factory=dict)) for name, table in tables.items() if name != "node"
     ]
@@ -25,7 +25,7 @@ def json_schema() -> dict[str, Any]:
     return msgspec.json.schema(whole)
 
 
-def _struct_of(name: str, cls: type[Any]) -> type[Any]:
+def _make_struct(name: str, cls: type[Any]) -> type[Any]:
     hints = get_type_hints(cls, include_extras=True)
     known: list[tuple[Any, ...]] = []
     for each in fields(cls):

@@ -34,7 +34,7 @@ class NodeService(Service):
         self.assembly = assembled(settings, seams)
         self._seams = seams
         self._fronts = fronts
-        self._open: list[IService] = []
+        self._open_fronts: list[IService] = []
         self._return_call: IDelayedCall | None = None
 
     def startService(self) -> None:
@@ -64,9 +64,9 @@ class NodeService(Service):
         if self._return_call is None and self.running:
             self._log.info("{name} leaves the network for {s:g} s", name=self.settings.node.name, s=seconds)
             self.vanish()
-            self._return_call = self._seams.clock.callLater(seconds, self._return)
+            self._return_call = self._seams.clock.callLater(seconds, self._rejoin)
 
-    def _return(self) -> None:
+    def _rejoin(self) -> None:
         self._return_call = None
         try:
             self.assembly = assembled(self.settings, self._seams)
@@ -74,7 +74,7 @@ class NodeService(Service):
         except FAULTS as error:
             self._log.warn("{name} cannot rejoin the network yet: {error}", name=self.settings.node.name, error=error)
             self.vanish()
-            self._return_call = self._seams.clock.callLater(COMING_BACK, self._return)
+            self._return_call = self._seams.clock.callLater(COMING_BACK, self._rejoin)
 
     def _start_parts(self) -> None:
         node, agent = self.assembly.node, self.assembly.agent
@@ -83,13 +83,13 @@ class NodeService(Service):
         if agent is not None:
             agent.startService()
         for front in self._fronts:
-            self._open.append(front(node))
-            self._open[-1].startService()
+            self._open_fronts.append(front(node))
+            self._open_fronts[-1].startService()
 
     def _stop_agent(self) -> Deferred[object]:
         agent = self.assembly.agent
         return maybeDeferred(lambda: agent.stopService() if agent is not None and agent.running else None)
 
     def _stop_fronts(self) -> Deferred[Any]:
-        ended, self._open = self._open, []
+        ended, self._open_fronts = self._open_fronts, []
         return gatherResults([maybeDeferred(front.stopService) for front in ended])

@@ -10,10 +10,11 @@ A node shows its certificate (its *pass*) in the handshake of a session.  A pass
   alone nor the holder of a leaked code alone can admit a member.
 * ``[2, name, not before, not after, signature, gateway, pass]``: a guest, such as a visitor's phone.  A member with the
   role ``gateway`` signs it, for a day at most; it becomes invalid when the gateway's own pass does.
-* ``[3, word, not before, not after, signature, grant]``: a renewal of format 0 or 1.  ``word`` is the operator-signed
-  content, ``[grant]`` or ``[invite, wish, proof, name, admitter]``; ``signature`` and ``grant`` are those of the
-  bootstrap node.  Name and roles follow from ``word``, so a renewal changes only the dates.  Only certificates that
-  the operator issued for ``YEAR`` or longer are renewed, and only by bootstrap nodes with such a certificate.
+* ``[3, content, not before, not after, signature, grant]``: a renewal of format 0 or 1.  ``content`` has the fields
+  that the operator signed, ``[grant]`` or ``[invite, wish, proof, name, admitter]``; the bootstrap node adds its
+  ``signature`` and its ``grant``.  Name and roles follow from ``content``, so a renewal changes only the dates.  Only
+  certificates that the operator issued for ``YEAR`` or longer are renewed, and only by bootstrap nodes that have such
+  a certificate.
 """
 
 from __future__ import annotations
@@ -131,12 +132,12 @@ def renewed(bootstrap: Identity, grant: bytes, member: Member, shown: bytes, now
 
     ``grant`` is the grant of ``bootstrap``.  Raises ``Malformed`` for the pass of a guest.
     """
-    word, end = _signed_content_of(member, shown), now + member.life
-    signature = bootstrap.sign(_renewal_content(member.public, word, now, end))
-    return bytes(msgpack.packb([3, word, now, end, signature, grant]))
+    content, end = _extract_signed_content(member, shown), now + member.life
+    signature = bootstrap.sign(_renewal_content(member.public, content, now, end))
+    return bytes(msgpack.packb([3, content, now, end, signature, grant]))
 
 
-def _signed_content_of(member: Member, shown: bytes) -> list[Any]:
+def _extract_signed_content(member: Member, shown: bytes) -> list[Any]:
     """Return the operator-signed content of the pass of ``member``."""
     kind, *rest = unpacked(shown)
     if kind == 0:
@@ -151,8 +152,8 @@ def _signed_content_of(member: Member, shown: bytes) -> list[Any]:
 
 def grant_of(operator: bytes, shown: bytes) -> tuple[Grant, bytes] | None:
     """Return the operator's grant in a renewed pass, parsed and packed; None if the member joined by a code."""
-    word = unpacked(shown)[1]
-    return (_grant(operator, word[0]), word[0]) if len(word) == 1 else None
+    content = unpacked(shown)[1]
+    return (_parse_grant(operator, content[0]), content[0]) if len(content) == 1 else None
 
 
 def entries_of(public: bytes, shown: bytes) -> list[bytes]:
@@ -189,13 +190,13 @@ def member_of(operator: bytes, public: bytes, shown: bytes) -> Member:
         kind, *rest = fields
         if kind == 0:
             [whole] = rest
-            return member_by(_own_grant(operator, public, whole))
+            return member_by(_parse_own_grant(operator, public, whole))
         if kind == 1:
-            return _chain(operator, public, rest)
+            return _verify_chain(operator, public, rest)
         if kind == 2:
-            return _guest(operator, public, rest)
+            return _verify_guest(operator, public, rest)
         if kind == 3:
-            return _renewal(operator, public, rest)
+            return _verify_renewal(operator, public, rest)
     except (ValueError, TypeError) as error:
         raise Malformed("the pass has invalid fields") from error
     raise Malformed("the pass is of an unknown kind")
@@ -207,27 +208,31 @@ def member_by(grant: Grant) -> Member:
     return Member(grant.public, grant.name, grant.roles, begin, end, since=begin, life=grant.life)
 
 
-def _renewal(operator: bytes, public: bytes, fields: list[Any]) -> Member:
-    word, begin, end, signature, whole = fields
-    if not isinstance(word, list):
+def _verify_renewal(operator: bytes, public: bytes, fields: list[Any]) -> Member:
+    content, begin, end, signature, whole = fields
+    if not isinstance(content, list):
         raise Malformed("the renewal has no operator-signed content")
-    member = member_by(_own_grant(operator, public, word[0])) if len(word) == 1 else _invited(operator, public, word)
+    member = (
+        member_by(_parse_own_grant(operator, public, content[0]))
+        if len(content) == 1
+        else _verify_invited(operator, public, content)
+    )
     if not member.is_renewable:
         raise Forged("the operator did not issue this certificate as renewable")
-    grant = _grant(operator, whole)
+    grant = _parse_grant(operator, whole)
     if BOOTSTRAP not in grant.roles or grant.life < YEAR:
         raise Forged("the renewal is signed by a node that may not renew")
     moment(begin, max(0, max(member.since, grant.not_before) - SKEW))
     moment(end, begin + 1, begin + member.life)
-    if not verified(grant.public, _renewal_content(public, word, begin, end), sized(signature, 64)):
+    if not verified(grant.public, _renewal_content(public, content, begin, end), sized(signature, 64)):
         raise Forged("the renewal's signature is not valid")
     return replace(member, not_before=begin, not_after=end, renewer=grant.public)
 
 
-def _invited(operator: bytes, public: bytes, word: list[Any]) -> Member:
+def _verify_invited(operator: bytes, public: bytes, content: list[Any]) -> Member:
     """Return the member that joined by a code, without dates; checks that invitation and wish allow the name."""
-    packed, wish, signature, name, admitter = word
-    invite = _invitation(operator, public, packed, wish, signature)
+    packed, wish, signature, name, admitter = content
+    invite = _verify_invitation(operator, public, packed, wish, signature)
     if not invite.allows(named(name), wish):
         raise Forged("the invitation does not allow this name")
     since = max(0, invite.not_before - SKEW)
@@ -235,7 +240,7 @@ def _invited(operator: bytes, public: bytes, word: list[Any]) -> Member:
     return Member(public, name, invite.roles, 0, 0, *origin, uses=invite.uses, since=since, life=invite.life)
 
 
-def _invitation(operator: bytes, public: bytes, packed: Any, wish: Any, signature: Any) -> Invite:
+def _verify_invitation(operator: bytes, public: bytes, packed: Any, wish: Any, signature: Any) -> Invite:
     """Verify that the invitation's key signed ``public`` and ``wish``, and return the invitation."""
     invite = opened(operator, packed)
     if not isinstance(invite, Invite):
@@ -247,12 +252,12 @@ def _invitation(operator: bytes, public: bytes, packed: Any, wish: Any, signatur
     return invite
 
 
-def _chain(operator: bytes, public: bytes, fields: list[Any]) -> Member:
+def _verify_chain(operator: bytes, public: bytes, fields: list[Any]) -> Member:
     packed, wish, signature, name, begin, end, admission, whole = fields
-    invite = _invitation(operator, public, packed, wish, signature)
+    invite = _verify_invitation(operator, public, packed, wish, signature)
     moment(begin, max(0, invite.not_before - SKEW), invite.not_after)
     moment(end, begin + 1, begin + invite.life)
-    grant = _grant(operator, whole)
+    grant = _parse_grant(operator, whole)
     # A renewed bootstrap node outlives its grant; the grant stays valid for its roles until it is revoked.
     is_over = begin >= grant.not_after and grant.life < YEAR
     if BOOTSTRAP not in grant.roles or begin < grant.not_before - SKEW or is_over:
@@ -264,7 +269,7 @@ def _chain(operator: bytes, public: bytes, fields: list[Any]) -> Member:
     return Member(public, name, invite.roles, begin, end, *origin, uses=invite.uses, since=begin, life=invite.life)
 
 
-def _guest(operator: bytes, public: bytes, fields: list[Any]) -> Member:
+def _verify_guest(operator: bytes, public: bytes, fields: list[Any]) -> Member:
     name, begin, end, signature, gateway, own = fields
     if not isinstance(own, bytes):
         raise Malformed("the guest's pass does not contain a gateway's pass")
@@ -282,15 +287,15 @@ def _guest_content(public: bytes, name: str, begin: int, end: int) -> bytes:
     return _GUEST + bytes(msgpack.packb([public, name, begin, end]))
 
 
-def _grant(operator: bytes, whole: Any) -> Grant:
+def _parse_grant(operator: bytes, whole: Any) -> Grant:
     grant = opened(operator, whole)
     if not isinstance(grant, Grant):
         raise Malformed("the pass does not contain a grant")
     return grant
 
 
-def _own_grant(operator: bytes, public: bytes, whole: Any) -> Grant:
-    grant = _grant(operator, whole)
+def _parse_own_grant(operator: bytes, public: bytes, whole: Any) -> Grant:
+    grant = _parse_grant(operator, whole)
     if grant.public != public:
         raise Forged("the grant is for another key")
     return grant
@@ -304,5 +309,5 @@ def _admission_content(invitation: bytes, public: bytes, name: str, begin: int, 
     return _ADMIT + bytes(msgpack.packb([invitation, public, name, begin, end]))
 
 
-def _renewal_content(public: bytes, word: list[Any], begin: int, end: int) -> bytes:
-    return _RENEW + bytes(msgpack.packb([public, word, begin, end]))
+def _renewal_content(public: bytes, content: list[Any], begin: int, end: int) -> bytes:
+    return _RENEW + bytes(msgpack.packb([public, content, begin, end]))

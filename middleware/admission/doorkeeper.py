@@ -62,7 +62,7 @@ class Doorkeeper:
         self._met: OrderedDict[bytes, Member] = OrderedDict()
         self._shown: dict[bytes, bytes] = {}  # passes of members in ``_met`` that are not on the list
         self._authorities: dict[bytes, Authority] = {}
-        self._judged_at = (b"", 0.0)
+        self._cached_at = (b"", 0.0)
 
     @property
     def me(self) -> Member:
@@ -81,14 +81,14 @@ class Doorkeeper:
         except RemoteError:
             return FOREIGN
         now = self._wall()
-        return self._roll.refusal(self._roll.known_as(member, now), now) or self._count_guest(member)
+        return self._roll.refusal(self._roll.known_as(member, now), now) or self._check_guest_quota(member)
 
     def admit(self, public: bytes, shown: bytes) -> str:
         """Judge a node that has confirmed its session, and remember it if it is accepted."""
         refusal = self.judge(public, shown)
         if not refusal:
             member = self._verify_pass(public, shown)
-            refusal = self._list(public, shown, member)
+            refusal = self._add_to_list(public, shown, member)
         if not refusal:
             self._met[public] = member
             self._met.move_to_end(public)
@@ -108,7 +108,7 @@ class Doorkeeper:
         """Return the current roles of a key; none for strangers and for revoked or expired members."""
         return frozenset(self.authority(public).roles)
 
-    def _list(self, public: bytes, shown: bytes, member: Member) -> str:
+    def _add_to_list(self, public: bytes, shown: bytes, member: Member) -> str:
         """Add a member to the membership list, so that all nodes know it and the operator can revoke it by name.
 
         Returns a refusal if the list is full, because only listed keys are members.  Guests are not listed; their
@@ -125,7 +125,7 @@ class Doorkeeper:
                 return UNLISTED if is_off_roll else ""
         return ""
 
-    def _count_guest(self, member: Member) -> str:
+    def _check_guest_quota(self, member: Member) -> str:
         """Return a refusal if the guest's gateway already has the maximum number of other guests here."""
         if member.voucher is None:
             return ""
@@ -151,10 +151,10 @@ class Doorkeeper:
     def authority(self, owner: bytes) -> Authority:
         """Return whether the certificate of an owner of records is valid now, with its roles and name."""
         now = self._wall()
-        digest, at = self._judged_at
+        digest, at = self._cached_at
         if digest != self._roll.digest or not 0.0 <= now - at < JUDGED_S:
             self._authorities.clear()
-            self._judged_at = (self._roll.digest, now)
+            self._cached_at = (self._roll.digest, now)
         found = self._authorities.get(owner)
         if found is None:
             found = self._authorities[owner] = self._compute_authority(owner, now)

@@ -68,7 +68,7 @@ class Gossip:
         entry = self._roll.add(packed, self._wall())
         if entry is not None:
             self._on_new(entry)
-            self._spread([packed], ())
+            self._push([packed], ())
         return entry
 
     def met(self, contact: Contact) -> None:
@@ -95,11 +95,11 @@ class Gossip:
         finally:
             # Many new entries at once occur at a newcomer only; otherwise the others catch up by comparison.
             if len(fresh) <= NEWS:
-                self._spread(fresh, but)
+                self._push(fresh, but)
 
-    def _spread(self, packed: list[bytes], but: tuple[bytes, ...]) -> None:
+    def _push(self, packed: list[bytes], but: tuple[bytes, ...]) -> None:
         others = [contact for contact in self._contacts() if contact.public not in but]
-        for page in _pages(packed):
+        for page in _split_pages(packed):
             for contact in self._rng.sample(others, min(SPREAD, len(others))):
                 self._endpoint.ask(contact, "roll.tell", page, changes=True).addErrback(self._log_unexpected)
 
@@ -123,7 +123,7 @@ class Gossip:
                 break
             self._add_received(found, (contact.public,))
             wanted = [each for each in wanted if each not in received]
-        for page in _pages(self._roll.packed(sorted(mine - theirs))):
+        for page in _split_pages(self._roll.packed(sorted(mine - theirs))):
             await self._endpoint.ask(contact, "roll.tell", page, changes=True)
 
     def _answer_tell(self, peer: Contact, entries: list[object]) -> None:
@@ -134,14 +134,14 @@ class Gossip:
         return None if digest == self._roll.digest else self._roll.digests
 
     def _answer_fetch(self, peer: Contact, wanted: list[object]) -> list[bytes]:
-        return next(_pages(self._roll.packed(each for each in wanted[:PAGE] if isinstance(each, bytes))), [])
+        return next(_split_pages(self._roll.packed(each for each in wanted[:PAGE] if isinstance(each, bytes))), [])
 
     def _log_unexpected(self, failure: Failure) -> None:
         if failure.check(EntangledError) is None:
             self._log.failure("while sending entries of the membership list", failure)
 
 
-def _pages(packed: Iterable[bytes]) -> Iterator[list[bytes]]:
+def _split_pages(packed: Iterable[bytes]) -> Iterator[list[bytes]]:
     page: list[bytes] = []
     size = 0
     for each in packed:

@@ -70,7 +70,7 @@ class Reception:
         self._rng = rng
         self._answers: OrderedDict[bytes, bytes] = OrderedDict()
         self._under_way: dict[bytes, str] = {}
-        self._refused = refused
+        self._on_refused = refused
         self._logged = Noted()
         self._request_rate = TokenBucket(RATE)
         self._hint_rate = TokenBucket(HINTS)
@@ -102,10 +102,10 @@ class Reception:
         if heard.public in self._under_way:
             return  # the newcomer retransmits
         self._under_way[heard.public] = ""
-        decided = Deferred.fromCoroutine(self._decide(heard, invite, packed))
+        decided = Deferred.fromCoroutine(self._decide_request(heard, invite, packed))
         decided.addBoth(self._reply, heard, invite, digest, source).addErrback(self._log_unexpected)
 
-    async def _decide(self, heard: Knock, invite: Invite, packed: bytes) -> bytes | str:
+    async def _decide_request(self, heard: Knock, invite: Invite, packed: bytes) -> bytes | str:
         """Return the pass of the newcomer, or the code of the refusal."""
         now = int(self._wall())
         me, own = self._roll.granted(self._identity.public), self._roll.member(self._identity.public, now)
@@ -158,10 +158,12 @@ class Reception:
             result.trap(EntangledError)
             self._log.warn("cannot admit a newcomer: {problem}", problem=result.getErrorMessage())
             result = "later"
-        signer = self._signer(invite)
+        signer = self._make_signer(invite)
         if isinstance(result, bytes) and signer is not None:
             answer = knock.welcome(invite.public, heard, self._build_welcome(result), signer, self._rng)
-            self._log.info("admitted by the invitation of {name}: {public}", name=invite.name, public=heard.public.hex())
+            self._log.info(
+                "admitted by the invitation of {name}: {public}", name=invite.name, public=heard.public.hex()
+            )
         else:
             code = result if isinstance(result, str) else "role"
             self._log_refusal(heard.public, code, source, invite.name)
@@ -176,7 +178,7 @@ class Reception:
         self._send(answer, source)
         return None
 
-    def _signer(self, invite: Invite) -> Signer | None:
+    def _make_signer(self, invite: Invite) -> Signer | None:
         """Return the signer of a reply; None if this node is not a bootstrap node or lacks the terms."""
         me, terms = self._roll.granted(self._identity.public), self._roll.terms_of(invite.public)
         if me is None or BOOTSTRAP not in me[0].roles or terms is None:
@@ -189,10 +191,8 @@ class Reception:
 
     def _log_refusal(self, who: bytes, code: str, source: Address, name: str = "") -> None:
         """Log a refusal once per newcomer and reason; invented ids share one entry, so they cannot fill the log."""
-        self._refused(b"" if code == "unknown" else who, source, code)
+        self._on_refused(b"" if code == "unknown" else who, source, code)
         if not self._logged.is_new(self._now(), who, code):
             return
         via = f" by the invitation of {name}" if name else ""
-        self._log.warn(
-            "rejected{via}, from {source}: {code}: {why}", via=via, source=source, code=code, why=WHY[code]
-        )
+        self._log.warn("rejected{via}, from {source}: {code}: {why}", via=via, source=source, code=code, why=WHY[code])

@@ -179,7 +179,7 @@ class Roll:
         if key in self._held:
             return None
         entry = self._parse(packed)
-        if entry.until <= now or self._is_void(entry, now):
+        if entry.until <= now or self._is_invalid(entry, now):
             return None
         before = self._slots.get(entry.slot)
         if before is not None and (entry.rank, packed) <= (self._held[before].entry.rank, self._held[before].packed):
@@ -191,9 +191,11 @@ class Roll:
         self._check_room(entry, packed, now)
         self._insert(key, Held(entry, packed))
         if isinstance(entry, Revoke) or (isinstance(entry, Grant) and before is not None):
-            self._drop_void(self._held, now)
+            self._drop_invalid(self._held, now)
         elif isinstance(entry, Grant):
-            self._drop_void([self._slots[slot] for slot in [(Renewal.kind, entry.public)] if slot in self._slots], now)
+            self._drop_invalid(
+                [self._slots[slot] for slot in [(Renewal.kind, entry.public)] if slot in self._slots], now
+            )
         return entry
 
     def expire(self, now: float) -> int:
@@ -207,11 +209,11 @@ class Roll:
 
     def revoked(self, public: bytes) -> Revoke | None:
         """Return the revocation of a member's or an invitation's key."""
-        return self._at(Revoke, public)
+        return self._find(Revoke, public)
 
     def granted(self, public: bytes) -> tuple[Grant, bytes] | None:
         """Return the operator's grant for ``public``, parsed and packed."""
-        found, renewal = self._held_at(Grant, public), self.renewal(public)
+        found, renewal = self._find_packed(Grant, public), self.renewal(public)
         other = None if renewal is None else renewal.grant
         if found is None or (other is not None and found[0].not_before < other[0].not_before):
             return other
@@ -219,36 +221,36 @@ class Roll:
 
     def invited(self, name: bytes) -> tuple[Invite, bytes] | None:
         """Return the invitation with that id, parsed and packed."""
-        return self._held_at(Invite, self._by_id.get(name, b""))
+        return self._find_packed(Invite, self._by_id.get(name, b""))
 
     def terms_of(self, invitation: bytes) -> bytes | None:
         """Return the encrypted terms of the invitation with that public key; None if they are not known."""
-        entry = self._at(Terms, invitation)
+        entry = self._find(Terms, invitation)
         return None if entry is None else entry.sealed
 
     def admitted(self, public: bytes) -> Admission | None:
         """Return the admission of ``public``."""
-        return self._at(Admission, public)
+        return self._find(Admission, public)
 
     def renewal(self, public: bytes) -> Renewal | None:
         """Return the newest renewal of the certificate of ``public``."""
-        return self._at(Renewal, public)
+        return self._find(Renewal, public)
 
     def secrets(self) -> list[Secret]:
         """Return the statements with the team's secrets, newest first."""
-        return sorted(self._all(Secret), key=lambda each: -each.number)
+        return sorted(self._list_kind(Secret), key=lambda each: -each.number)
 
     def invites(self) -> list[Invite]:
         """Return all known invitations, oldest first."""
-        return sorted(self._all(Invite), key=lambda each: each.not_before)
+        return sorted(self._list_kind(Invite), key=lambda each: each.not_before)
 
     def revocations(self) -> list[Revoke]:
         """Return all revocations."""
-        return self._all(Revoke)
+        return self._list_kind(Revoke)
 
     def admissions(self) -> list[Admission]:
         """Return all admissions by bootstrap nodes."""
-        return self._all(Admission)
+        return self._list_kind(Admission)
 
     def refusal(self, member: Member, now: float) -> str:
         """Return ``revoked``, ``expired``, ``early`` or ``role`` for a key that is not a member; empty for a member."""
@@ -319,8 +321,8 @@ class Roll:
 
     def remembered(self, now: float) -> list[tuple[Member, str]]:
         """Return all current and former members by name, each with its refusal (empty for a current member)."""
-        publics = [each.member.public for each in self._all(SignedPass)]
-        publics += [each.public for each in self._all(Grant)]
+        publics = [each.member.public for each in self._list_kind(SignedPass)]
+        publics += [each.public for each in self._list_kind(Grant)]
         known = [each for public in dict.fromkeys(publics) if (each := self.member(public, now)) is not None]
         return [(each, self.refusal(each, now)) for each in sorted(known, key=lambda each: (each.name, each.public))]
 
@@ -334,8 +336,8 @@ class Roll:
         A bootstrap node that the operator named after ``since`` does not count, nor does one that ends within two
         ``STEP``: bootstrap nodes renew each other long before that, so it is offline.
         """
-        publics = {each.public for each in self._all(Grant)}
-        publics |= {each.member.public for each in self._all(Renewal)}
+        publics = {each.public for each in self._list_kind(Grant)}
+        publics |= {each.member.public for each in self._list_kind(Renewal)}
         for grant in map(self.granted, publics):
             if grant is None or grant[0].public == public or grant[0].not_before > since:
                 continue
@@ -404,7 +406,7 @@ class Roll:
             return False
         return renewal.not_before <= now + SKEW
 
-    def _is_void(self, entry: Entry, now: float) -> bool:
+    def _is_invalid(self, entry: Entry, now: float) -> bool:
         """Return whether an admission or a renewal is invalid at any time."""
         if not isinstance(entry, SignedPass):
             return False
@@ -421,9 +423,9 @@ class Roll:
             return True
         return member.renewer != member.public and not self._is_renewal_valid(member, now)
 
-    def _drop_void(self, keys: Iterable[bytes], now: float) -> None:
+    def _drop_invalid(self, keys: Iterable[bytes], now: float) -> None:
         """Drop entries that a revocation or a later grant invalidated; that statement also rejects them when shown."""
-        void = [key for key in keys if self._is_void(self._held[key].entry, now)]
+        void = [key for key in keys if self._is_invalid(self._held[key].entry, now)]
         members = [each.member for key in void if isinstance(each := self._held[key].entry, SignedPass)]
         for key in void:
             self._remove(key)
@@ -448,16 +450,16 @@ class Roll:
             if not users:
                 del self._uses[entry.member.invitation]
 
-    def _held_at(self, kind: type[Kind], public: bytes) -> tuple[Kind, bytes] | None:
+    def _find_packed(self, kind: type[Kind], public: bytes) -> tuple[Kind, bytes] | None:
         key = self._slots.get((kind.kind, public))
         held = None if key is None else self._held[key]
         return (held.entry, held.packed) if held is not None and isinstance(held.entry, kind) else None
 
-    def _at(self, kind: type[Kind], public: bytes) -> Kind | None:
-        found = self._held_at(kind, public)
+    def _find(self, kind: type[Kind], public: bytes) -> Kind | None:
+        found = self._find_packed(kind, public)
         return None if found is None else found[0]
 
-    def _all(self, kind: type[Kind]) -> list[Kind]:
+    def _list_kind(self, kind: type[Kind]) -> list[Kind]:
         return [held.entry for held in self._held.values() if isinstance(held.entry, kind)]
 
     def _insert(self, key: bytes, held: Held) -> None:

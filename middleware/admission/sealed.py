@@ -23,7 +23,7 @@ def sealed(message: bytes, to: bytes, shared: bytes, about: bytes, rng: random.R
     """
     secret = rng.randbytes(KEY)
     public = bindings.crypto_scalarmult_base(secret)
-    key = _key(secret, to, public, to, shared)
+    key = _derive_key(secret, to, public, to, shared)
     return public + bindings.crypto_aead_chacha20poly1305_ietf_encrypt(message, about, _NONCE, key)
 
 
@@ -32,14 +32,14 @@ def opened(whole: bytes, secret: bytes, shared: bytes, about: bytes) -> bytes:
     if len(whole) < OVERHEAD:
         raise Forged("the encrypted message is too short")
     public = whole[:KEY]
-    key = _key(secret, public, public, bindings.crypto_scalarmult_base(secret), shared)
+    key = _derive_key(secret, public, public, bindings.crypto_scalarmult_base(secret), shared)
     try:
         return bindings.crypto_aead_chacha20poly1305_ietf_decrypt(whole[KEY:], about, _NONCE, key)
     except (CryptoError, ValueError) as error:
         raise Forged("the message does not decrypt") from error
 
 
-def _key(secret: bytes, public: bytes, sender: bytes, receiver: bytes, shared: bytes) -> bytes:
+def _derive_key(secret: bytes, public: bytes, sender: bytes, receiver: bytes, shared: bytes) -> bytes:
     try:
         agreed = bindings.crypto_scalarmult(secret, public)
     except (CryptoError, RuntimeError, ValueError, TypeError) as error:

@@ -198,7 +198,7 @@ class Secret(Entry):
         if whole is None:
             return None
         try:
-            found = unsealed(whole, member.exchange_secret, _shared(self.number), b"")
+            found = unsealed(whole, member.exchange_secret, _derive_shared(self.number), b"")
         except Forged:
             return None
         return found if self.is_it(found) else None
@@ -217,7 +217,7 @@ def sealed_secret(
     secret: bytes, number: int, members: Iterable[bytes], at: int, grace: int, rng: random.Random
 ) -> Secret:
     """Return the statement that gives ``secret`` to the ``members`` (public keys) only."""
-    pairs = [(each, sealed(secret, exchange_key(each), _shared(number), b"", rng)) for each in sorted(members)]
+    pairs = [(each, sealed(secret, exchange_key(each), _derive_shared(number), b"", rng)) for each in sorted(members)]
     return Secret(number, at, grace, at + MAX_LIFE, mark_of(secret), tuple(pairs))
 
 
@@ -246,7 +246,7 @@ def mark_of(secret: bytes) -> bytes:
 
 def signed(operator: Identity, statement: Statement) -> bytes:
     """Pack and sign ``statement``; raises ``ValueError`` if it is not valid."""
-    fields = _fields(statement)
+    fields = _to_fields(statement)
     try:
         _parse_fields(fields)
     except Malformed as error:
@@ -316,7 +316,7 @@ def sized(value: object, size: int) -> bytes:
     return value
 
 
-def _fields(statement: Statement) -> list[Any]:
+def _to_fields(statement: Statement) -> list[Any]:
     kind = _KINDS.index(type(statement))
     if isinstance(statement, Secret):
         pairs = [list(pair) for pair in statement.sealed]
@@ -381,5 +381,5 @@ def _signed_content(operator: bytes, fields: list[Any]) -> bytes:
     return DOMAIN + operator + bytes(msgpack.packb(fields))
 
 
-def _shared(number: int) -> bytes:
+def _derive_shared(number: int) -> bytes:
     return hashlib.blake2s(DOMAIN + number.to_bytes(8), person=b"number").digest()

@@ -30,7 +30,7 @@ class Uses:
         """Put the uses of ``invite``; fires when a majority stored them, fails with a ``WeatherError``."""
         name = invitation_id(invite.public)
         puts = [self._space.put((name, number)) for number in range(invite.uses)]
-        return gatherResults(puts, consumeErrors=True).addErrback(_first)
+        return gatherResults(puts, consumeErrors=True).addErrback(_unwrap_first_error)
 
     def take(self, invite: Invite) -> Deferred[bool]:
         """Take one use of ``invite``; fires with whether one was left, fails with a ``WeatherError`` if undecidable."""
@@ -42,6 +42,6 @@ class Uses:
         self._space.stop()
 
 
-def _first(failure: Failure) -> Failure:
+def _unwrap_first_error(failure: Failure) -> Failure:
     """Return the original failure instead of the ``FirstError`` around it."""
     return failure.value.subFailure if isinstance(failure.value, FirstError) else failure

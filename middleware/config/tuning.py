@@ -75,7 +75,7 @@ class Tuning:
             except Invalid as wrong:
                 for other, old in before.items():
                     self._knobs[other].turn(old)
-                raise _refused(key, wrong) from None
+                raise _make_refusal(key, wrong) from None
         self._stored.update(changes)
         self._store.note(NOTE, bytes(msgpack.packb(self._stored)))
         return self.told()
@@ -83,11 +83,11 @@ class Tuning:
     def _check_change(self, key: object, value: object) -> Any:
         if not isinstance(key, str) or key not in self._knobs:
             remedy = f"the nearest is {nearest_of(str(key), self._knobs)}" if self._knobs else "leave it unchanged"
-            raise _refused(key, Invalid("", "cannot be changed on this device", remedy))
+            raise _make_refusal(key, Invalid("", "cannot be changed on this device", remedy))
         try:
             return self._knobs[key].check(value)
         except Invalid as wrong:
-            raise _refused(key, wrong) from None
+            raise _make_refusal(key, wrong) from None
 
     def answer_settings(self, peer: Contact) -> list[list[object]]:
         """Answer a request for the settings."""
@@ -134,7 +134,7 @@ def answer_tuning(node: SwarmNode, settings: Settings, body: Capabilities | None
     return tuning
 
 
-def _refused(key: object, wrong: Invalid) -> Refused:
+def _make_refusal(key: object, wrong: Invalid) -> Refused:
     return Refused(f"{str(key)[:64]}: {wrong.problem}; {wrong.remedy}", WRONG)
 
 

@@ -61,7 +61,7 @@ def confine(parent: int) -> list[str]:
 
     ``parent`` is the id of the process with which this one ends.
     """
-    held = ["limits"] if _limit() else []
+    held = ["limits"] if _set_limits() else []
     if not sys.platform.startswith("linux"):
         return held
     libc = ctypes.CDLL(None, use_errno=True)
@@ -73,8 +73,8 @@ def confine(parent: int) -> list[str]:
         ("no capabilities", lambda: _drop_capabilities(libc)),
         ("no new rights", lambda: libc.prctl(_PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0) == 0),
         ("no tracing", lambda: libc.prctl(_PR_SET_DUMPABLE, 0, 0, 0, 0) == 0),
-        ("ends with node", lambda: _die_with(libc, parent)),
-        ("seccomp", lambda: _filter(libc, platform.machine())),
+        ("ends with node", lambda: _end_with_parent(libc, parent)),
+        ("seccomp", lambda: _install_filter(libc, platform.machine())),
     ]
     for name, step in steps:
         with suppress(OSError, ValueError, AttributeError):
@@ -100,7 +100,7 @@ def filter_program(machine: str) -> bytes:
     return b"".join(struct.pack("=HBBI", *line) for line in lines)
 
 
-def _limit() -> bool:
+def _set_limits() -> bool:
     used = 0
     with suppress(OSError, ValueError, IndexError), open("/proc/self/statm", encoding="ascii") as file:
         used = int(file.read().split()[0]) * resource.getpagesize()
@@ -143,7 +143,7 @@ def _drop_capabilities(libc: ctypes.CDLL) -> bool:
     return bool(libc.capset(header, bytes(24)) == 0)
 
 
-def _die_with(libc: ctypes.CDLL, parent: int) -> bool:
+def _end_with_parent(libc: ctypes.CDLL, parent: int) -> bool:
     if libc.prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL), 0, 0, 0) != 0:
         return False
     if os.getppid() != parent:
@@ -151,7 +151,7 @@ def _die_with(libc: ctypes.CDLL, parent: int) -> bool:
     return True
 
 
-def _filter(libc: ctypes.CDLL, machine: str) -> bool:
+def _install_filter(libc: ctypes.CDLL, machine: str) -> bool:
     program = ctypes.create_string_buffer(filter_program(machine))
     size = (len(program) - 1) // 8
     # struct sock_fprog: a count and, after padding, the address of the instructions.

@@ -98,7 +98,7 @@ class Deployment:
         self._running: dict[str, tuple[Runner, Record]] = {}
         self._starting: dict[str, tuple[Runner, Record]] = {}
         self._previous: dict[str, tuple[Runner, Record]] = {}
-        self._refused: dict[str, str] = {}
+        self._refusals: dict[str, str] = {}
         self._reported: dict[str, str] = {}
         self._records: dict[tuple[bytes, str], Record] = {}
         self._unauthorized: dict[tuple[bytes, str], int] = {}
@@ -114,7 +114,7 @@ class Deployment:
         for name, content in self._shelf.everything():
             pair = _parse_stored(content)
             if pair is None:
-                self._say(f"deployed file {name} is damaged and ignored")
+                self._publish_message(f"deployed file {name} is damaged and ignored")
                 continue
             record, source = pair
             manifest = manifest_of(record)
@@ -289,11 +289,11 @@ class Deployment:
         self.modules[manifest.kind, manifest.name] = (
             (lambda: PushedStrategy(runner)) if is_strategy else runner.create  # factory for new tasks
         )
-        self._refused.pop(manifest.name, None)
+        self._refusals.pop(manifest.name, None)
         if CONFINED not in runner.limits:
             held = ", ".join(runner.limits) or "none"
             self._log.warn("{name} runs without seccomp; limits in effect: {held}", name=manifest.name, held=held)
-        self._say(f"runs {manifest.kind} {manifest.name} {manifest.label}")
+        self._publish_message(f"runs {manifest.kind} {manifest.name} {manifest.label}")
 
     def _watch(self) -> None:
         """Stop modules that may no longer run, supervise processes, and judge again modules of former non-operators."""
@@ -341,9 +341,9 @@ class Deployment:
         manifest = candidate.manifest
         content = bytes(msgpack.packb([candidate.record.packed(), candidate.source]))
         try:
-            self._shelf.keep(_file(manifest), content)
+            self._shelf.keep(_file_name(manifest), content)
         except OSError as error:
-            self._say(f"cannot store {manifest.name} {manifest.version}: {error.strerror or error}")
+            self._publish_message(f"cannot store {manifest.name} {manifest.version}: {error.strerror or error}")
             return
         kept = []
         for name, data in self._shelf.everything():
@@ -359,8 +359,8 @@ class Deployment:
         shown = "".join(c for c in record.name[:32] if c.isprintable())
         self._log.warn("refused: {name}{version} {reason}", name=shown, version=version, reason=reason)
         if record.name in self._allowed.modules:
-            self._refused[record.name] = f"{self._describe(record, manifest)} refused"
-        self._say(f"refuses {shown}{version}: {reason}")
+            self._refusals[record.name] = f"{self._describe(record, manifest)} refused"
+        self._publish_message(f"refuses {shown}{version}: {reason}")
 
     def _report(self) -> None:
         described = {}
@@ -368,13 +368,13 @@ class Deployment:
             words = []
             if name in self._running:
                 runner, record = self._running[name]
-                words.append(f"{self._describe(record, runner.manifest)} {_state(runner)}")
+                words.append(f"{self._describe(record, runner.manifest)} {_describe_state(runner)}")
             if name in self._starting:
                 words.append(f"{self._describe(self._starting[name][1], self._starting[name][0].manifest)} is started")
             elif name in self._wanted:
                 words.append(f"{self._describe(self._wanted[name][1], self._wanted[name][0])} waits for its source")
-            if name in self._refused:
-                words.append(self._refused[name])
+            if name in self._refusals:
+                words.append(self._refusals[name])
             if words:
                 described[name] = ", ".join(words)
         if described != self._reported:
@@ -387,17 +387,17 @@ class Deployment:
         name = "".join(c for c in self._author_of(record.owner).name[:MAX_NAME] if c.isprintable())
         return f"{label}by {name} {record.owner.hex()[:8]}".replace("  ", " ")
 
-    def _say(self, text: str) -> None:
+    def _publish_message(self, text: str) -> None:
         self._presence.say(self._wall(), text)
 
 
-def _state(runner: Runner) -> str:
+def _describe_state(runner: Runner) -> str:
     if runner.state is State.READY:
         return "runs" if CONFINED in runner.limits else "runs, not confined"
     return "was ended" if runner.state in (State.LOST, State.OUT) else "is started"
 
 
-def _file(manifest: Manifest) -> str:
+def _file_name(manifest: Manifest) -> str:
     return f"{manifest.name}-{manifest.digest[:16]}"
 
 

@@ -123,7 +123,7 @@ def manifest_of(record: Record) -> Manifest | None:
     if content is None:
         return None
     name, kind, before = content.get("name"), content.get("kind"), content.get("before")
-    edition = _edition([content.get("version"), content.get("digest"), content.get("size")])
+    edition = _parse_edition([content.get("version"), content.get("digest"), content.get("size")])
     withdrawn = content.get("withdrawn")
     if not isinstance(name, str) or name != record.name or not re.fullmatch(NAME, name, re.ASCII) or kind not in KINDS:
         return None
@@ -131,14 +131,14 @@ def manifest_of(record: Record) -> Manifest | None:
         return None
     if edition is None or not isinstance(before, list):
         return None
-    editions = [_edition(fields) for fields in before[:KEPT]]
+    editions = [_parse_edition(fields) for fields in before[:KEPT]]
     valid = tuple(each for each in editions if each is not None)
     if len(valid) != len(editions) or any(each.version >= edition.version for each in valid):
         return None
     return Manifest(name, kind, edition.version, edition.digest, edition.size, valid, withdrawn)
 
 
-def _edition(fields: object) -> Edition | None:
+def _parse_edition(fields: object) -> Edition | None:
     if not isinstance(fields, list) or len(fields) != 3:
         return None
     version, digest, size = fields

@@ -50,7 +50,7 @@ def loaded(manifest: Manifest, source: bytes) -> Make:
         make = getattr(module, ENTRIES[manifest.kind], None)
         if not callable(make):
             raise Undeployable(manifest.name, f"a {manifest.kind} has to define {ENTRIES[manifest.kind]}")
-        faults = within(STEPS, _faults, manifest.kind, make)
+        faults = within(STEPS, _find_violations, manifest.kind, make)
         if faults:
             raise Undeployable(manifest.name, faults[0])
     except Undeployable:
@@ -118,7 +118,7 @@ def _label_instances(make: Make, manifest: Manifest) -> Make:
     return make_labelled
 
 
-def _faults(kind: str, make: Make) -> Sequence[str]:
+def _find_violations(kind: str, make: Make) -> Sequence[str]:
     """Return the violations of the module's interface; empty if it conforms."""
     if kind == BEHAVIOUR:
         # Creating a behaviour takes the parameters of a task.

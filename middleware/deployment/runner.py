@@ -123,7 +123,7 @@ class Runner:
         """End the process permanently."""
         if self.state is not State.OUT:
             self._set_state(State.OUT)
-            self._end(why)
+            self._end_process(why)
 
     def wait_for(self, verb: str, arguments: list[Any]) -> Any:
         """Return the reply to one request, waiting at most ``DEADLINE_S``; raises ``NoOpinion``."""
@@ -222,9 +222,9 @@ class Runner:
         self._log.warn("{name}: process killed: {why}", name=self.manifest.name, why=why)
         self._losses += 1
         self._set_state(State.OUT if self._losses >= STRIKES else State.LOST)
-        self._end(why)
+        self._end_process(why)
 
-    def _end(self, why: str) -> None:
+    def _end_process(self, why: str) -> None:
         self.why = why
         channel, self._channel = self._channel, None
         if channel is not None:

@@ -68,27 +68,27 @@ def explained(verdicts: Iterable[Verdict]) -> Explanation:
     for verdict in sorted(verdicts, key=lambda v: (v.epoch, v.agent, v.packed())):
         task = verdict.task
         epochs.setdefault(verdict.epoch, {})[verdict.agent] = verdict
-    rulings = [_ruling(epoch, list(epochs[epoch].values())) for epoch in sorted(epochs, reverse=True)]
+    rulings = [_make_ruling(epoch, list(epochs[epoch].values())) for epoch in sorted(epochs, reverse=True)]
     return Explanation(task, tuple(rulings))
 
 
 def as_text(explanation: Explanation) -> str:
     """Return the explanation as text, newest epoch first; empty if there is no decision yet."""
-    return "".join(_paragraph(ruling) for ruling in explanation.epochs)
+    return "".join(_format_ruling(ruling) for ruling in explanation.epochs)
 
 
 # -- implementation -----------------------------------------------------------------------------------------------
 
 
-def _ruling(epoch: int, verdicts: Sequence[Verdict]) -> Ruling:
+def _make_ruling(epoch: int, verdicts: Sequence[Verdict]) -> Ruling:
     votes = Counter(v.winner for v in verdicts)
     winner = min(votes, key=lambda uuid: (-votes[uuid], not uuid, uuid))
     agreeing = [v for v in verdicts if v.winner == winner]
-    grounds = Counter(_grounds(v) for v in agreeing)
+    grounds = Counter(_basis(v) for v in agreeing)
     most = min(grounds, key=lambda ground: (-grounds[ground], ground))
-    reference = next(v for v in agreeing if _grounds(v) == most)
+    reference = next(v for v in agreeing if _basis(v) == most)
     names = {r.agent: r.name for v in verdicts for r in v.reports} | {v.agent: v.name for v in verdicts}
-    differ = [Difference(v.name, what) for v in verdicts if (what := _differences(v, reference, names))]
+    differ = [Difference(v.name, what) for v in verdicts if (what := _describe_differences(v, reference, names))]
     deciders = {v.agent for v in verdicts}
     missing = [r.name for r in reference.reports if r.agent not in deciders]
     differ += [Difference(name, "has no decision record") for name in missing]
@@ -112,11 +112,11 @@ def _ruling(epoch: int, verdicts: Sequence[Verdict]) -> Ruling:
     )
 
 
-def _grounds(verdict: Verdict) -> tuple[str, str, str]:
+def _basis(verdict: Verdict) -> tuple[str, str, str]:
     return (verdict.rule, verdict.version, verdict.digest)
 
 
-def _differences(verdict: Verdict, reference: Verdict, names: Mapping[str, str]) -> str:
+def _describe_differences(verdict: Verdict, reference: Verdict, names: Mapping[str, str]) -> str:
     """Return the differences between a decision record and the majority's; empty if there are none."""
     differences = []
     if verdict.winner != reference.winner:
@@ -127,11 +127,11 @@ def _differences(verdict: Verdict, reference: Verdict, names: Mapping[str, str])
     if agreed != agreement(reference.value, reference.choice):
         differences.append(f"agreed on {agreed or 'nothing'}")
     if verdict.digest != reference.digest:
-        differences.append(_other_reports(verdict, reference))
+        differences.append(_describe_other_reports(verdict, reference))
     return "; ".join(differences)
 
 
-def _other_reports(verdict: Verdict, reference: Verdict) -> str:
+def _describe_other_reports(verdict: Verdict, reference: Verdict) -> str:
     are_whole = all(len(v.reports) == v.reported for v in (verdict, reference))
     knew, known = ({r.agent: r for r in v.reports} for v in (verdict, reference))
     differences = []
@@ -150,7 +150,7 @@ def _other_reports(verdict: Verdict, reference: Verdict) -> str:
     return f"knew {', '.join([*differences[:TOLD], *more])}"
 
 
-def _paragraph(ruling: Ruling) -> str:
+def _format_ruling(ruling: Ruling) -> str:
     """Return one ruling as lines of text."""
     token = f", token {ruling.token}" if ruling.token else ""
     lines = [f"epoch {ruling.epoch}: {ruling.chosen}, {len(ruling.agree)} of {ruling.of} agree{token}"]

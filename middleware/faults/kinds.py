@@ -61,12 +61,12 @@ def parse_fault(kind: object, seconds: object = None, amount: object = None) -> 
     if not isinstance(kind, str) or kind not in KINDS:
         raise BadFault("kind", f"there is no fault {str(kind)[:40]!r}", f"choose one of {', '.join(KINDS)}")
     rule = KINDS[kind]
-    lasts = _number("seconds", USUAL_S if seconds is None else seconds, MIN_S, MAX_S, "s")
+    lasts = _check_number("seconds", USUAL_S if seconds is None else seconds, MIN_S, MAX_S, "s")
     if not rule.unit:
         if amount is not None and amount != 0:
             raise BadFault("amount", f"a fault of the kind {kind} has none", "leave it out")
         return Fault(kind, lasts)
-    much = _number("amount", rule.amount if amount is None else amount, rule.least, rule.most, rule.unit)
+    much = _check_number("amount", rule.amount if amount is None else amount, rule.least, rule.most, rule.unit)
     return Fault(kind, lasts, much)
 
 
@@ -75,7 +75,7 @@ def begins_in(answer: object) -> float:
     return float(answer) if is_number(answer) and 0.0 < answer <= MOST_AHEAD_S else 0.0  # type: ignore[operator,arg-type]
 
 
-def _number(field: str, value: object, least: float, most: float, unit: str) -> float:
+def _check_number(field: str, value: object, least: float, most: float, unit: str) -> float:
     if not is_number(value) or not least <= value <= most:  # type: ignore[operator]
         raise BadFault(field, f"{str(value)[:40]} is out of range", f"give {least:g} to {most:g} {unit}")
     return float(value)  # type: ignore[arg-type]

@@ -93,7 +93,7 @@ def play(scenario: Scenario, seed: int, stage: Stage, say: Callable[[str], None]
     began = stage.seconds()
     for step in scenario.steps:
         while stage.seconds() < began + step.at:
-            _look(stage, losses, say)
+            _update(stage, losses, say)
         device = _wait_for_device(stage, step.device, rng, losses, say)
         task = acting(stage.devices()).get(device.uuid, "")
         now = stage.cause(device, step.fault) + stage.seconds()
@@ -101,7 +101,7 @@ def play(scenario: Scenario, seed: int, stage: Stage, say: Callable[[str], None]
         say(f"{device.name}: {step.fault.kind}{lasts}")
         losses.append(Loss(device.name, step.fault, Takeover(device.uuid, task, now, now + step.fault.seconds)))
     while any(_is_open(loss, stage.seconds()) for loss in losses):
-        _look(stage, losses, say)
+        _update(stage, losses, say)
     for loss in losses:
         if loss.clock.seconds is None:
             loss.is_ended = bool(loss.clock.task) and stage.is_over(loss.clock.task)
@@ -118,7 +118,7 @@ def _is_hopeless(loss: Loss, now: float) -> bool:
     return now > loss.clock.began + max(SETTLED_S, min(loss.fault.seconds, 3 * SETTLED_S))
 
 
-def _look(stage: Stage, losses: Iterable[Loss], say: Callable[[str], None]) -> None:
+def _update(stage: Stage, losses: Iterable[Loss], say: Callable[[str], None]) -> None:
     stage.wait(LOOK_S)
     devices = stage.devices()
     acts, names = acting(devices), {device.uuid: device.name for device in devices}
@@ -135,7 +135,7 @@ def _wait_for_device(
     while stage.seconds() <= end:
         if found := _matching_devices(stage, wanted, losses):
             return rng.choice(found) if wanted == ANY else found[0]
-        _look(stage, losses, say)
+        _update(stage, losses, say)
     names = ", ".join(device.name for device in stage.devices()) or "none"
     what = "executes a task" if wanted == WHO_ACTS else "can be chosen" if wanted == ANY else f"has the name {wanted}"
     raise NobodyThere(f"no device {what} within {PATIENCE_S:g} s; present devices: {names}")

@@ -77,11 +77,11 @@ def scenario_of(content: Mapping[str, Any], origin: str) -> Scenario:
     except Invalid as error:
         key = "[[fault]]" if error.key == "fault" else error.key
         raise BadSetting(origin, key, error.problem, error.remedy) from None
-    steps = [_step(fault, origin, f"[[fault]] {number}") for number, fault in enumerate(file.fault, start=1)]
+    steps = [_parse_step(fault, origin, f"[[fault]] {number}") for number, fault in enumerate(file.fault, start=1)]
     return Scenario(file.task, tuple(sorted(steps, key=lambda step: step.at)), file.seed)
 
 
-def _step(content: Any, origin: str, where: str) -> Step:
+def _parse_step(content: Any, origin: str, where: str) -> Step:
     try:
         table = convert_table(content, _FaultTable)
         return Step(table.at, table.device, parse_fault(table.kind, table.seconds, table.amount))

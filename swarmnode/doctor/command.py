@@ -48,23 +48,23 @@ def main(
     try:
         settings = resolved(Settings.load(options.settings)) if options.settings else None
         name = options.node or (settings.node.name if settings is not None else None)
-        answers = _running(name, ask)
+        answers = _ask_node(name, ask)
         if settings is None:
             if answers is None:
                 raise NoControl(_not_running(name))
             facts = _facts_of_running(name or "", answers[0])
         else:
-            facts = measure(settings, answers is not None, None if answers is None else _health(answers[0]))
+            facts = measure(settings, answers is not None, None if answers is None else _parse_health(answers[0]))
     except (SwarmError, NoControl) as problem:
         sys.stderr.write(printable(f"swarm doctor: {problem}") + "\n")
         return WRONG
     findings = diagnosed(facts)
-    links = [] if answers is None else [_link(each) for each in answers[1]]
+    links = [] if answers is None else [_parse_link(each) for each in answers[1]]
     out.write(_as_json(findings, links) if options.json else _as_text(findings, links, answers is not None))
     return ILL if any(finding.weight != "note" for finding in findings) else WELL
 
 
-def _running(name: str | None, ask: Ask) -> tuple[dict[str, Any], list[dict[str, Any]]] | None:
+def _ask_node(name: str | None, ask: Ask) -> tuple[dict[str, Any], list[dict[str, Any]]] | None:
     """Return the health and the links of the running node; None if it does not run."""
     try:
         path = found(name)
@@ -84,7 +84,7 @@ def _not_running(name: str | None) -> str:
     return f"{which}; pass its settings file (swarm doctor SETTINGS), or --node NAME"
 
 
-def _health(answer: dict[str, Any]) -> Health:
+def _parse_health(answer: dict[str, Any]) -> Health:
     refusals = tuple((str(code), str(whom)) for code, whom in answer.get("refusals", []))
     figures = {key: int(answer[key]) for key in ("contacts", "rows", "max_rows", "bytes", "max_bytes")}
     return Health(**figures, trouble=str(answer.get("trouble", "")), refusals=refusals)
@@ -92,10 +92,10 @@ def _health(answer: dict[str, Any]) -> Health:
 
 def _facts_of_running(name: str, answer: dict[str, Any]) -> Facts:
     host, _, port = str(answer["address"]).rpartition(":")
-    return Facts(name, host, int(port), 0.0, tuple(interfaces()), is_running=True, health=_health(answer))
+    return Facts(name, host, int(port), 0.0, tuple(interfaces()), is_running=True, health=_parse_health(answer))
 
 
-def _link(answer: dict[str, Any]) -> tuple[str, str, Link]:
+def _parse_link(answer: dict[str, Any]) -> tuple[str, str, Link]:
     return str(answer["id"]), str(answer["address"]), link(answer["times"], bool(answer["relayed"]))
 
 

@@ -80,7 +80,7 @@ def measured(
         port_problem = f"Another program uses {node.host}:{node.port}."
     where = chosen(list(found), node.host) if node.lan and not is_local(node.host) else []
     heard = _probe_all(node.host, known, team.secrets, where, wall)
-    gateway = _gateway()
+    gateway = _find_router()
     return Facts(
         node.name,
         node.host,
@@ -95,7 +95,7 @@ def measured(
         way_out=_source_address([each.host for each in known if not is_local(each.host)]),
         is_gateway_resolved=_is_resolved(gateway) if gateway else None,
         certificate=team.certificate,
-        storage=_storage(node.store),
+        storage=_check_storage(node.store),
         open_files=tuple(_readable_by_others(_secret_files(settings))),
         health=health,
     )
@@ -142,7 +142,7 @@ def _probe_all(
     rng = random.SystemRandom()
     keys = [derived_key(secret, b"greet") for secret in secrets]
     tokens = {rng.randbytes(16): address for address in known}
-    sockets = _sockets(host, known)
+    sockets = _open_sockets(host, known)
     ear = _open_multicast_socket(where) if where else None
     try:
         for _ in range(TRIES):
@@ -154,7 +154,7 @@ def _probe_all(
             if where:
                 call = rng.randbytes(16)
                 heard.calls.add(call)
-                _multicast(sockets, hail(call), where, heard)
+                _send_multicast(sockets, hail(call), where, heard)
             _listen([*sockets.values(), *([] if ear is None else [ear])], ear, keys, heard, wall)
             if known and not where and heard.members >= set(known) and heard.answers.keys() >= set(known):
                 break
@@ -165,7 +165,7 @@ def _probe_all(
     return heard
 
 
-def _sockets(host: str, known: Iterable[Address]) -> dict[int, socket.socket]:
+def _open_sockets(host: str, known: Iterable[Address]) -> dict[int, socket.socket]:
     """Open one socket per required address family, at the node's address and any port."""
     by_family: dict[int, socket.socket] = {}
     families = {socket.AF_INET6 if ":" in address.host else socket.AF_INET for address in known} | {socket.AF_INET}
@@ -219,7 +219,9 @@ def _send(sockets: dict[int, socket.socket], datagram: bytes, to: Address, heard
                 heard.errors[to] = "unreachable"
 
 
-def _multicast(sockets: dict[int, socket.socket], datagram: bytes, where: Sequence[Interface], heard: _Heard) -> None:
+def _send_multicast(
+    sockets: dict[int, socket.socket], datagram: bytes, where: Sequence[Interface], heard: _Heard
+) -> None:
     by = sockets.get(socket.AF_INET)
     if by is None:
         return
@@ -348,29 +350,29 @@ def _is_near(host: str, found: Sequence[Interface]) -> bool:
     if address.version == 6:
         mine = [ip_address(each) for i in found for each in i.addresses if ":" in each and not i.is_loopback]
         return any(int(address) >> 64 == int(own) >> 64 for own in mine)
-    routes = [(network, mask) for network, gateway, mask in _routes() if not gateway and mask]
+    routes = [(network, mask) for network, gateway, mask in _read_routes() if not gateway and mask]
     return any(int(address) & mask == network for network, mask in routes)
 
 
-def _gateway() -> str:
+def _find_router() -> str:
     """Return the default router, or an empty string."""
-    for network, gateway, mask in _routes():
+    for network, gateway, mask in _read_routes():
         if gateway and not network and not mask:
             return str(ip_address(gateway))
     return ""
 
 
-def _routes() -> list[tuple[int, int, int]]:
+def _read_routes() -> list[tuple[int, int, int]]:
     """Return (network, gateway, mask) of each IPv4 route."""
     try:
         lines = Path("/proc/net/route").read_text(encoding="ascii").splitlines()[1:]
     except (OSError, ValueError):
         return []
     rows = [line.split() for line in lines]
-    return [(_number(row[1]), _number(row[2]), _number(row[7])) for row in rows if len(row) > 7]
+    return [(_parse_address(row[1]), _parse_address(row[2]), _parse_address(row[7])) for row in rows if len(row) > 7]
 
 
-def _number(digits: str) -> int:
+def _parse_address(digits: str) -> int:
     """Convert an address as the kernel prints it: four bytes in native byte order."""
     return int.from_bytes(int(digits, 16).to_bytes(4, sys.byteorder))
 
@@ -389,7 +391,7 @@ def _is_resolved(host: str) -> bool | None:
     return bool(flags[0] & 0x2) if flags else False
 
 
-def _storage(path: str) -> Storage | None:
+def _check_storage(path: str) -> Storage | None:
     if path == IN_MEMORY:
         return None
     where = Path(path)

@@ -18,7 +18,7 @@ def interface(facts: Facts) -> Iterator[Finding]:
                 "wrong-interface",
                 "The node accepts only connections from this machine.",
                 f"[node] host is {facts.host}, and {far[0].address} is on another machine.",
-                f"Set [node] host to {_offer(facts)}.",
+                f"Set [node] host to {_suggest_address(facts)}.",
             )
         return
     if not outside:
@@ -36,15 +36,15 @@ def interface(facts: Facts) -> Iterator[Finding]:
         yield error(
             "wrong-interface",
             "The node's address is not an address of this machine.",
-            f"[node] host is {facts.host}; this machine has {_all(facts)}.",
-            f"Set [node] host to {_offer(facts)}.",
+            f"[node] host is {facts.host}; this machine has {_list_addresses(facts)}.",
+            f"Set [node] host to {_suggest_address(facts)}.",
         )
     elif not at[0].is_running:
         yield error(
             "wrong-interface",
             f"The interface {at[0].name} is not connected.",
             f"[node] host {facts.host} is its address, but it has no carrier.",
-            f"Connect it, or set [node] host to {_offer(facts, at[0].name)}.",
+            f"Connect it, or set [node] host to {_suggest_address(facts, at[0].name)}.",
         )
     elif facts.way_out and facts.way_out != facts.host and not any(probe.is_heard for probe in facts.known):
         yield error(
@@ -65,7 +65,7 @@ def known(facts: Facts) -> Iterator[Finding]:
             "The machine replies that the port is closed.",
             "Start that node, or fix its address in [node] known_nodes.",
         )
-    yield from _isolated(facts, silent)
+    yield from _check_neighbours(facts, silent)
     far = [probe for probe in silent if not probe.is_near and not probe.error and not is_local(probe.address.host)]
     heard_far = any(probe.is_heard and not probe.is_near for probe in facts.known)
     spoken = [probe for probe in far if probe.is_tcp]
@@ -78,7 +78,7 @@ def known(facts: Facts) -> Iterator[Finding]:
         )
 
 
-def _isolated(facts: Facts, silent: list[Probe]) -> Iterator[Finding]:
+def _check_neighbours(facts: Facts, silent: list[Probe]) -> Iterator[Finding]:
     """Report silent nodes on the same subnet."""
     near = [probe for probe in silent if probe.is_near and probe.error != "refused"]
     hidden = [probe for probe in near if probe.is_resolved is False]
@@ -192,11 +192,11 @@ def nobody(facts: Facts) -> Iterator[Finding]:
         )
 
 
-def _all(facts: Facts) -> str:
+def _list_addresses(facts: Facts) -> str:
     return ", ".join(f"{' '.join(i.addresses)} ({i.name})" for i in facts.interfaces if i.addresses) or "none"
 
 
-def _offer(facts: Facts, but: str = "") -> str:
+def _suggest_address(facts: Facts, but: str = "") -> str:
     if facts.way_out and not is_local(facts.way_out):
         return facts.way_out
     usable = [i for i in facts.interfaces if not i.is_loopback and i.addresses and i.is_running and i.name != but]

@@ -33,7 +33,7 @@ def catalogue(is_there: Callable[[str], bool] = lambda library: find_spec(librar
     """Return every kind of robot; a broken driver of another distribution is listed with its problem."""
     built_in, installed = built_in_kinds(), places()
     return [
-        _built_in(kind, is_there) if kind in built_in else _installed(kind, installed[kind])
+        _make_built_in_entry(kind, is_there) if kind in built_in else _make_installed_entry(kind, installed[kind])
         for kind in kinds()
         if kind in built_in or kind in installed
     ]
@@ -50,7 +50,7 @@ def catalogue_lines(entries: list[Entry]) -> list[str]:
     return lines
 
 
-def _built_in(kind: str, is_there: Callable[[str], bool]) -> Entry:
+def _make_built_in_entry(kind: str, is_there: Callable[[str], bool]) -> Entry:
     package = import_module(f"drivers.{kind}")
     about = (package.__doc__ or "").strip().split("\n")[0].partition(": ")[0].rstrip(".")
     manifest = manifest_of(kind)
@@ -61,7 +61,7 @@ def _built_in(kind: str, is_there: Callable[[str], bool]) -> Entry:
     )
 
 
-def _installed(kind: str, place: str) -> Entry:
+def _make_installed_entry(kind: str, place: str) -> Entry:
     try:
         factory: object = getattr(maker(kind, place), "args", (kind, None))[1]
     except UsageError as error:

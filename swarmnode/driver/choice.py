@@ -54,9 +54,9 @@ def chosen(arguments: argparse.Namespace) -> Choice | None:
     if arguments.config and arguments.kind:
         raise UsageError("use either --kind or --config, not both")
     if arguments.config:
-        return _configured(arguments.config, arguments)
+        return _choose_by_settings(arguments.config, arguments)
     if arguments.kind:
-        return _named(arguments.kind, arguments)
+        return _choose_by_kind(arguments.kind, arguments)
     if arguments.option:
         raise UsageError("--option needs --kind; `swarm driver list` shows the kinds")
     return None
@@ -65,8 +65,8 @@ def chosen(arguments: argparse.Namespace) -> Choice | None:
 def meant(word: str, arguments: argparse.Namespace) -> Choice:
     """Return the robot for a settings file or a kind; raises as ``chosen`` does."""
     if word.endswith(".toml") or os.path.isfile(word):
-        return _configured(word, arguments)
-    return _named(word, arguments)
+        return _choose_by_settings(word, arguments)
+    return _choose_by_kind(word, arguments)
 
 
 def options_of(words: Sequence[str]) -> dict[str, Any]:
@@ -82,11 +82,11 @@ def options_of(words: Sequence[str]) -> dict[str, Any]:
             inner = inner.setdefault(name, {})
             if not isinstance(inner, dict):
                 raise UsageError(f"--option {key} is given as a value and as a table")
-        inner[names[-1]] = _value(text)
+        inner[names[-1]] = _parse_value(text)
     return table
 
 
-def _value(text: str) -> Any:
+def _parse_value(text: str) -> Any:
     try:
         value = tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
@@ -100,12 +100,12 @@ def _add_working_directory(kind: str) -> None:
         sys.path.insert(0, os.getcwd())
 
 
-def _named(kind: str, arguments: argparse.Namespace) -> Choice:
+def _choose_by_kind(kind: str, arguments: argparse.Namespace) -> Choice:
     _add_working_directory(kind)
     return Choice(kind, options_of(arguments.option), arguments.name or "robot")
 
 
-def _configured(path: str, arguments: argparse.Namespace) -> Choice:
+def _choose_by_settings(path: str, arguments: argparse.Namespace) -> Choice:
     from middleware.config.settings import Settings
 
     settings = Settings.load(path)

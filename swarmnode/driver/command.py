@@ -48,8 +48,10 @@ def parser() -> argparse.ArgumentParser:
         add_arguments(each)
     for each in (listing, info, probe, monitor):
         each.add_argument("--json", action="store_true", help="print JSON, one line per result")
-    probe.add_argument("--seconds", type=_seconds, default=3.0, help="duration in seconds (default: 3)")
-    monitor.add_argument("--seconds", type=_seconds, default=math.inf, help="duration in s (default: until Ctrl-C)")
+    probe.add_argument("--seconds", type=_parse_seconds, default=3.0, help="duration in seconds (default: 3)")
+    monitor.add_argument(
+        "--seconds", type=_parse_seconds, default=math.inf, help="duration in s (default: until Ctrl-C)"
+    )
     monitor.add_argument("--picture", type=Path, metavar="FILE", help="save the newest picture to FILE every second")
     return whole
 
@@ -153,7 +155,7 @@ def _monitor(options: argparse.Namespace, driver: Driver, ground: Ground, say: S
     return int(ground.run(monitor.start, monitor.end))
 
 
-def _seconds(text: str) -> Any:
+def _parse_seconds(text: str) -> Any:
     seconds = float(text)
     if not 0.0 < seconds <= 86_400.0:
         raise ValueError(text)

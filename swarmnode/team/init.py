@@ -79,7 +79,7 @@ def _create(arguments: argparse.Namespace, desk: Desk) -> Answer:
     first = _Member(arguments.first, FIRST, arguments.folder)
     members = [first]
     for text in arguments.member:
-        member = _member(text, arguments.folder)
+        member = _parse_member(text, arguments.folder)
         if member.name in {each.name for each in members}:
             raise Wrong(f"--member {text}: another member has this name; choose another one")
         members.append(member)
@@ -109,7 +109,7 @@ def _create(arguments: argparse.Namespace, desk: Desk) -> Answer:
     ]
 
 
-def _member(text: str, folder: Path) -> _Member:
+def _parse_member(text: str, folder: Path) -> _Member:
     name, _, roles = text.partition("=")
     found = roles.split(",") if roles else ["device"]
     unknown = [role for role in found if role not in ROLES]

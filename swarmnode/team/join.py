@@ -84,7 +84,7 @@ def _join(arguments: argparse.Namespace, desk: Desk, knocking: Knocking, around:
     try:
         arguments.folder.mkdir(parents=True, exist_ok=True)
         begun = arguments.folder / f".{arguments.files}.joining"
-        membership = knocking(code, _seed(begun, code, desk), arguments.name, doors, arguments.timeout)
+        membership = knocking(code, _load_or_create_seed(begun, code, desk), arguments.name, doors, arguments.timeout)
     except BadKeyFile:
         raise
     except EntangledError as error:
@@ -120,7 +120,7 @@ def _join(arguments: argparse.Namespace, desk: Desk, knocking: Knocking, around:
     return {**answer, "settings": str(settings)}, lines
 
 
-def _seed(path: Path, code: Code, desk: Desk) -> bytes:
+def _load_or_create_seed(path: Path, code: Code, desk: Desk) -> bytes:
     """Return the newcomer's key, stored at ``path`` before it is sent.
 
     After an interrupted join the same key is sent again, so the code's use is not lost.

@@ -25,8 +25,8 @@ def _revoke(arguments: argparse.Namespace, desk: Desk) -> Answer:
     operator = operator_in(arguments.operator)
     found = known(arguments.node, desk, operator)
     public, what, came = _resolve(found, arguments.name, arguments.invitation, desk.wall())
-    kept = [] if arguments.all else _admitted_by(found, public, desk.wall())
-    renewals = [] if arguments.all else _renewed_by(found, public, desk.wall())
+    kept = [] if arguments.all else _list_admitted(found, public, desk.wall())
+    renewals = [] if arguments.all else _list_renewed(found, public, desk.wall())
     try:
         keys = [each.public for each in kept]
         statement = operator.revoke(public, arguments.name[:40], desk.wall(), keys, renewals)
@@ -41,12 +41,12 @@ def _revoke(arguments: argparse.Namespace, desk: Desk) -> Answer:
     return {"revoked": public.hex(), "what": what, "with": came, "kept": kept_names}, lines
 
 
-def _admitted_by(found: Known, public: bytes, now: float) -> list[Member]:
+def _list_admitted(found: Known, public: bytes, now: float) -> list[Member]:
     """Return the members that the bootstrap node ``public`` admitted."""
     return [each for each in found.members(now) if each.admitter == public]
 
 
-def _renewed_by(found: Known, public: bytes, now: float) -> list[tuple[bytes, int]]:
+def _list_renewed(found: Known, public: bytes, now: float) -> list[tuple[bytes, int]]:
     """Return the key and end of each renewal of current members that the bootstrap node ``public`` signed."""
     return [(each.public, each.not_after) for each in found.members(now) if each.renewer == public != each.public]
 

@@ -33,9 +33,9 @@ def _rotate(arguments: argparse.Namespace, desk: Desk) -> Answer:
     keys = [each.public for each in members][:MAX_SEALED]
     tell(arguments.node, desk, operator.rotate(number, keys, desk.wall(), arguments.grace, desk.rng))
     names = [each.name for each in members]
-    lines = [f"created secret number {number} for {', '.join(names)}", _until(arguments.grace)]
+    lines = [f"created secret number {number} for {', '.join(names)}", _describe_grace(arguments.grace)]
     return {"number": number, "members": names, "grace": arguments.grace}, lines
 
 
-def _until(grace: float) -> str:
+def _describe_grace(grace: float) -> str:
     return f"The previous secret is accepted for {span(grace)}; members that are offline longer have to join again"
