@@ -15,8 +15,7 @@ from webnode.password import LEAST, MOST, SALT, hashed
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     about = "Ask for a password, and print its hash for the settings, as [web] password."
-    epilog = "Example: swarm password >> password.toml"
-    return argparse.ArgumentParser(prog="swarm password", description=about, epilog=epilog)
+    return argparse.ArgumentParser(prog="swarm password", description=about, epilog="Example: swarm password")
 
 
 def main(

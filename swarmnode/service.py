@@ -43,7 +43,7 @@ class NodeService(Service):
         self._start_parts()
 
     def stopService(self) -> Deferred[None]:
-        """Stop the robot, say goodbye, and close the store."""
+        """Stop the robot, leave the network, and close the store."""
         super().stopService()
         if self._return_call is not None and self._return_call.active():
             self._return_call.cancel()

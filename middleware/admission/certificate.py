@@ -94,7 +94,7 @@ class Member:
 
 
 def pass_of(grant: bytes) -> bytes:
-    """Return the pass of a member that the operator granted a certificate directly."""
+    """Return the pass of a member with a certificate from the operator."""
     return bytes(msgpack.packb([0, grant]))
 
 
@@ -128,7 +128,7 @@ def chained(
 
 
 def renewed(bootstrap: Identity, grant: bytes, member: Member, shown: bytes, now: int) -> bytes:
-    """Renew the pass ``shown`` of ``member`` from ``now`` on, for the life that the operator issued it for.
+    """Renew the pass ``shown`` of ``member`` from ``now`` on, with its original validity.
 
     ``grant`` is the grant of ``bootstrap``.  Raises ``Malformed`` for the pass of a guest.
     """

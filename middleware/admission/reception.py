@@ -29,7 +29,7 @@ from middleware.entangled.token_bucket import TokenBucket
 from middleware.entangled.wire.door import Noted
 
 RATE = 50.0
-"""Join requests per second via signature is checked; these take 1 % of a core."""
+"""Join requests per second with a signature check; these take 1 % of a core."""
 HINTS = 20.0
 """Hints per second to join requests with an unknown invitation id."""
 MAX_ANSWERS = 256

@@ -71,7 +71,7 @@ class SignedPass(Entry):
 
     @property
     def until(self) -> int:
-        """Until the operator can no longer renew it."""
+        """The time from which the operator can no longer renew it."""
         return remembered_until(self.member.not_after, self.member.life)
 
 

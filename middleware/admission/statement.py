@@ -73,7 +73,7 @@ class Entry:
 
     @property
     def until(self) -> int:
-        """Until its end date."""
+        """The end date."""
         return self.not_after
 
 
@@ -90,7 +90,7 @@ class Grant(Entry):
 
     @property
     def until(self) -> int:
-        """Until all earlier statements about the key have expired."""
+        """The time at which all earlier statements about the key have expired."""
         return max(self.not_after, self.not_before + MAX_LIFE)
 
     @property
@@ -118,7 +118,7 @@ class Invite(Entry):
 
     @property
     def until(self) -> int:
-        """A week longer than it is valid, so that its code is refused as expired."""
+        """A week after the end date; until then the code is refused as expired."""
         return self.not_after + REMEMBERED
 
     def allows(self, name: str, wish: str) -> bool:
@@ -140,7 +140,7 @@ class Terms(Entry):
 
     @property
     def until(self) -> int:
-        """A week longer than they are valid, so that the code is refused as expired."""
+        """A week after the end date; until then the code is refused as expired."""
         return self.not_after + REMEMBERED
 
 
@@ -148,7 +148,7 @@ class Terms(Entry):
 class Revoke(Entry):
     """The irreversible revocation of a member's key, or of an invitation's key and all members that joined by it.
 
-    ``name`` is the name for people.  If the key is a bootstrap node's, ``kept`` limits its earlier signatures, whatever
+    ``name`` is for display.  If the key is a bootstrap node's, ``kept`` limits its earlier signatures, whatever
     dates they have: only the admitted members with these ids (``member_id``) stay members, and only the renewals with
     these ids (``renewal_id``) stay valid.
     """

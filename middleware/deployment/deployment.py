@@ -2,7 +2,7 @@
 
 The node checks in this order: the module's name is listed, its author's key is listed, the author is an operator of the
 team now, the signature is valid, the version is newer than the current one, the source has the signed digest, the
-module loads and conforms.  Each module runs in a separate process (``runner``), and no part of it before all checks.
+module loads and conforms.  Each module runs in a separate process (``runner``), after all checks have passed.
 The author's role is checked again every second: the modules of a former operator stop.
 """
 
@@ -39,7 +39,7 @@ IDLE_S = 60.0
 EDITIONS = 2
 """Editions of one module that are stored: the running one and the previous one."""
 MAX_JUDGED = 256
-"""Maximum number of manifests with a remembered verdict; the oldest is dropped, then judged and reported again."""
+"""Maximum number of manifests that are remembered as checked; a dropped one is checked and reported again."""
 MAX_NAME = 16
 CONFINED = "seccomp"
 """The limit without which the device reports a module as not confined."""
@@ -49,7 +49,7 @@ Later = Callable[..., object]
 
 @dataclass(frozen=True)
 class Author:
-    """The member with a certain key: its ``roles`` now, or None in an open team."""
+    """The author of a module: its name, and its ``roles`` now, None in an open team."""
 
     name: str
     roles: frozenset[str] | None
@@ -296,7 +296,7 @@ class Deployment:
         self._publish_message(f"runs {manifest.kind} {manifest.name} {manifest.label}")
 
     def _watch(self) -> None:
-        """Stop modules that may no longer run, supervise processes, and judge again modules of former non-operators."""
+        """Stop modules that may no longer run, supervise processes, and check again authors that were not operators."""
         self._later(WATCHING_S, self._watch)
         now = self._seconds()
         for runner, record in (*self._running.values(), *self._starting.values()):

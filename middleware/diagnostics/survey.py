@@ -97,7 +97,7 @@ def network(node: SwarmNode) -> dict[str, Any]:
 
 
 def links(node: SwarmNode) -> dict[str, Any]:
-    """Return the links from ``node`` to its peers, as ``Gauge.links``, and the recent refusals.
+    """Return the links from ``node`` to its peers, as ``Gauge.links`` does, and the recent refusals.
 
     Each refusal has ``who`` (a name of the team, or the beginning of a key, or empty), ``at``, ``side`` as in
     ``Rebuff``, ``code``, ``reason``, ``ago`` (seconds since the last time) and ``count``.
@@ -124,7 +124,7 @@ def links(node: SwarmNode) -> dict[str, Any]:
 def team(node: SwarmNode) -> dict[str, Any]:
     """Return the team of ``node``; times are Unix timestamps.
 
-    For an open team, ``unprotected`` says what it does not protect.  A closed team has a ``name``, a ``fingerprint``
+    For an open team, ``unprotected`` describes the missing protection.  A closed team has a ``name``, a ``fingerprint``
     as in ``swarm doctor``, and ``members`` with their roles, end of certificate and whether it is renewable, those
     first that end within ``ENDING_S``; ``me`` is this node.
     """

@@ -17,7 +17,7 @@ from middleware.faults.takeover import TARGET_S, Takeover, acting
 
 LOOK_S = 0.05
 PATIENCE_S = 60.0
-"""Seconds to wait for an executing device, or for a device of a name."""
+"""Seconds to wait for an executing device, or for the device with a given name."""
 SETTLED_S = 6.0
 """Seconds after a fault without a takeover within which the remaining devices can end the task."""
 BODILESS = {"bootstrap", "web"}

@@ -1,6 +1,7 @@
 """Measurements for ``swarm doctor``, taken from this machine with separate sockets.
 
-A node replies to a HAIL of any sender, and to a WHO of a member.  All measurements take about two seconds.
+A node replies to a discovery probe (HAIL) of any sender, and to a team probe (WHO) of a member.  All measurements take
+about two seconds.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ _IP_RECVERR, _IP_PKTINFO, _IP_MULTICAST_ALL = 11, 8, 49
 
 @dataclass
 class Team:
-    """The team of the node: secrets that encrypt a WHO, fingerprint, certificate, and bootstrap nodes."""
+    """The team of the node: secrets for team probes, fingerprint, certificate, and bootstrap nodes."""
 
     secrets: Sequence[bytes]
     fingerprint: bytes = bytes(8)
@@ -120,7 +121,7 @@ def team_of(settings: Settings) -> Team:
 
 
 def on_lan() -> list[Answer]:
-    """Return the replies to a HAIL on the LAN, of any team; takes ``TRIES`` times ``EACH_S`` seconds.
+    """Return the replies to a discovery probe on the LAN, of any team; takes ``TRIES`` times ``EACH_S`` seconds.
 
     A newcomer without a team finds bootstrap nodes by this.  In a large team only some nodes reply to each call.
     """
