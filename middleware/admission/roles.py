@@ -2,8 +2,8 @@
 
 A member has one or several roles, and the union of their permissions.  A *device* senses, bids and acts; an *operator*
 issues tasks and orders; a *viewer* only reads; a *gateway* (a web node) acts on behalf of people, with the permissions
-of device and operator except to push modules; a *bootstrap* node admits newcomers.  Methods that maintain the network are open to all roles,
-because every member takes part in it.
+of device and operator, but cannot push modules; a *bootstrap* node admits newcomers.  Methods that maintain the network
+are open to all roles, because every member takes part in it.
 """
 
 from __future__ import annotations
