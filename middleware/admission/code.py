@@ -35,12 +35,12 @@ from middleware.entangled.identity import Identity
 LETTERS = "0123456789ABCDEFGHJKMNPQRSTVWXYZ"
 ALIKE = str.maketrans("OIL", "011", " -\t\r\n")
 LENGTH, GROUP = 20, 5
-_SECRET, _MARK = 15, 4
-_SECRET_BITS, _MARK_BITS = 5 * _SECRET, 5 * _MARK
-_FIELD = 0b100101
+_SECRET_LETTERS, _MARK_LETTERS = 15, 4
+_SECRET_BITS, _MARK_BITS = 5 * _SECRET_LETTERS, 5 * _MARK_LETTERS
+_POLYNOMIAL = 0b100101
 """x^5 + x^2 + 1, a primitive polynomial: the powers of x are all non-zero elements of the field."""
 MAX_SETTINGS = 16
-_NONCE = 24
+_NONCE_BYTES = 24
 _ABOUT = b"swarm-terms-1"
 
 
@@ -54,7 +54,7 @@ class Code:
     @property
     def text(self) -> str:
         """The code in four groups of five characters."""
-        letters = _encode(self.secret, _SECRET) + _encode(self.mark, _MARK)
+        letters = _encode(self.secret, _SECRET_LETTERS) + _encode(self.mark, _MARK_LETTERS)
         letters += LETTERS[_compute_check([LETTERS.index(letter) for letter in letters])]
         return "-".join(letters[start : start + GROUP] for start in range(0, LENGTH, GROUP))
 
@@ -99,7 +99,7 @@ def read(text: str) -> Code:
     places = [LETTERS.index(letter) for letter in letters]
     if _compute_check(places[:-1]) != places[-1]:
         raise BadCode("the code is mistyped: its check character does not match; check it")
-    return Code(_decode(places[:_SECRET]), _decode(places[_SECRET:-1]))
+    return Code(_decode(places[:_SECRET_LETTERS]), _decode(places[_SECRET_LETTERS:-1]))
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ class TermsContent:
 def seal_terms(code: Code, content: TermsContent, rng: random.Random) -> bytes:
     """Encrypt ``content`` for the holder of ``code``; raises ``ValueError`` if it is too long."""
     body = msgpack.packb([content.operator, content.team, dict(content.settings)])
-    nonce = rng.randbytes(_NONCE)
+    nonce = rng.randbytes(_NONCE_BYTES)
     sealed: bytes = nonce + bindings.crypto_aead_xchacha20poly1305_ietf_encrypt(body, _ABOUT, nonce, code.terms_key)
     if len(sealed) > MAX_TERMS or len(content.settings) > MAX_SETTINGS:
         raise ValueError(f"the settings for newcomers take {len(sealed)} bytes, at most {MAX_TERMS}; share fewer")
@@ -125,7 +125,7 @@ def open_terms(code: Code, sealed: bytes) -> TermsContent:
     """Decrypt the terms of ``code``; raises ``Forged`` or ``Malformed``."""
     try:
         body = bindings.crypto_aead_xchacha20poly1305_ietf_decrypt(
-            sealed[_NONCE:], _ABOUT, sealed[:_NONCE], code.terms_key
+            sealed[_NONCE_BYTES:], _ABOUT, sealed[:_NONCE_BYTES], code.terms_key
         )
     except (CryptoError, ValueError) as error:
         raise Forged("the code does not decrypt these terms") from error
@@ -164,4 +164,4 @@ def _compute_check(places: list[int]) -> int:
 
 def _multiply_by_x(element: int) -> int:
     product = element << 1
-    return product ^ _FIELD if product & 32 else product
+    return product ^ _POLYNOMIAL if product & 32 else product

@@ -41,10 +41,10 @@ KNOCK, WELCOME = 0x17, 0x18
 KNOCK_BYTES = MAX_DATAGRAM
 MAX_CONTACTS = 8
 MAX_SECRETS = 2
-_NONCE, _TAG = 24, 16
-_HEAD = 1 + ID
-_PADDED = KNOCK_BYTES - _HEAD - _NONCE - _TAG
-MAX_WELCOME = KNOCK_BYTES - _HEAD - sealed.OVERHEAD
+_NONCE_BYTES, _TAG_BYTES = 24, 16
+_HEAD_BYTES = 1 + ID
+_BODY_BYTES = KNOCK_BYTES - _HEAD_BYTES - _NONCE_BYTES - _TAG_BYTES
+MAX_WELCOME = KNOCK_BYTES - _HEAD_BYTES - sealed.OVERHEAD
 MAX_HINT = 16
 _DOMAIN = b"swarm-welcome-1 "
 
@@ -98,8 +98,8 @@ def psk_of(invitation: bytes) -> bytes:
 def knock(invitation: Identity, public: bytes, ephemeral: bytes, wish: str, rng: random.Random) -> bytes:
     """Return the KNOCK of the newcomer ``public`` that asks for the name ``wish`` (empty: any)."""
     signature = proof(invitation, public, wish)
-    body = msgpack.packb([public, ephemeral, wish, signature]).ljust(_PADDED, b"\0")
-    head, nonce = bytes([KNOCK]) + invitation_id(invitation.public), rng.randbytes(_NONCE)
+    body = msgpack.packb([public, ephemeral, wish, signature]).ljust(_BODY_BYTES, b"\0")
+    head, nonce = bytes([KNOCK]) + invitation_id(invitation.public), rng.randbytes(_NONCE_BYTES)
     key = psk_of(invitation.public)
     return head + nonce + bindings.crypto_aead_xchacha20poly1305_ietf_encrypt(body, head, nonce, key)
 
@@ -107,9 +107,9 @@ def knock(invitation: Identity, public: bytes, ephemeral: bytes, wish: str, rng:
 def id_of(datagram: bytes) -> bytes:
     """Return the invitation id in a KNOCK or WELCOME; raises ``Malformed``."""
     is_knock = datagram[:1] == bytes([KNOCK])
-    if len(datagram) < _HEAD or (is_knock and len(datagram) != KNOCK_BYTES):
+    if len(datagram) < _HEAD_BYTES or (is_knock and len(datagram) != KNOCK_BYTES):
         raise Malformed(f"the join datagram has a wrong length, {len(datagram)} bytes")
-    return datagram[1:_HEAD]
+    return datagram[1:_HEAD_BYTES]
 
 
 def opened_knock(datagram: bytes, invitation: bytes) -> Knock:
@@ -118,14 +118,14 @@ def opened_knock(datagram: bytes, invitation: bytes) -> Knock:
     The caller verifies the proof.
     """
     id_of(datagram)
-    head, nonce = datagram[:_HEAD], datagram[_HEAD : _HEAD + _NONCE]
+    head, nonce = datagram[:_HEAD_BYTES], datagram[_HEAD_BYTES : _HEAD_BYTES + _NONCE_BYTES]
     try:
         body = bindings.crypto_aead_xchacha20poly1305_ietf_decrypt(
-            datagram[_HEAD + _NONCE :], head, nonce, psk_of(invitation)
+            datagram[_HEAD_BYTES + _NONCE_BYTES :], head, nonce, psk_of(invitation)
         )
     except (CryptoError, ValueError) as error:
         raise Forged("the join request does not decrypt") from error
-    unpacker = msgpack.Unpacker(max_buffer_size=_PADDED, max_map_len=0, max_ext_len=0, max_array_len=4)
+    unpacker = msgpack.Unpacker(max_buffer_size=_BODY_BYTES, max_map_len=0, max_ext_len=0, max_array_len=4)
     unpacker.feed(body)
     try:
         public, ephemeral, wish, signature = unpacker.unpack()
@@ -134,24 +134,24 @@ def opened_knock(datagram: bytes, invitation: bytes) -> Knock:
     return Knock(sized(public, 32), sized(ephemeral, 32), wish if wish == "" else named(wish), sized(signature, 64))
 
 
-def welcome(invitation: bytes, heard: Knock, welcomed: Welcome, signer: Signer, rng: random.Random) -> bytes:
+def welcome(invitation: bytes, request: Knock, reply: Welcome, signer: Signer, rng: random.Random) -> bytes:
     """Return the WELCOME for a newcomer, with as many contacts as fit.
 
     Raises ``Forged`` if the newcomer's ephemeral key is not valid.
     """
-    contacts = [contact.packed() for contact in welcomed.contacts[:MAX_CONTACTS]]
-    secrets = [list(each) for each in welcomed.secrets[:MAX_SECRETS]]
+    contacts = [contact.packed() for contact in reply.contacts[:MAX_CONTACTS]]
+    secrets = [list(each) for each in reply.secrets[:MAX_SECRETS]]
     while True:
-        body = _sign_body(invitation, heard, msgpack.packb([welcomed.shown, secrets, contacts]), signer)
+        body = _sign_body(invitation, request, msgpack.packb([reply.shown, secrets, contacts]), signer)
         if len(body) <= MAX_WELCOME or not contacts:
-            return _encrypt_reply(invitation, heard.ephemeral, body, rng)
+            return _encrypt_reply(invitation, request.ephemeral, body, rng)
         contacts.pop()
 
 
-def refusal(invitation: bytes, heard: Knock, code: str, signer: Signer, rng: random.Random) -> bytes:
+def refusal(invitation: bytes, request: Knock, code: str, signer: Signer, rng: random.Random) -> bytes:
     """Return the WELCOME that rejects a newcomer with a code of ``errors.WHY``."""
-    body = _sign_body(invitation, heard, msgpack.packb([code]), signer)
-    return _encrypt_reply(invitation, heard.ephemeral, body, rng)
+    body = _sign_body(invitation, request, msgpack.packb([code]), signer)
+    return _encrypt_reply(invitation, request.ephemeral, body, rng)
 
 
 def hint(name: bytes, code: str = "") -> bytes:
@@ -167,18 +167,18 @@ def opened_welcome(datagram: bytes, code: Code, public: bytes, ephemeral: bytes)
     invitation = code.key.public
     if id_of(datagram) != invitation_id(invitation):
         raise Forged("the join reply names another invitation")
-    if len(datagram) <= _HEAD + MAX_HINT:
-        said = datagram[_HEAD:].decode("ascii", "replace")
+    if len(datagram) <= _HEAD_BYTES + MAX_HINT:
+        said = datagram[_HEAD_BYTES:].decode("ascii", "replace")
         return Hint(said if said in WHY else "unknown")
-    body = sealed.opened(datagram[_HEAD:], ephemeral, psk_of(invitation), datagram[:_HEAD])
+    body = sealed.opened(datagram[_HEAD_BYTES:], ephemeral, psk_of(invitation), datagram[:_HEAD_BYTES])
     try:
         terms, grant, signature, content = msgpack.unpackb(body, max_map_len=0, max_ext_len=0, max_array_len=4)
         found = open_terms(code, terms)
         bootstrap = opened(found.operator, grant)
         if not isinstance(bootstrap, Grant) or BOOTSTRAP not in bootstrap.roles:
             raise Forged("the replying node is not a bootstrap node of the team")
-        heard = Knock(public, bindings.crypto_scalarmult_base(ephemeral), "", b"")
-        if not verified(bootstrap.public, _signed_content(invitation, heard, terms, content), sized(signature, 64)):
+        request = Knock(public, bindings.crypto_scalarmult_base(ephemeral), "", b"")
+        if not verified(bootstrap.public, _signed_content(invitation, request, terms, content), sized(signature, 64)):
             raise Forged("the signature of the join reply is not valid")
         return Reply(found, _parse_content(content))
     except (Forged, Malformed):
@@ -198,13 +198,13 @@ def _parse_content(packed: bytes) -> Welcome | str:
     return Welcome(shown, found, tuple(contact for each in contacts if (contact := unpacked(each)) is not None))
 
 
-def _sign_body(invitation: bytes, heard: Knock, content: bytes, signer: Signer) -> bytes:
-    signature = signer.identity.sign(_signed_content(invitation, heard, signer.terms, content))
+def _sign_body(invitation: bytes, request: Knock, content: bytes, signer: Signer) -> bytes:
+    signature = signer.identity.sign(_signed_content(invitation, request, signer.terms, content))
     return bytes(msgpack.packb([signer.terms, signer.grant, signature, content]))
 
 
-def _signed_content(invitation: bytes, heard: Knock, terms: bytes, content: bytes) -> bytes:
-    return _DOMAIN + bytes(msgpack.packb([invitation, heard.public, heard.ephemeral, terms, content]))
+def _signed_content(invitation: bytes, request: Knock, terms: bytes, content: bytes) -> bytes:
+    return _DOMAIN + bytes(msgpack.packb([invitation, request.public, request.ephemeral, terms, content]))
 
 
 def _encrypt_reply(invitation: bytes, ephemeral: bytes, body: bytes, rng: random.Random) -> bytes:

@@ -91,21 +91,21 @@ class Reception:
                     self._send(knock.hint(name), source)
                 return
             invite, packed = known
-            heard = knock.opened_knock(datagram, invite.public)
+            request = knock.opened_knock(datagram, invite.public)
             # Checked after decryption: a node that only saw the id must not use up the rate of code holders.
             if not self._request_rate.take(self._now()):
                 return
-            if not is_proof(invite.public, heard.public, heard.wish, heard.proof):
+            if not is_proof(invite.public, request.public, request.wish, request.proof):
                 return
         except RemoteError:
             return
-        if heard.public in self._under_way:
+        if request.public in self._under_way:
             return  # the newcomer retransmits
-        self._under_way[heard.public] = ""
-        decided = Deferred.fromCoroutine(self._decide_request(heard, invite, packed))
-        decided.addBoth(self._reply, heard, invite, digest, source).addErrback(self._log_unexpected)
+        self._under_way[request.public] = ""
+        decided = Deferred.fromCoroutine(self._decide_request(request, invite, packed))
+        decided.addBoth(self._reply, request, invite, digest, source).addErrback(self._log_unexpected)
 
-    async def _decide_request(self, heard: Knock, invite: Invite, packed: bytes) -> bytes | str:
+    async def _decide_request(self, request: Knock, invite: Invite, packed: bytes) -> bytes | str:
         """Return the pass of the newcomer, or the code of the refusal."""
         now = int(self._wall())
         me, own = self._roll.granted(self._identity.public), self._roll.member(self._identity.public, now)
@@ -113,9 +113,9 @@ class Reception:
             return "role"
         if self._roll.terms_of(invite.public) is None:
             return "old"
-        if self._roll.revoked(invite.public) is not None or self._roll.revoked(heard.public) is not None:
+        if self._roll.revoked(invite.public) is not None or self._roll.revoked(request.public) is not None:
             return "revoked"
-        before = self._roll.admitted(heard.public)
+        before = self._roll.admitted(request.public)
         if before is not None and before.member.invitation == invite.public:
             return before.shown
         if now < invite.not_before - SKEW:
@@ -124,53 +124,53 @@ class Reception:
             return "expired"
         if sum(each.member.invitation == invite.public for each in self._roll.admissions()) >= invite.uses:
             return "used"
-        name = self._choose_name(heard, invite)
+        name = self._choose_name(request, invite)
         if name is None:
             return "name"
-        self._under_way[heard.public] = name
+        self._under_way[request.public] = name
         try:
             if not await self._take(invite):
                 return "used"
         except EntangledError:
             return "later"
-        came = (heard.public, heard.wish, heard.proof)
+        newcomer = (request.public, request.wish, request.proof)
         begin = max(now, invite.not_before)
-        shown = chained(self._identity, me[1], (packed, invite), came, name, begin)
-        self._admit(packed_admission(heard.public, shown))
+        shown = chained(self._identity, me[1], (packed, invite), newcomer, name, begin)
+        self._admit(packed_admission(request.public, shown))
         return shown
 
-    def _choose_name(self, heard: Knock, invite: Invite) -> str | None:
+    def _choose_name(self, request: Knock, invite: Invite) -> str | None:
         """Choose the newcomer's name; None if another member has it already."""
-        taken = {member.name for member in self._roll.members(self._wall()) if member.public != heard.public}
+        taken = {member.name for member in self._roll.members(self._wall()) if member.public != request.public}
         taken.update(self._under_way.values())
         if invite.uses == 1:
             return invite.name if invite.name not in taken else None
-        if heard.wish:
-            return heard.wish if heard.wish not in taken else None
+        if request.wish:
+            return request.wish if request.wish not in taken else None
         free = (f"{invite.name[:NUMBERED]}-{number}" for number in range(1, len(taken) + 2))
         return next((name for name in free if name not in taken), None)
 
     def _reply(
-        self, result: bytes | str | Failure, heard: Knock, invite: Invite, digest: bytes, source: Address
+        self, result: bytes | str | Failure, request: Knock, invite: Invite, digest: bytes, source: Address
     ) -> Any:
-        del self._under_way[heard.public]
+        del self._under_way[request.public]
         if isinstance(result, Failure):
             result.trap(EntangledError)
             self._log.warn("cannot admit a newcomer: {problem}", problem=result.getErrorMessage())
             result = "later"
         signer = self._make_signer(invite)
         if isinstance(result, bytes) and signer is not None:
-            answer = knock.welcome(invite.public, heard, self._build_welcome(result), signer, self._rng)
+            answer = knock.welcome(invite.public, request, self._build_welcome(result), signer, self._rng)
             self._log.info(
-                "admitted by the invitation of {name}: {public}", name=invite.name, public=heard.public.hex()
+                "admitted by the invitation of {name}: {public}", name=invite.name, public=request.public.hex()
             )
         else:
             code = result if isinstance(result, str) else "role"
-            self._log_refusal(heard.public, code, source, invite.name)
+            self._log_refusal(request.public, code, source, invite.name)
             if signer is None:
                 answer = knock.hint(invitation_id(invite.public), code)
             else:
-                answer = knock.refusal(invite.public, heard, code, signer, self._rng)
+                answer = knock.refusal(invite.public, request, code, signer, self._rng)
         if result not in ("later", "role", "name", "old"):  # these can change at any time
             self._answers[digest] = answer
             if len(self._answers) > MAX_ANSWERS:

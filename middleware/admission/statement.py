@@ -46,8 +46,8 @@ SECRET_BYTES = 32
 MEMBER_ID = 8
 MAX_KEPT = MAX_SEALED
 """Maximum number of members and renewals that one revocation of a bootstrap node can keep."""
-_LAST = 2**40
-_PUBLIC, _SIGNATURE, _MARK = 32, 64, 16
+_MAX_TIME_S = 2**40
+_PUBLIC_BYTES, _SIGNATURE_BYTES, _MARK_BYTES = 32, 64, 16
 
 
 class Entry:
@@ -241,7 +241,7 @@ def remembered_until(not_after: int, life: int) -> int:
 
 def mark_of(secret: bytes) -> bytes:
     """Return the public fingerprint of a secret."""
-    return hashlib.blake2s(secret, digest_size=_MARK, person=b"secret").digest()
+    return hashlib.blake2s(secret, digest_size=_MARK_BYTES, person=b"secret").digest()
 
 
 def signed(operator: Identity, statement: Statement) -> bytes:
@@ -262,7 +262,7 @@ def opened(operator: bytes, whole: object) -> Statement:
     fields = unpacked(whole)
     signature = fields.pop() if fields else None
     statement = _parse_fields(fields)
-    if not isinstance(signature, bytes) or len(signature) != _SIGNATURE:
+    if not isinstance(signature, bytes) or len(signature) != _SIGNATURE_BYTES:
         raise Malformed("the statement does not end with a signature")
     if not verified(operator, _signed_content(operator, fields), signature):
         raise Forged("the statement is not signed by this team's operator")
@@ -295,7 +295,7 @@ def roles_of(bits: object) -> tuple[str, ...]:
     return tuple(role for place, role in enumerate(ROLES) if bits >> place & 1)
 
 
-def moment(value: object, least: int = 0, most: int = _LAST) -> int:
+def moment(value: object, least: int = 0, most: int = _MAX_TIME_S) -> int:
     """Return ``value`` if it is a whole number from ``least`` to ``most``; raises ``Malformed``."""
     if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= most:
         raise Malformed(f"a number in the statement is not between {least} and {most}")
@@ -339,32 +339,34 @@ def _parse_fields(fields: list[Any]) -> Statement:
         kind, *rest = fields
         if kind == 0:
             public, name, bits, begin, end = rest
-            grant = Grant(sized(public, _PUBLIC), named(name), roles_of(bits), moment(begin), moment(end))
+            grant = Grant(sized(public, _PUBLIC_BYTES), named(name), roles_of(bits), moment(begin), moment(end))
             return _check_dates(grant, grant.not_before, grant.not_after)
         if kind == 1:
             public, name, bits, uses, begin, end, life = rest
             times = moment(begin), moment(end), moment(life, 1, MAX_LIFE)
-            invite = Invite(sized(public, _PUBLIC), named(name), roles_of(bits), moment(uses, 1, MAX_USES), *times)
+            invite = Invite(
+                sized(public, _PUBLIC_BYTES), named(name), roles_of(bits), moment(uses, 1, MAX_USES), *times
+            )
             return _check_dates(invite, invite.not_before, invite.not_after)
         if kind == 2:
             public, name, at, end, *more = rest
             kept = tuple(sized(each, MEMBER_ID) for [ids] in [more] for each in ids) if more else ()
-            revoke = Revoke(sized(public, _PUBLIC), named(name), moment(at), moment(end), kept)
+            revoke = Revoke(sized(public, _PUBLIC_BYTES), named(name), moment(at), moment(end), kept)
             return _check_dates(revoke, revoke.at, revoke.not_after)
         if kind == 3:
             number, at, grace, end, mark, pairs = rest
             if not isinstance(pairs, list) or not pairs:
                 raise Malformed("the secret is for no member")
             size = SECRET_BYTES + OVERHEAD
-            each = tuple((sized(public, _PUBLIC), sized(whole, size)) for public, whole in pairs)
+            each = tuple((sized(public, _PUBLIC_BYTES), sized(whole, size)) for public, whole in pairs)
             times = moment(at), moment(grace, 0, MAX_LIFE), moment(end)
-            secret = Secret(moment(number, 1), *times, sized(mark, _MARK), each)
+            secret = Secret(moment(number, 1), *times, sized(mark, _MARK_BYTES), each)
             return _check_dates(secret, secret.at, secret.not_after)
         if kind == 4:
             public, sealed, begin, end = rest
             if not isinstance(sealed, bytes) or len(sealed) > MAX_TERMS:
                 raise Malformed(f"the terms have more than {MAX_TERMS} bytes")
-            terms = Terms(sized(public, _PUBLIC), sealed, moment(begin), moment(end))
+            terms = Terms(sized(public, _PUBLIC_BYTES), sealed, moment(begin), moment(end))
             return _check_dates(terms, terms.not_before, terms.not_after)
     except (ValueError, TypeError) as error:
         raise Malformed("the statement has invalid fields") from error
