@@ -190,7 +190,7 @@ class Reception:
             self._log.failure("while admitting a newcomer", failure)
 
     def _log_refusal(self, who: bytes, code: str, source: Address, name: str = "") -> None:
-        """Log a refusal once per newcomer and reason; invented ids share one entry, so they cannot fill the log."""
+        """Log a refusal once per newcomer and reason; a rate limit protects the log from invented ids."""
         self._on_refused(b"" if code == "unknown" else who, source, code)
         if not self._logged.is_new(self._now(), who, code):
             return
