@@ -53,7 +53,7 @@ class Team:
 
 
 @dataclass
-class _Heard:
+class _Replies:
     calls: set[bytes] = field(default_factory=set)
     on_lan: dict[Address, Answer] = field(default_factory=dict)
     answers: dict[Address, Answer] = field(default_factory=dict)
@@ -79,8 +79,8 @@ def measured(
     port_problem = ""
     if node.port and not is_free(socket.SOCK_DGRAM, "" if is_any(node.host) else node.host, node.port):
         port_problem = f"Another program uses {node.host}:{node.port}."
-    where = chosen(list(found), node.host) if node.lan and not is_local(node.host) else []
-    heard = _probe_all(node.host, known, team.secrets, where, wall)
+    lan_interfaces = chosen(list(found), node.host) if node.lan and not is_local(node.host) else []
+    replies = _probe_all(node.host, known, team.secrets, lan_interfaces, wall)
     gateway = _find_router()
     return Facts(
         node.name,
@@ -88,8 +88,8 @@ def measured(
         node.port,
         wall(),
         interfaces=found,
-        known=tuple(_make_probe(address, heard, found) for address in known),
-        lan=Lan(tuple(heard.on_lan.values()), heard.is_sent, heard.is_own_heard) if where else None,
+        known=tuple(_make_probe(address, replies, found) for address in known),
+        lan=Lan(tuple(replies.on_lan.values()), replies.is_sent, replies.is_own_heard) if lan_interfaces else None,
         port_problem=port_problem if settings.is_given("node", "port") else "",
         is_running=is_running,
         fingerprint=team.fingerprint,
@@ -135,35 +135,35 @@ def _probe_all(
     host: str,
     known: Sequence[Address],
     secrets: Sequence[bytes],
-    where: Sequence[Interface],
+    lan_interfaces: Sequence[Interface],
     wall: Callable[[], float],
-) -> _Heard:
-    """Probe all known nodes from one socket, so they report the same port; also probe the LAN of ``where``."""
-    heard = _Heard()
+) -> _Replies:
+    """Probe all known nodes from one socket, so they report the same port; also probe the LAN by ``lan_interfaces``."""
+    replies = _Replies()
     rng = random.SystemRandom()
     keys = [derived_key(secret, b"greet") for secret in secrets]
     tokens = {rng.randbytes(16): address for address in known}
     sockets = _open_sockets(host, known)
-    ear = _open_multicast_socket(where) if where else None
+    multicast = _open_multicast_socket(lan_interfaces) if lan_interfaces else None
     try:
         for _ in range(TRIES):
             for token, address in tokens.items():
-                _send(sockets, hail(token), address, heard)
-                if address not in heard.members:
+                _send(sockets, hail(token), address, replies)
+                if address not in replies.members:
                     for key in keys:
-                        _send(sockets, who(key, token, rng), address, heard)
-            if where:
+                        _send(sockets, who(key, token, rng), address, replies)
+            if lan_interfaces:
                 call = rng.randbytes(16)
-                heard.calls.add(call)
-                _send_multicast(sockets, hail(call), where, heard)
-            _listen([*sockets.values(), *([] if ear is None else [ear])], ear, keys, heard, wall)
-            if known and not where and heard.members >= set(known) and heard.answers.keys() >= set(known):
+                replies.calls.add(call)
+                _send_multicast(sockets, hail(call), lan_interfaces, replies)
+            _listen([*sockets.values(), *([] if multicast is None else [multicast])], multicast, keys, replies, wall)
+            if known and not lan_interfaces and replies.members >= set(known) and replies.answers.keys() >= set(known):
                 break
     finally:
-        for each in [*sockets.values(), ear]:
+        for each in [*sockets.values(), multicast]:
             if each is not None:
                 each.close()
-    return heard
+    return replies
 
 
 def _open_sockets(host: str, known: Iterable[Address]) -> dict[int, socket.socket]:
@@ -188,28 +188,28 @@ def _open_sockets(host: str, known: Iterable[Address]) -> dict[int, socket.socke
     return by_family
 
 
-def _open_multicast_socket(where: Sequence[Interface]) -> socket.socket | None:
+def _open_multicast_socket(lan_interfaces: Sequence[Interface]) -> socket.socket | None:
     """Open a socket in the multicast group of the LAN, as a node does."""
-    ear = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    multicast = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
-        ear.setblocking(False)
-        ear.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        ear.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)
-        ear.bind(GROUP)
-        for interface in where:
+        multicast.setblocking(False)
+        multicast.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        multicast.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)
+        multicast.bind(GROUP)
+        for interface in lan_interfaces:
             with suppress(OSError):
                 request = struct.pack("4s4si", socket.inet_aton(GROUP.host), bytes(4), interface.index)
-                ear.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, request)
+                multicast.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, request)
     except OSError:
-        ear.close()
+        multicast.close()
         return None
-    return ear
+    return multicast
 
 
-def _send(sockets: dict[int, socket.socket], datagram: bytes, to: Address, heard: _Heard) -> None:
+def _send(sockets: dict[int, socket.socket], datagram: bytes, to: Address, replies: _Replies) -> None:
     by = sockets.get(socket.AF_INET6 if ":" in to.host else socket.AF_INET)
     if by is None:
-        heard.errors[to] = "unreachable"
+        replies.errors[to] = "unreachable"
         return
     for _ in range(2):  # an error of an earlier datagram is raised by the next call
         try:
@@ -217,66 +217,66 @@ def _send(sockets: dict[int, socket.socket], datagram: bytes, to: Address, heard
             return
         except OSError as error:
             if error.errno in (errno.ENETUNREACH, errno.EPERM, errno.EACCES, errno.EINVAL):
-                heard.errors[to] = "unreachable"
+                replies.errors[to] = "unreachable"
 
 
 def _send_multicast(
-    sockets: dict[int, socket.socket], datagram: bytes, where: Sequence[Interface], heard: _Heard
+    sockets: dict[int, socket.socket], datagram: bytes, lan_interfaces: Sequence[Interface], replies: _Replies
 ) -> None:
     by = sockets.get(socket.AF_INET)
     if by is None:
         return
-    for interface in where:
+    for interface in lan_interfaces:
         for address in [each for each in interface.addresses if ":" not in each]:
-            way = struct.pack("i4s4s", interface.index, socket.inet_aton(address), bytes(4))
+            packet_info = struct.pack("i4s4s", interface.index, socket.inet_aton(address), bytes(4))
             with suppress(OSError):
-                by.sendmsg([datagram], [(socket.IPPROTO_IP, _IP_PKTINFO, way)], 0, GROUP)
-                heard.is_sent = True
+                by.sendmsg([datagram], [(socket.IPPROTO_IP, _IP_PKTINFO, packet_info)], 0, GROUP)
+                replies.is_sent = True
 
 
 def _listen(
     sockets: Sequence[socket.socket],
-    ear: socket.socket | None,
+    multicast: socket.socket | None,
     keys: Sequence[bytes],
-    heard: _Heard,
+    replies: _Replies,
     wall: Callable[[], float],
 ) -> None:
     until = time.monotonic() + EACH_S
-    ours = {each.getsockname()[1] for each in sockets if each is not ear}
+    ours = {each.getsockname()[1] for each in sockets if each is not multicast}
     while (left := until - time.monotonic()) > 0:
         for ready in select.select(sockets, [], [], left)[0]:
-            _read_errors(ready, heard)
+            _read_errors(ready, replies)
             try:
                 datagram, source = ready.recvfrom(2048)
             except OSError:
                 continue
-            if ready is ear:
-                heard.is_own_heard = heard.is_own_heard or source[1] in ours
+            if ready is multicast:
+                replies.is_own_heard = replies.is_own_heard or source[1] in ours
             elif datagram[:1] == bytes([ECHO]):
-                _on_echo(datagram, Address(source[0], source[1]), heard, wall())
+                _on_echo(datagram, Address(source[0], source[1]), replies, wall())
             else:
-                _on_here(datagram, Address(source[0], source[1]), keys, heard)
+                _on_here(datagram, Address(source[0], source[1]), keys, replies)
 
 
-def _on_echo(datagram: bytes, source: Address, heard: _Heard, now: float) -> None:
+def _on_echo(datagram: bytes, source: Address, replies: _Replies, now: float) -> None:
     try:
         echo = echo_of(datagram)
     except Malformed:
         return
     offset = echo.wall - now if echo.wall else None
-    answers = heard.on_lan if echo.token in heard.calls else heard.answers
+    answers = replies.on_lan if echo.token in replies.calls else replies.answers
     answers.setdefault(source, Answer(source, echo.version, echo.fingerprint, offset, echo.seen))
 
 
-def _on_here(datagram: bytes, source: Address, keys: Sequence[bytes], heard: _Heard) -> None:
+def _on_here(datagram: bytes, source: Address, keys: Sequence[bytes], replies: _Replies) -> None:
     for key in keys:
         with suppress(Forged):
             opened_greeting(key, datagram)
-            heard.members.add(source)
+            replies.members.add(source)
             return
 
 
-def _read_errors(ready: socket.socket, heard: _Heard) -> None:
+def _read_errors(ready: socket.socket, replies: _Replies) -> None:
     """Read the ICMP errors for datagrams that could not be delivered."""
     while ready.family == socket.AF_INET:
         try:
@@ -287,15 +287,15 @@ def _read_errors(ready: socket.socket, heard: _Heard) -> None:
             if level == socket.IPPROTO_IP and kind == _IP_RECVERR and len(data) >= 4:
                 number = struct.unpack_from("I", data)[0]
                 refused = number == errno.ECONNREFUSED
-                heard.errors[Address(to[0], to[1])] = "refused" if refused else "unreachable"
+                replies.errors[Address(to[0], to[1])] = "refused" if refused else "unreachable"
 
 
-def _make_probe(address: Address, heard: _Heard, found: Sequence[Interface]) -> Probe:
+def _make_probe(address: Address, replies: _Replies, found: Sequence[Interface]) -> Probe:
     probe = Probe(
         address,
-        heard.answers.get(address),
-        address in heard.members,
-        heard.errors.get(address, ""),
+        replies.answers.get(address),
+        address in replies.members,
+        replies.errors.get(address, ""),
         _is_near(address.host, found),
     )
     if probe.is_heard:
@@ -339,9 +339,9 @@ def _source_address(hosts: Sequence[str]) -> str:
     """Return the source address for datagrams to the first host."""
     for host in hosts[:1]:
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        with suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as way:
-            way.connect((host, 9))  # sends nothing
-            return str(way.getsockname()[0])
+        with suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as probe:
+            probe.connect((host, 9))  # sends nothing
+            return str(probe.getsockname()[0])
     return ""
 
 
@@ -395,13 +395,13 @@ def _is_resolved(host: str) -> bool | None:
 def _check_storage(path: str) -> Storage | None:
     if path == IN_MEMORY:
         return None
-    where = Path(path)
-    folder = where.parent
+    file = Path(path)
+    folder = file.parent
     problem = ""
-    if where.is_dir():
+    if file.is_dir():
         problem = "It is a folder."
-    elif where.exists():
-        problem = "" if os.access(where, os.R_OK | os.W_OK) else "This user has no permission to write it."
+    elif file.exists():
+        problem = "" if os.access(file, os.R_OK | os.W_OK) else "This user has no permission to write it."
     elif not folder.is_dir():
         problem = f"The folder {folder} does not exist."
     if not problem and not os.access(folder, os.W_OK | os.X_OK):
