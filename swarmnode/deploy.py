@@ -42,13 +42,13 @@ def parser() -> argparse.ArgumentParser:
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument("--node", metavar="NAME", help="node on this machine, if several run")
     common.add_argument("--json", action="store_true", help="print JSON, on one line")
-    whole = argparse.ArgumentParser(
+    main_parser = argparse.ArgumentParser(
         prog="swarm deploy",
         description="Push a strategy or a behaviour to the running team, signed by the node on this machine.",
         epilog="A node runs a module only if its [deployment] settings allow it, and list the module's name and this "
         "node's key as an operator.  Example: swarm deploy push follow.py --name follow --kind behaviour",
     )
-    verbs = whole.add_subparsers(dest="verb", required=True, metavar="VERB")
+    verbs = main_parser.add_subparsers(dest="verb", required=True, metavar="VERB")
 
     def verb(name: str, purpose: str, example: str) -> argparse.ArgumentParser:
         epilog = f"Example: swarm deploy {name}{example}"
@@ -64,7 +64,7 @@ def parser() -> argparse.ArgumentParser:
     back.add_argument("name", metavar="NAME", help="name of the module")
     verb("status", "Show the pushed modules and the devices that run them.", " --json")
     verb("keys", "Print the public key of each device, as needed in [deployment] operators.", "")
-    return whole
+    return main_parser
 
 
 def main(words: Sequence[str] | None = None, out: TextIO | None = None, ask: Ask = asked) -> int:

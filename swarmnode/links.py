@@ -84,8 +84,8 @@ def _as_text(rated: Sequence[tuple[dict[str, Any], Link]], names: dict[str, str]
     rows = [(_name(each["id"], names), _path(each, names), each, found) for each, found in rated]
     wide, far = (max(len(each[place]) for each in rows) for place in (0, 1))  # type: ignore[arg-type]
     lines = [
-        f"{name:{wide}}  {found.score:3}/100  {way:{far}}  {figures(found)}{_span(each['for'])}"
-        for name, way, each, found in rows
+        f"{name:{wide}}  {found.score:3}/100  {path:{far}}  {figures(found)}{_span(each['for'])}"
+        for name, path, each, found in rows
     ]
     return "".join(printable(line) + "\n" for line in lines)
 

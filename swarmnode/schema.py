@@ -21,8 +21,8 @@ def json_schema() -> dict[str, Any]:
     optional: list[tuple[str, Any, Any]] = [
         (name, table, msgspec.field(default_factory=dict)) for name, table in tables.items() if name != "node"
     ]
-    whole = msgspec.defstruct("Settings", [("node", tables["node"]), *optional], forbid_unknown_fields=True)
-    return msgspec.json.schema(whole)
+    struct = msgspec.defstruct("Settings", [("node", tables["node"]), *optional], forbid_unknown_fields=True)
+    return msgspec.json.schema(struct)
 
 
 def _make_struct(name: str, cls: type[Any]) -> type[Any]:

@@ -189,8 +189,8 @@ def member_of(operator: bytes, public: bytes, shown: bytes) -> Member:
     try:
         kind, *rest = fields
         if kind == 0:
-            [whole] = rest
-            return member_by(_parse_own_grant(operator, public, whole))
+            [packed_grant] = rest
+            return member_by(_parse_own_grant(operator, public, packed_grant))
         if kind == 1:
             return _verify_chain(operator, public, rest)
         if kind == 2:
@@ -209,7 +209,7 @@ def member_by(grant: Grant) -> Member:
 
 
 def _verify_renewal(operator: bytes, public: bytes, fields: list[Any]) -> Member:
-    content, begin, end, signature, whole = fields
+    content, begin, end, signature, packed_grant = fields
     if not isinstance(content, list):
         raise Malformed("the renewal has no operator-signed content")
     member = (
@@ -219,7 +219,7 @@ def _verify_renewal(operator: bytes, public: bytes, fields: list[Any]) -> Member
     )
     if not member.is_renewable:
         raise Forged("the operator did not issue this certificate as renewable")
-    grant = _parse_grant(operator, whole)
+    grant = _parse_grant(operator, packed_grant)
     if BOOTSTRAP not in grant.roles or grant.life < YEAR:
         raise Forged("the renewal is signed by a node that may not renew")
     moment(begin, max(0, max(member.since, grant.not_before) - SKEW))
@@ -253,11 +253,11 @@ def _verify_invitation(operator: bytes, public: bytes, packed: Any, wish: Any, s
 
 
 def _verify_chain(operator: bytes, public: bytes, fields: list[Any]) -> Member:
-    packed, wish, signature, name, begin, end, admission, whole = fields
+    packed, wish, signature, name, begin, end, admission, packed_grant = fields
     invite = _verify_invitation(operator, public, packed, wish, signature)
     moment(begin, max(0, invite.not_before - SKEW), invite.not_after)
     moment(end, begin + 1, begin + invite.life)
-    grant = _parse_grant(operator, whole)
+    grant = _parse_grant(operator, packed_grant)
     # A renewed bootstrap node outlives its grant; the grant stays valid for its roles until it is revoked.
     is_over = begin >= grant.not_after and grant.life < YEAR
     if BOOTSTRAP not in grant.roles or begin < grant.not_before - SKEW or is_over:
@@ -287,15 +287,15 @@ def _guest_content(public: bytes, name: str, begin: int, end: int) -> bytes:
     return _GUEST + bytes(msgpack.packb([public, name, begin, end]))
 
 
-def _parse_grant(operator: bytes, whole: Any) -> Grant:
-    grant = opened(operator, whole)
+def _parse_grant(operator: bytes, packed_grant: Any) -> Grant:
+    grant = opened(operator, packed_grant)
     if not isinstance(grant, Grant):
         raise Malformed("the pass does not contain a grant")
     return grant
 
 
-def _parse_own_grant(operator: bytes, public: bytes, whole: Any) -> Grant:
-    grant = _parse_grant(operator, whole)
+def _parse_own_grant(operator: bytes, public: bytes, packed_grant: Any) -> Grant:
+    grant = _parse_grant(operator, packed_grant)
     if grant.public != public:
         raise Forged("the grant is for another key")
     return grant

@@ -136,9 +136,9 @@ class Newcomer:
         if self._hint:
             self._fail(NotWelcome(self._hint))
             return
-        where = ", ".join(map(str, self._addresses)) or "no bootstrap node found"
+        addresses = ", ".join(map(str, self._addresses)) or "no bootstrap node found"
         remedy = "name the address of a bootstrap node that runs (swarm join CODE --at HOST:PORT)"
-        self._fail(NoAnswer(f"no reply to the join request ({where}); {remedy}, and check that UDP is not blocked"))
+        self._fail(NoAnswer(f"no reply to the join request ({addresses}); {remedy}, and check that UDP is not blocked"))
 
     def _fail(self, error: Exception) -> None:
         done = self._finish()

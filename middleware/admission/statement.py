@@ -194,11 +194,11 @@ class Secret(Entry):
 
     def opened(self, member: Identity) -> bytes | None:
         """Return the secret, or None if it was not encrypted for ``member``."""
-        whole = dict(self.sealed).get(member.public)
-        if whole is None:
+        packed = dict(self.sealed).get(member.public)
+        if packed is None:
             return None
         try:
-            found = unsealed(whole, member.exchange_secret, _derive_shared(self.number), b"")
+            found = unsealed(packed, member.exchange_secret, _derive_shared(self.number), b"")
         except Forged:
             return None
         return found if self.is_it(found) else None
@@ -251,15 +251,15 @@ def signed(operator: Identity, statement: Statement) -> bytes:
         _parse_fields(fields)
     except Malformed as error:
         raise ValueError(str(error)) from error
-    whole: bytes = msgpack.packb([*fields, operator.sign(_signed_content(operator.public, fields))])
-    if len(whole) > MAX_STATEMENT:
-        raise ValueError(f"a statement has at most {MAX_STATEMENT} bytes, this one {len(whole)}")
-    return whole
+    packed: bytes = msgpack.packb([*fields, operator.sign(_signed_content(operator.public, fields))])
+    if len(packed) > MAX_STATEMENT:
+        raise ValueError(f"a statement has at most {MAX_STATEMENT} bytes, this one {len(packed)}")
+    return packed
 
 
-def opened(operator: bytes, whole: object) -> Statement:
-    """Parse ``whole`` and verify the signature of ``operator``; raises ``Malformed`` or ``Forged``."""
-    fields = unpacked(whole)
+def opened(operator: bytes, packed: object) -> Statement:
+    """Parse ``packed`` and verify the signature of ``operator``; raises ``Malformed`` or ``Forged``."""
+    fields = unpacked(packed)
     signature = fields.pop() if fields else None
     statement = _parse_fields(fields)
     if not isinstance(signature, bytes) or len(signature) != _SIGNATURE_BYTES:
@@ -269,15 +269,15 @@ def opened(operator: bytes, whole: object) -> Statement:
     return statement
 
 
-def unpacked(whole: object) -> list[Any]:
+def unpacked(packed: object) -> list[Any]:
     """Unpack a msgpack array of at most ``MAX_STATEMENT`` bytes; raises ``Malformed``."""
-    if not isinstance(whole, bytes) or len(whole) > MAX_STATEMENT:
+    if not isinstance(packed, bytes) or len(packed) > MAX_STATEMENT:
         raise Malformed(f"a statement has to be at most {MAX_STATEMENT} bytes")
     try:
-        fields = msgpack.unpackb(whole, max_ext_len=0, max_map_len=0, max_array_len=MAX_SEALED)
+        fields = msgpack.unpackb(packed, max_ext_len=0, max_map_len=0, max_array_len=MAX_SEALED)
     except Exception as error:  # untrusted bytes
         raise Malformed("the statement is not msgpack") from error
-    if not isinstance(fields, list) or msgpack.packb(fields) != whole:
+    if not isinstance(fields, list) or msgpack.packb(fields) != packed:
         # Only the shortest encoding is valid: equal statements must have equal digests.
         raise Malformed("the statement is not in the shortest msgpack encoding")
     return fields
@@ -358,7 +358,7 @@ def _parse_fields(fields: list[Any]) -> Statement:
             if not isinstance(pairs, list) or not pairs:
                 raise Malformed("the secret is for no member")
             size = SECRET_BYTES + OVERHEAD
-            each = tuple((sized(public, _PUBLIC_BYTES), sized(whole, size)) for public, whole in pairs)
+            each = tuple((sized(public, _PUBLIC_BYTES), sized(packed, size)) for public, packed in pairs)
             times = moment(at), moment(grace, 0, MAX_LIFE), moment(end)
             secret = Secret(moment(number, 1), *times, sized(mark, _MARK_BYTES), each)
             return _check_dates(secret, secret.at, secret.not_after)

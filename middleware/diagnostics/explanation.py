@@ -133,17 +133,17 @@ def _describe_differences(verdict: Verdict, reference: Verdict, names: Mapping[s
 
 def _describe_other_reports(verdict: Verdict, reference: Verdict) -> str:
     are_whole = all(len(v.reports) == v.reported for v in (verdict, reference))
-    knew, known = ({r.agent: r for r in v.reports} for v in (verdict, reference))
+    own, other = ({r.agent: r for r in v.reports} for v in (verdict, reference))
     differences = []
-    for agent in sorted({**knew, **known}, key=lambda agent: ({**known, **knew}[agent].name, agent)):
-        if agent not in knew:
-            differences.append(f"no report of {known[agent].name}")
-        elif agent not in known:
-            differences.append(f"a report of {knew[agent].name}")
-        elif knew[agent].cost != known[agent].cost:
-            differences.append(f"{knew[agent].name} at {knew[agent].cost:.2f}, not {known[agent].cost:.2f}")
-        elif knew[agent].more != known[agent].more:
-            differences.append(f"{knew[agent].name} with {knew[agent].more or 'nothing more'}")
+    for agent in sorted({**own, **other}, key=lambda agent: ({**other, **own}[agent].name, agent)):
+        if agent not in own:
+            differences.append(f"no report of {other[agent].name}")
+        elif agent not in other:
+            differences.append(f"a report of {own[agent].name}")
+        elif own[agent].cost != other[agent].cost:
+            differences.append(f"{own[agent].name} at {own[agent].cost:.2f}, not {other[agent].cost:.2f}")
+        elif own[agent].more != other[agent].more:
+            differences.append(f"{own[agent].name} with {own[agent].more or 'nothing more'}")
     if not are_whole or not differences:
         return "knew other reports"
     more = [f"{len(differences) - TOLD} more"] if len(differences) > TOLD else []

@@ -85,7 +85,7 @@ def _not_running(name: str | None) -> str:
 
 
 def _parse_health(answer: dict[str, Any]) -> Health:
-    refusals = tuple((str(code), str(whom)) for code, whom in answer.get("refusals", []))
+    refusals = tuple((str(code), str(peer)) for code, peer in answer.get("refusals", []))
     figures = {key: int(answer[key]) for key in ("contacts", "rows", "max_rows", "bytes", "max_bytes")}
     return Health(**figures, trouble=str(answer.get("trouble", "")), refusals=refusals)
 

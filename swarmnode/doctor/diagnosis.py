@@ -34,20 +34,20 @@ def port(facts: Facts) -> Iterator[Finding]:
 
 def store(facts: Facts) -> Iterator[Finding]:
     """Check that the store is writable and not full."""
-    where, health = facts.storage, facts.health
-    if where is not None and where.problem:
+    storage, health = facts.storage, facts.health
+    if storage is not None and storage.problem:
         yield error(
             "store-unwritable",
-            f"The store {where.path} cannot be written.",
-            where.problem,
+            f"The store {storage.path} cannot be written.",
+            storage.problem,
             "Fix that, or set another [node] store.",
         )
     elif health is not None and health.trouble:
         yield error(
             "store-unwritable", "The node cannot write its store.", health.trouble, "Free disk space, or fix the disk."
         )
-    elif where is not None and where.free is not None and where.free < LEAST_FREE:
-        free = f"The disk of {where.path} has {where.free / 2**20:.0f} MiB free."
+    elif storage is not None and storage.free is not None and storage.free < LEAST_FREE:
+        free = f"The disk of {storage.path} has {storage.free / 2**20:.0f} MiB free."
         yield warning("disk-full", "The disk of the store is nearly full.", free, "Free disk space.")
     if health is None:
         return

@@ -27,13 +27,13 @@ CAUSES = {
 
 def wrong_team(facts: Facts) -> Iterator[Finding]:
     """Check that the nodes found are of this team."""
-    heard = [probe for probe in facts.known if probe.answer is not None and probe.answer.version == VERSION]
-    foreign = [probe for probe in heard if not probe.is_member]
+    probed = [probe for probe in facts.known if probe.answer is not None and probe.answer.version == VERSION]
+    foreign = [probe for probe in probed if not probe.is_member]
     if not foreign or (facts.certificate is not None and facts.certificate.problem):
         return  # no node could be probed as a member of this team
-    theirs = foreign[0].answer.fingerprint if foreign[0].answer is not None else b""
-    if theirs != facts.fingerprint and any(theirs):
-        why = f"It belongs to the team {theirs.hex()}, and this node to {_team(facts.fingerprint)}."
+    fingerprint_seen = foreign[0].answer.fingerprint if foreign[0].answer is not None else b""
+    if fingerprint_seen != facts.fingerprint and any(fingerprint_seen):
+        why = f"It belongs to the team {fingerprint_seen.hex()}, and this node to {_team(facts.fingerprint)}."
         remedy = "Join that team with a code of its operator (swarm join CODE), or set known_nodes of this team."
     elif any(facts.fingerprint):
         why = "It is of an open team and this node of a closed one, or this node does not have the newest team secret."
@@ -62,11 +62,11 @@ def clock(facts: Facts) -> Iterator[Finding]:
     offset = median(offsets) if offsets else 0.0
     if abs(offset) < NOTICED:
         return
-    way = "behind" if offset > 0 else "ahead of"
+    direction = "behind" if offset > 0 else "ahead of"
     make = error if abs(offset) > SKEW else warning
     yield make(
         "clock-off",
-        f"This machine's clock is {_span(abs(offset))} {way} the other nodes' clocks.",
+        f"This machine's clock is {_span(abs(offset))} {direction} the other nodes' clocks.",
         f"Measured at {len(offsets)} nodes." if len(offsets) > 1 else "Measured at one node, whose clock may be wrong.",
         "Set it, for example by timedatectl set-ntp true. The validity of certificates depends on the clock.",
     )
@@ -97,8 +97,8 @@ def certificate(facts: Facts) -> Iterator[Finding]:
 
 def refused(facts: Facts) -> Iterator[Finding]:
     """Report the refusals that the running node received."""
-    for code, whom in facts.health.refusals if facts.health is not None else ():
-        yield error(CAUSES.get(code, code), f"{whom} rejects this node: {code}.", "It sent a refusal.", _remedy(code))
+    for code, peer in facts.health.refusals if facts.health is not None else ():
+        yield error(CAUSES.get(code, code), f"{peer} rejects this node: {code}.", "It sent a refusal.", _remedy(code))
 
 
 def _offsets(facts: Facts) -> list[float]:

@@ -27,12 +27,12 @@ Problems = Callable[[], list[str]]
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    whole = argparse.ArgumentParser(
+    main_parser = argparse.ArgumentParser(
         prog="swarm driver",
         description="Find a robot, and test it in a terminal before it joins a team.",
         epilog="Example: swarm driver probe --kind aibo --option host=192.168.0.51",
     )
-    verbs = whole.add_subparsers(dest="verb", required=True, metavar="VERB")
+    verbs = main_parser.add_subparsers(dest="verb", required=True, metavar="VERB")
 
     def verb(name: str, purpose: str, example: str = " --kind aibo --option host=192.168.0.51") -> Any:
         epilog = f"Example: swarm driver {name}{example}"
@@ -53,7 +53,7 @@ def parser() -> argparse.ArgumentParser:
         "--seconds", type=_parse_seconds, default=math.inf, help="duration in s (default: until Ctrl-C)"
     )
     monitor.add_argument("--picture", type=Path, metavar="FILE", help="save the newest picture to FILE every second")
-    return whole
+    return main_parser
 
 
 def main(words: Sequence[str] | None = None, out: TextIO | None = None, ground: Ground | None = None) -> int:

@@ -109,8 +109,8 @@ class WitnessedConnector:
 
     def problems(self) -> list[str]:
         """Return each link that is not open now, with the reason."""
-        results = {where: str(getattr(line, "problem", "")) for where, line in self._lines.items()}
-        return [f"{where}: {problem}" for where, problem in results.items() if problem]
+        results = {place: str(getattr(line, "problem", "")) for place, line in self._lines.items()}
+        return [f"{place}: {problem}" for place, problem in results.items() if problem]
 
 
 @implementer(ILogObserver)

@@ -126,8 +126,8 @@ class Probe:
 
     def _finding(self) -> Finding:
         body, newest = self._driver.description, self._driver.observe()
-        lasted = self._clock.seconds() - self._began - (self._first or 0.0)
-        rate = self._seen / lasted if self._first is not None and lasted > 0 else 0.0
+        duration = self._clock.seconds() - self._began - (self._first or 0.0)
+        rate = self._seen / duration if self._first is not None and duration > 0 else 0.0
         promised = body.rates.get("state", max(body.rates.values(), default=0.0))
         values = {} if newest is None else newest.values
         frame = None if newest is None else newest.frame
@@ -147,7 +147,7 @@ class Probe:
             keys=tuple(sorted(self._keys)),
             readings={key: values[key] for key in TOLD if key in values},
             picture="" if frame is None else f"{frame.width} x {frame.height} {frame.encoding}",
-            pictures=len(self._pictures) / lasted if lasted > 0 else 0.0,
+            pictures=len(self._pictures) / duration if duration > 0 else 0.0,
             counts=self._driver.diagnostics(),
             problems=tuple(dict.fromkeys(problems)),
         )

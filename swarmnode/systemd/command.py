@@ -38,12 +38,12 @@ def run(words: Sequence[str]) -> int:
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    whole = argparse.ArgumentParser(
+    main_parser = argparse.ArgumentParser(
         prog="swarm service",
         description="Run a node as a systemd service.",
         epilog="Example: swarm service install dog1.toml",
     )
-    verbs = whole.add_subparsers(dest="verb", required=True, metavar="VERB")
+    verbs = main_parser.add_subparsers(dest="verb", required=True, metavar="VERB")
     for name, purpose in (
         ("install", "Install and start the service, or update its settings."),
         ("show", "Print the unit file, without changes."),
@@ -61,7 +61,7 @@ def parser() -> argparse.ArgumentParser:
         verb = verbs.add_parser(name, help=purpose, description=purpose, epilog=f"Example: swarm service {name} dog1")
         verb.add_argument("name", metavar="NAME", help="name of the node")
         verb.add_argument("--user", action="store_true", help="service of this user, without root")
-    return whole
+    return main_parser
 
 
 def main(

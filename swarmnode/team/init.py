@@ -87,10 +87,10 @@ def _create(arguments: argparse.Namespace, desk: Desk) -> Answer:
     for path in (key, *(each.membership for each in members), *texts):
         if path.exists():
             raise Wrong(f"{path} is there already; choose another team name, or --folder DIR")
-    founded = _create_memberships(operator, members, desk)
+    created = _create_memberships(operator, members, desk)
     _make_folders(key.parent, arguments.folder)
     operators.made(key, operator)
-    for path, membership in founded.items():
+    for path, membership in created.items():
         memberships.made(path, replace(membership, settings=team))
     for path, text in texts.items():
         written(path, text)

@@ -51,14 +51,14 @@ def _invite(arguments: argparse.Namespace, desk: Desk) -> Answer:
     doors = found.doors
     tell(arguments.node, desk, terms)
     tell(arguments.node, desk, statement)
-    whole = f"{code.text}@{','.join(doors)}" if doors else code.text
-    answer = {"code": code.text, "at": list(doors), "text": whole, "name": arguments.name, "roles": list(roles)}
+    text = f"{code.text}@{','.join(doors)}" if doors else code.text
+    answer = {"code": code.text, "at": list(doors), "text": text, "name": arguments.name, "roles": list(roles)}
     times = "once" if arguments.uses == 1 else f"{arguments.uses} times"
     lines = [f"{code.text}   admits {arguments.name}, {times}, within {span(arguments.expires)}"]
-    lines.append(f"On the newcomer:  swarm join {whole}")
+    lines.append(f"On the newcomer:  swarm join {text}")
     if not doors:
         lines.append("No bootstrap node is reachable now; name one by: swarm join CODE --at HOST:PORT")
-    return answer, [*lines, *picture(whole)]
+    return answer, [*lines, *picture(text)]
 
 
 def picture(text: str) -> list[str]:

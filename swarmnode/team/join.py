@@ -83,8 +83,10 @@ def _join(arguments: argparse.Namespace, desk: Desk, knocking: Knocking, around:
         raise Wrong("no bootstrap node was named, and none replies on the LAN; pass --at HOST:PORT")
     try:
         arguments.folder.mkdir(parents=True, exist_ok=True)
-        begun = arguments.folder / f".{arguments.files}.joining"
-        membership = knocking(code, _load_or_create_seed(begun, code, desk), arguments.name, doors, arguments.timeout)
+        seed_file = arguments.folder / f".{arguments.files}.joining"
+        membership = knocking(
+            code, _load_or_create_seed(seed_file, code, desk), arguments.name, doors, arguments.timeout
+        )
     except BadKeyFile:
         raise
     except EntangledError as error:
@@ -103,7 +105,7 @@ def _join(arguments: argparse.Namespace, desk: Desk, knocking: Knocking, around:
     written(settings, text)
     # The membership is written last: if it exists, the other files do.
     memberships.made(path, membership)
-    begun.unlink(missing_ok=True)
+    seed_file.unlink(missing_ok=True)
     lines = [
         f"This machine is now {name}, a member of the team {membership.team} ({', '.join(roles)}).",
         f"  {path}  the membership: a secret of this node",
@@ -127,10 +129,10 @@ def _load_or_create_seed(path: Path, code: Code, desk: Desk) -> bytes:
     """
     invitation = code.key.public.hex()
     if path.exists():
-        kept = keyfile.read(path)
-        if kept.get("invitation") == invitation:
+        stored = keyfile.read(path)
+        if stored.get("invitation") == invitation:
             try:
-                return sized(bytes.fromhex(kept["seed"]), 32)
+                return sized(bytes.fromhex(stored["seed"]), 32)
             except (KeyError, ValueError, TypeError, RemoteError):
                 pass
     seed = desk.rng.randbytes(32)

@@ -47,9 +47,9 @@ def _list(arguments: argparse.Namespace, desk: Desk) -> Answer:
     lines = [f"team {found.team}, secret number {found.secret}"]
     for row in rows:
         until = day(row["until"])
-        where = place(row["at"])
+        location = place(row["at"])
         renewal = "renewed automatically" if row["renews"] else "not renewed"
-        lines.append(f"  {row['name']:{width}}  {', '.join(row['roles'])}  until {until}, {renewal}  {where}")
+        lines.append(f"  {row['name']:{width}}  {', '.join(row['roles'])}  until {until}, {renewal}  {location}")
     for row in expired:
         until = day(row["until"])
         lines.append(f"  {row['name']:{width}}  expired {until}; to readmit it: swarm renew {row['name']}")

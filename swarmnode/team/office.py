@@ -84,15 +84,15 @@ def options(
 ) -> argparse.ArgumentParser:
     """Return the parser of a verb with the common options; ``is_asked``: the verb sends requests to a node."""
     epilog = f"Example: swarm {prog} {example}".rstrip()
-    whole = argparse.ArgumentParser(prog=f"swarm {prog}", description=purpose, epilog=epilog)
+    verb_parser = argparse.ArgumentParser(prog=f"swarm {prog}", description=purpose, epilog=epilog)
     if is_asked:
-        whole.add_argument("--node", metavar="NAME", help="node on this machine, if several run")
-    whole.add_argument("--json", action="store_true", help="print JSON, on one line")
+        verb_parser.add_argument("--node", metavar="NAME", help="node on this machine, if several run")
+    verb_parser.add_argument("--json", action="store_true", help="print JSON, on one line")
     if needs_key:
-        whole.add_argument(
+        verb_parser.add_argument(
             "--operator", metavar="FILE", type=Path, help=f"operator's key (default: ${VARIABLE}, or the only key)"
         )
-    return whole
+    return verb_parser
 
 
 Answer = tuple[Any, Sequence[str]]
