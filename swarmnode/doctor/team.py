@@ -79,7 +79,12 @@ def certificate(facts: Facts) -> Iterator[Finding]:
     # With a wrong clock a valid certificate seems invalid; the clock is then reported as the cause.
     now = facts.wall + (offset if abs(offset) > SKEW else 0.0)
     if own is not None and own.problem:
-        yield error("certificate-unreadable", "The node's membership is not usable.", own.problem, "Fix the file.")
+        yield error(
+            "certificate-unreadable",
+            "The node's membership is not usable.",
+            own.problem,
+            "Apply the remedy that the reason names.",
+        )
     elif own is not None and now >= own.not_after:
         why = f"It ended on {_day(own.not_after)}; this machine's clock shows {_day(facts.wall)}."
         yield error(CAUSES[EXPIRED], "The node's certificate has expired.", why, _remedy(EXPIRED))
