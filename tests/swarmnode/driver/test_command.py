@@ -168,7 +168,7 @@ class DriverCommandTests(SynchronousTestCase):
             (["probe", "--kind", "warp"], "known are aibo"),
             (["probe", "--kind", "aibo"], "option host is missing"),
             (["probe", "--kind", "aibo", "--option", "host"], "KEY=VALUE"),
-            (["probe", "--option", "host=x"], "--option says nothing without --kind"),
+            (["probe", "--option", "host=x"], "--option needs --kind"),
             (["monitor", "--config", "/no/such/file.toml"], "cannot be read"),
         ):
             with self.subTest(words=words):
