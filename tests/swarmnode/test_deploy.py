@@ -153,9 +153,7 @@ class DeployTests(SynchronousTestCase):
         self.assertIn("line 1", self.refused(f"push {path} --name farthest --kind strategy"))
         self.assertIn("cannot read", self.refused("push /nowhere --name farthest --kind strategy"))
         self.assertIn("does not match", self.refused(f"push {path} --name Far/thest --kind strategy"))
-        self.assertIn(
-            "no module 'farthest' was pushed; pushed modules: none", self.refused("rollback farthest")
-        )
+        self.assertIn("no module 'farthest' was pushed; pushed modules: none", self.refused("rollback farthest"))
         big = self.file("#" * 300_000)
         self.assertIn("bytes", self.refused(f"push {big} --name farthest --kind strategy"))
         self.push()
