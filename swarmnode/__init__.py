@@ -1,1 +1,1 @@
-"""The front door: settings in, a running node out; the ``swarm`` command; a rehearsal of a whole team in memory."""
+"""Composition of nodes from settings, the ``swarm`` and ``sim`` commands, and a simulated team in memory."""

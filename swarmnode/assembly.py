@@ -1,4 +1,4 @@
-"""Assembly: one node with its agent and body, wired as its settings say and not yet started."""
+"""Composition of one node with its agent and driver from its settings."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ if TYPE_CHECKING:
     from middleware.admission.team import Team
 
 FAULTS = (SwarmError, EntangledError, DriverError, WebError)
-"""What a person can mend, and is told in one line."""
+"""Errors that an operator can fix; they are shown in one line."""
 
 _log = Logger()
 
 
 @dataclass
 class Assembly:
-    """One node with its agent and body, wired and not yet started."""
+    """One node with its agent and driver, connected to each other and not yet started."""
 
     node: SwarmNode
     agent: Service | None
@@ -49,65 +49,65 @@ class Assembly:
 
 
 def identity_in(store: Store, rng: random.Random) -> Identity:
-    """The lasting identity that the store keeps, made at the first start."""
+    """Return the lasting identity in the store, and create it at the first start."""
     seed = store.noted("identity")
     if seed is None or len(seed) != 32:
         if store.origin != "new":
-            _log.warn("the data store has lost the node's identity: this node is a new one now")
+            _log.warn("the data store has lost the node's identity: the node has a new one now")
         seed = rng.randbytes(32)
         store.note("identity", seed)
     return Identity(seed)
 
 
 def checked_team(settings: Settings) -> None:
-    """Raise ``BadSetting`` where a node has no team, or two."""
+    """Raise ``BadSetting`` if the settings have no team, or two."""
     node = settings.node
     if not node.membership and not node.team_key:
-        problem = "is missing: this node belongs to no team"
-        remedy = "make a team by swarm init, join one by swarm join CODE, or for an open team set team_key to a secret"
+        problem = "is missing: this node has no team"
+        remedy = "create a team by swarm init, join one by swarm join CODE, or set team_key to a secret (open team)"
         raise BadSetting(settings.origin, "[node] membership", problem, remedy)
     if node.membership and node.team_key:
-        problem = "stands beside a membership: a team is closed or open"
+        problem = "is set in addition to a membership: a team is either closed or open"
         raise BadSetting(settings.origin, "[node] team_key", problem, "remove team_key, or the membership")
 
 
 def assembled(settings: Settings, seams: Seams) -> Assembly:
-    """Wire one node as ``settings`` say (thesis, Algorithm 4.1).
+    """Connect one node, agent and driver as ``settings`` require (thesis, Algorithm 4.1).
 
-    Raises ``SwarmError`` or ``DriverError`` where they cannot be met.
+    Raises ``SwarmError`` or ``DriverError`` if that is not possible.
     """
     if seams.membership is None:
         checked_team(settings)
-    _checked_body(settings)
+    _check_robot(settings)
     injector = None
     if settings.faults.allow:
         from agents.catalogue import task_named
-        from middleware.faults.injector import FaultInjector  # any other node is spared the memory
+        from middleware.faults.injector import FaultInjector  # imported on demand, to save memory
 
         injector = FaultInjector(seams.clock, seams.wall, seams.rng, seams.network, seams.process)
         seams = replace(seams, network=injector.open_network, wall=injector.wall)
-    device, driver = _device(settings), _driver(settings, seams)
-    node = _node(device, settings, seams)
-    _answer(node, settings, driver)
+    device, driver = _make_device(settings), _make_driver(settings, seams)
+    node = _make_node(device, settings, seams)
+    _expose_methods(node, settings, driver)
     if injector is not None:
         driver = None if driver is None else injector.wrap_driver(driver)
         injector.expose(node, task_named)
     if settings.deployment.allow:
-        _deployable(node, settings, seams)
-    return Assembly(node, _agent(node, settings, driver, seams), driver)
+        _enable_deployment(node, settings, seams)
+    return Assembly(node, _make_agent(node, settings, driver, seams), driver)
 
 
-def _checked_body(settings: Settings) -> None:
-    """Raise ``BadSetting`` where an agent or a part has no robot."""
+def _check_robot(settings: Settings) -> None:
+    """Raise ``BadSetting`` if there is an agent or a part without a robot."""
     if settings.agent.module and not settings.driver.kind:
-        problem = f"is {settings.agent.module!r}, which has no robot to act with"
-        raise BadSetting(settings.origin, "[agent] module", problem, "name its [driver] kind, or leave the agent out")
+        problem = f"is {settings.agent.module!r}, but there is no robot"
+        raise BadSetting(settings.origin, "[agent] module", problem, "set [driver] kind, or leave the agent out")
     if settings.driver.parts and not settings.driver.kind:
-        raise BadSetting(settings.origin, "[driver] parts", "have no robot to ride on", "name its [driver] kind")
+        raise BadSetting(settings.origin, "[driver] parts", "are set, but there is no robot", "set [driver] kind")
 
 
-def _device(settings: Settings) -> Device:
-    """What the device says of itself: its robot's kind and capabilities as well, where its owner says no other."""
+def _make_device(settings: Settings) -> Device:
+    """Return the device with its own settings, and kind and capabilities of its driver as defaults."""
     node, wanted = settings.node, settings.driver
     kind, capabilities = node.kind, dict(node.capabilities)
     if wanted.kind:
@@ -127,17 +127,17 @@ def _device(settings: Settings) -> Device:
     )
 
 
-def _driver(settings: Settings, seams: Seams) -> Driver | None:
-    """The driver of its robot, not yet connected; None for a device that has none."""
+def _make_driver(settings: Settings, seams: Seams) -> Driver | None:
+    """Return the driver of the robot, not yet connected; None without a robot."""
     wanted = settings.driver
     if not wanted.kind:
         return None
     return driver_for(wanted.kind, wanted.options, settings.node.name, seams.clock, seams.connector, wanted.parts)
 
 
-def _node(device: Device, settings: Settings, seams: Seams) -> SwarmNode:
-    """The node of ``device``, a member of its team."""
-    team = _closed_team(seams)
+def _make_node(device: Device, settings: Settings, seams: Seams) -> SwarmNode:
+    """Return the node of ``device``, a member of its team."""
+    team = _load_team(seams)
     known = [] if team is None else team.membership.known
     node = SwarmNode(
         device,
@@ -161,31 +161,31 @@ def _node(device: Device, settings: Settings, seams: Seams) -> SwarmNode:
     return node
 
 
-def _answer(node: SwarmNode, settings: Settings, driver: Driver | None) -> None:
-    """Let the others survey, tune and halt the node."""
+def _expose_methods(node: SwarmNode, settings: Settings, driver: Driver | None) -> None:
+    """Expose diagnostics, changes of settings, and the emergency stop."""
     answer_survey(node)
     tuning = answer_tuning(node, settings, {} if driver is None else driver.description.capabilities)
     filming: object = driver
     if isinstance(filming, Filming) and "camera" in node.presence.device.capabilities:
-        tuning.add(_camera_knob(filming))
+        tuning.add(_make_camera_setting(filming))
     node.halt = answer_halt(node.entangled, node.rng, node.later, node.presence.obey)
 
 
-def _agent(node: SwarmNode, settings: Settings, driver: Driver | None, seams: Seams) -> Service | None:
-    """The agent that acts for the device; None where the settings name none."""
+def _make_agent(node: SwarmNode, settings: Settings, driver: Driver | None, seams: Seams) -> Service | None:
+    """Return the agent of the device; None if the settings have none."""
     if not settings.agent.module or driver is None:
         return None
     agent = agent_named(settings.agent.module)(node, driver, seams.clock, seams.rng)
     if settings.agent.name:
         place = f" on {settings.node.laptop}" if settings.node.laptop else ""
         _log.info(
-            "{device} has the agent {agent}{place}", device=settings.node.name, agent=settings.agent.name, place=place
+            "agent of {device}: {agent}{place}", device=settings.node.name, agent=settings.agent.name, place=place
         )
     return agent
 
 
-def _closed_team(seams: Seams) -> Team | None:
-    """The closed team that the node is a member of; a node of an open one loads none of this."""
+def _load_team(seams: Seams) -> Team | None:
+    """Return the closed team of the node; None, without importing its modules, in an open team."""
     if seams.membership is None:
         return None
     from middleware.admission.team import Team
@@ -193,14 +193,14 @@ def _closed_team(seams: Seams) -> Team | None:
     return Team(seams.membership, seams.store, seams.wall, seams.rng)
 
 
-def _camera_knob(driver: Filming) -> Knob:
-    about, check = "Pictures that the camera takes", partial(convert_value, hint=Fps)
+def _make_camera_setting(driver: Filming) -> Knob:
+    about, check = "Frame rate of the camera", partial(convert_value, hint=Fps)
     read = partial(getattr, driver, "camera_fps")
     return Knob("camera_fps", about, read, driver.set_camera_fps, check, "per second", 0.0, MAX_FPS)
 
 
-def _deployable(node: SwarmNode, settings: Settings, seams: Seams) -> None:
-    """Let the node run what its operators push; a node that does not allow it loads none of this."""
+def _enable_deployment(node: SwarmNode, settings: Settings, seams: Seams) -> None:
+    """Let the node run modules that its operators push; the modules for this are imported only if it is allowed."""
     from middleware.deployment.deployment import Author, Deployment
     from middleware.deployment.process import ProcessChannel
     from middleware.deployment.shelf import MemoryShelf
@@ -223,7 +223,7 @@ def _deployable(node: SwarmNode, settings: Settings, seams: Seams) -> None:
         node.clock.seconds,
     )
     node.deployed, node.stop_deployed = deployment.modules, deployment.stop
-    node.later(0.0, deployment.open)  # not before the program has become a daemon: processes end with their parent
+    node.later(0.0, deployment.open)  # after daemonization, because module processes end with their parent
 
     def follow(_: None) -> None:
         if node.running:

@@ -1,4 +1,4 @@
-"""Ballast: memory that a process does not need: TLS where it speaks none, and what only its start needed."""
+"""Memory savings: keep an unused TLS library unloaded, and release memory after startup."""
 
 from __future__ import annotations
 
@@ -7,24 +7,24 @@ import sys
 from contextlib import suppress
 
 STARTED_S = 3.0
-"""Seconds after which a node has loaded what it needs."""
+"""Seconds after which a node has imported everything that it needs."""
 
 
 def drop_tls() -> None:
-    """Have Twisted find no pyOpenSSL: it would load that into every process with a reactor, and it weighs 13 MiB.
+    """Hide pyOpenSSL from Twisted, which otherwise loads it into every process with a reactor and takes 13 MiB.
 
-    Call this before the reactor is imported; where pyOpenSSL is loaded already, nothing is changed.
+    Call this before the reactor is imported; if pyOpenSSL is loaded already, nothing changes.
     """
     sys.modules.setdefault("OpenSSL", None)  # type: ignore[arg-type]
 
 
 def warmed_up() -> None:
-    """Give memory back, and look for garbage no more among what is there for good.
+    """Return freed memory to the system, and exclude all current objects from garbage collection.
 
-    glibc keeps freed memory for later, and a small device has other uses for it.  A full collection goes through every
-    module of the process: in a web node that holds up its timers for 50 ms, again and again.
+    glibc otherwise keeps freed memory.  A full collection visits every module of the process; in a web node it delays
+    timers by 50 ms each time.
     """
-    import ctypes  # not before: commands that end at once load this module, too
+    import ctypes  # imported here, because short commands import this module, too
 
     gc.collect()
     gc.freeze()

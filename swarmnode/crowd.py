@@ -1,6 +1,6 @@
-"""The crowd: agents by the hundred, each with its node, driver and a body in a yard for many (``swarm crowd``).
+"""Simulation of hundreds of agents, each with a real node and driver and a robot in the simulator (``swarm crowd``).
 
-It wires what the front door wires, with the twins in memory of clock, wire and disk in place of the real ones.
+The nodes are real ones, with in-memory implementations of clock, network and store.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from swarmnode.seams import Seams
 from swarmnode.service import NodeService
 
 DESK = "desk"
-"""The node without a body, which assigns the task; everybody else's way in."""
+"""Name of the node without a robot, which assigns the task and is the bootstrap node of all others."""
 TEAM_KEY = "of a crowd that never leaves one process"
 JOINING = 0.1
-"""Seconds from one node that joins to the next."""
+"""Seconds between the starts of two nodes."""
 SETTLING = 2.0
 CAMERA_FPS = 5.0
 PORT = 7000
@@ -39,9 +39,9 @@ TASK = "search"
 
 
 class CrowdTeam(World):
-    """``agents`` in the first bodies of a crowd on ``ground``, and a desk; a seed replays them exactly.
+    """``agents`` nodes with the first robots of a crowd on ``ground``, and one node without a robot.
 
-    What runs is what runs on a robot: the real node, agent, driver and detection; the team is an open one.
+    Node, agent, driver and detection are the real ones; the team is open.  A seed reproduces a run exactly.
     """
 
     def __init__(
@@ -54,8 +54,8 @@ class CrowdTeam(World):
         camera_fps: float = CAMERA_FPS,
     ) -> None:
         super().__init__(seed, LAN)
-        yard_dice = random.Random(f"{seed}/yard")
-        self.yard = CrowdYard(self.clock, yard_dice, ground, agents, controller, stopwatch)
+        yard_rng = random.Random(f"{seed}/yard")
+        self.yard = CrowdYard(self.clock, yard_rng, ground, agents, controller, stopwatch)
         self.yard.start()
         self.services: dict[str, NodeService] = {}
         self._fps = camera_fps
@@ -67,18 +67,18 @@ class CrowdTeam(World):
         self.clock.advance(SETTLING)
 
     def address(self, place: int) -> Address:
-        """Where the node of this place listens, each on a machine of its own."""
+        """Return the address of the node ``place``; each node has a separate machine."""
         return Address(f"10.{place >> 16}.{place >> 8 & 255}.{place & 255}", PORT)
 
     def assign(self) -> None:
-        """Have whoever can do it search the red target."""
+        """Assign the task of finding the red target."""
         node = self.services[DESK].assembly.node
         self._group = node.watch_group(TASK, lambda records: None, keep=True)
         submitted = Deferred.fromCoroutine(node.submit(task_named(DEMO, TASK, self.clock.seconds())))
-        submitted.addCallback(self._submitted)
+        submitted.addCallback(self._store_task)
 
     def words(self) -> Mapping[str, Word]:
-        """What each agent that takes part says, by its name."""
+        """Return the report of each participating agent, by name."""
         every = {}
         for name in self.yard.names:
             agent: Any = self.services[name].assembly.agent
@@ -88,37 +88,37 @@ class CrowdTeam(World):
         return {name: Word(me.cost, named.get(me.assigned, "")) for name, me in every.items()}
 
     def done_by(self) -> str | None:
-        """Who ended the task, None while it is open."""
+        """Return the name of the agent that ended the task, None while it is open."""
         if self._group is None or self._task is None:
             return None
         outcome = outcome_of(self._task, self._group.records)
         return None if outcome is None else outcome.by
 
     def stop(self) -> None:
-        """End everything at once: nobody is left to be told."""
+        """Stop all nodes at once, without leaving messages."""
         for service in self.services.values():
             service.vanish()
         self.yard.stop()
 
-    def _submitted(self, task: Task) -> None:
+    def _store_task(self, task: Task) -> None:
         self._task = task
 
     def _add(self, name: str) -> None:
         number = len(self.services)
         node: dict[str, Any] = {"name": name, "port": PORT, "team_key": TEAM_KEY}
         mapping: dict[str, Any] = {"node": node}
-        dice = random.Random(f"{self.seed}/{name}")
+        rng = random.Random(f"{self.seed}/{name}")
         if number:
-            # Each joins by somebody who is there: a hundred at one door would only show what that door bears.
-            node["known_nodes"] = [str(self.address(dice.randrange(number)))]
+            # Each joins through a random earlier node, so the load on a single bootstrap node is not measured.
+            node["known_nodes"] = [str(self.address(rng.randrange(number)))]
             mapping["agent"] = {"module": "search"}
             mapping["driver"] = {"kind": "sim", "options": {"robot": name, "camera_fps": self._fps}}
         network = partial(self.network, number)
-        seams = Seams(self.clock, network, self.store(number), dice, self.clock.seconds, self.yard.connector())
+        seams = Seams(self.clock, network, self.store(number), rng, self.clock.seconds, self.yard.connector())
         self.services[name] = NodeService(Settings.from_mapping(mapping, f"seed {self.seed}"), seams)
         self.services[name].startService()
 
 
 def main(arguments: list[str]) -> int:
-    """``swarm crowd``."""
+    """Run ``swarm crowd``."""
     return run_crowd(arguments, CrowdTeam)

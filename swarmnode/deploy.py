@@ -1,6 +1,6 @@
-"""Deploy: ``swarm deploy``, the operator's side of deployment, through a node of this machine.
+"""``swarm deploy``: push modules to a team, roll them back and show their state.
 
-What is pushed is signed by that node, in whose slot it is stored: its key is the operator's key.
+The node on this machine signs each pushed module, and stores it in its slot: its key is the operator's key.
 """
 
 from __future__ import annotations
@@ -34,89 +34,92 @@ from swarmnode.asker import Asker, Refusal
 from swarmnode.team.office import Answer, Desk, Wrong, run
 
 SOURCE = "source"
-"""The slot of a source under its key."""
+"""Name of the slot of a source under its key."""
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command line."""
+    """Return the parser of the command line."""
     common = argparse.ArgumentParser(add_help=False)
-    common.add_argument("--node", metavar="NAME", help="which node of this machine, where several run")
-    common.add_argument("--json", action="store_true", help="answer in JSON, on one line")
-    whole = argparse.ArgumentParser(
+    common.add_argument("--node", metavar="NAME", help="node on this machine, if several run")
+    common.add_argument("--json", action="store_true", help="print JSON, on one line")
+    main_parser = argparse.ArgumentParser(
         prog="swarm deploy",
-        description="Push a strategy or a behaviour to the running team.",
-        epilog="Nodes run it where their [deployment] allows it, lists the name, and this node's key as an operator.",
+        description="Push a strategy or a behaviour to the running team, signed by the node on this machine.",
+        epilog="A node runs a module only if its [deployment] settings allow it, and list the module's name and this "
+        "node's key as an operator.  Example: swarm deploy push follow.py --name follow --kind behaviour",
     )
-    verbs = whole.add_subparsers(dest="verb", required=True, metavar="VERB")
+    verbs = main_parser.add_subparsers(dest="verb", required=True, metavar="VERB")
 
-    def verb(name: str, purpose: str) -> argparse.ArgumentParser:
-        return verbs.add_parser(name, help=purpose, description=purpose, parents=[common])
+    def verb(name: str, purpose: str, example: str) -> argparse.ArgumentParser:
+        epilog = f"Example: swarm deploy {name}{example}"
+        return verbs.add_parser(name, help=purpose, description=purpose, epilog=epilog, parents=[common])
 
-    push = verb("push", "Publish a new version of a module, signed by this node.")
-    push.add_argument("file", metavar="FILE", help="the Python source, one file")
-    push.add_argument("--name", required=True, help=f"what tasks call it, after {PREFIX}")
-    push.add_argument("--kind", required=True, choices=KINDS)
-    push.add_argument("--version", type=int, metavar="N", help="a higher one than before; the next one if left out")
-    back = verb("rollback", "Go back to the version before.")
-    back.add_argument("name", metavar="NAME")
-    verb("status", "Print what is pushed, and which device runs what.")
-    verb("keys", "Print the public key of each device, as [deployment] operators takes it.")
-    return whole
+    example = " nearest.py --name nearest-left --kind strategy"
+    push = verb("push", "Publish a new version of a module, signed by this node.", example)
+    push.add_argument("file", metavar="FILE", help="Python source, one file")
+    push.add_argument("--name", required=True, help=f"name of the module; tasks refer to it as {PREFIX}NAME")
+    push.add_argument("--kind", required=True, choices=KINDS, help="kind of the module")
+    push.add_argument("--version", type=int, metavar="N", help="version, higher than the last one (default: next)")
+    back = verb("rollback", "Roll a module back to the previous version.", " nearest-left")
+    back.add_argument("name", metavar="NAME", help="name of the module")
+    verb("status", "Show the pushed modules and the devices that run them.", " --json")
+    verb("keys", "Print the public key of each device, as needed in [deployment] operators.", "")
+    return main_parser
 
 
 def main(words: Sequence[str] | None = None, out: TextIO | None = None, ask: Ask = asked) -> int:
-    """Run the command; returns 0, 1 where the node refused, 2 where the command is wrong."""
+    """Run the command; returns 0, 1 if the node rejected the request, 2 if the command is wrong."""
     verbs = {"push": _push, "rollback": _rollback, "status": _status, "keys": _keys}
 
-    def work(wishes: argparse.Namespace, desk: Desk) -> Answer:
-        answer, lines = verbs[wishes.verb](wishes, desk.ask)
+    def work(options: argparse.Namespace, desk: Desk) -> Answer:
+        answer, lines = verbs[options.verb](options, desk.ask)
         return answer, [printable(line) for line in lines]
 
     return run(parser(), words, Desk(out or sys.stdout, ask), work)
 
 
-def _push(wishes: argparse.Namespace, ask: Ask) -> Answer:
+def _push(options: argparse.Namespace, ask: Ask) -> Answer:
     try:
-        source = Path(wishes.file).read_bytes()
+        source = Path(options.file).read_bytes()
     except OSError as error:
-        raise Wrong(f"{wishes.file} cannot be read: {error.strerror or error}") from error
-    if not re.fullmatch(NAME, wishes.name, re.ASCII):
-        raise Wrong(f"--name must match {NAME}, is {wishes.name!r}")
+        raise Wrong(f"cannot read {options.file}: {error.strerror or error}") from error
+    if not re.fullmatch(NAME, options.name, re.ASCII):
+        raise Wrong(f"--name {options.name!r} does not match {NAME}")
     if not 0 < len(source) <= MAX_SOURCE:
-        raise Wrong(f"{wishes.file} has {len(source)} bytes; a module has 1 to {MAX_SOURCE}")
+        raise Wrong(f"{options.file} has {len(source)} bytes; a module has 1 to {MAX_SOURCE}")
     try:
-        compiled(source, wishes.name)
+        compiled(source, options.name)
     except Undeployable as error:
-        raise Wrong(f"{wishes.file}: {error.problem}") from error
-    asker = Asker(wishes.node, ask)
-    held = newest(each for each, _ in _manifests(asker) if each.name == wishes.name)
-    manifest = pushed(wishes.name, wishes.kind, source, held, wishes.version)
+        raise Wrong(f"{options.file}: {error.problem}") from error
+    asker = Asker(options.node, ask)
+    held = newest(each for each, _ in _manifests(asker) if each.name == options.name)
+    manifest = pushed(options.name, options.kind, source, held, options.version)
     if held is not None and manifest.kind != held.kind:
-        raise Refusal(f"{held.name} is a {held.kind}; push it under another name")
+        raise Refusal(f"{held.name} is a {held.kind}; use another name for a {manifest.kind}")
     if held is not None and manifest.rank <= held.rank:
-        raise Refusal(f"version {manifest.version} is not above {held.rank[0]}, which there was already")
+        raise Refusal(f"version {manifest.version} is not higher than {held.rank[0]}, which was already pushed")
     if not 0 < manifest.version <= MAX_VERSION:
-        raise Refusal(f"a version is 1 to {MAX_VERSION}, this one {manifest.version}")
-    # The source first: whoever hears of the manifest asks for it at once.
+        raise Refusal(f"--version {manifest.version} is not between 1 and {MAX_VERSION}")
+    # Store the source first: nodes request it as soon as they receive the manifest.
     asker.put(source_key(manifest.digest), SOURCE, source)
-    return _published(asker, manifest, "pushed")
+    return _publish(asker, manifest, "pushed")
 
 
-def _rollback(wishes: argparse.Namespace, ask: Ask) -> Answer:
-    asker = Asker(wishes.node, ask)
+def _rollback(options: argparse.Namespace, ask: Ask) -> Answer:
+    asker = Asker(options.node, ask)
     manifests = [each for each, _ in _manifests(asker)]
-    held = newest(each for each in manifests if each.name == wishes.name)
+    held = newest(each for each in manifests if each.name == options.name)
     if held is None:
-        there = ", ".join(sorted({each.name for each in manifests})) or "nothing at all"
-        raise Refusal(f"nothing called {wishes.name!r} was pushed; there is {there}")
+        there = ", ".join(sorted({each.name for each in manifests})) or "none"
+        raise Refusal(f"no module {options.name!r} was pushed; pushed modules: {there}")
     manifest = rolled_back(held)
     if manifest is None:
-        raise Refusal(f"there is nothing before version {held.version} of {held.name}")
-    return _published(asker, manifest, f"went back from version {held.version}:")
+        raise Refusal(f"{held.name} has no version before {held.version}")
+    return _publish(asker, manifest, f"rolled back from version {held.version}:")
 
 
-def _status(wishes: argparse.Namespace, ask: Ask) -> Answer:
-    asker = Asker(wishes.node, ask)
+def _status(options: argparse.Namespace, ask: Ask) -> Answer:
+    asker = Asker(options.node, ask)
     devices = asker.devices()
     names = {record.owner: device.name for device, record in devices}
     rows: list[dict[str, Any]] = []
@@ -126,15 +129,15 @@ def _status(wishes: argparse.Namespace, ask: Ask) -> Answer:
         manifest, record = max((p for p in pairs if p[0].name == name), key=lambda p: (p[0].rank, p[0].digest))
         runs = {device.name: device.deployed.get(name, "") for device, _ in devices}
         by = names.get(record.owner, record.owner.hex()[:8])
-        rows.append({**_told(manifest), "by": by, "operator": record.owner.hex(), "devices": runs})
-        lines.append(f"{name}  {manifest.kind}  {manifest.label}  pushed by {by}{_past(manifest)}")
+        rows.append({**_as_json(manifest), "by": by, "operator": record.owner.hex(), "devices": runs})
+        lines.append(f"{name}  {manifest.kind}  {manifest.label}  pushed by {by}{_history(manifest)}")
         width = max(map(len, runs), default=0)
         lines += [f"  {device:{width}}  {label or '-'}" for device, label in runs.items()]
-    return rows, lines or ["nothing was pushed"]
+    return rows, lines or ["no module was pushed"]
 
 
-def _keys(wishes: argparse.Namespace, ask: Ask) -> Answer:
-    keys = {device.name: record.owner.hex() for device, record in Asker(wishes.node, ask).devices()}
+def _keys(options: argparse.Namespace, ask: Ask) -> Answer:
+    keys = {device.name: record.owner.hex() for device, record in Asker(options.node, ask).devices()}
     width = max(map(len, keys), default=0)
     return keys, [f"{name:{width}}  {key}" for name, key in keys.items()]
 
@@ -144,19 +147,19 @@ def _manifests(asker: Asker) -> list[tuple[Manifest, Record]]:
     return [(manifest, record) for record in records if (manifest := manifest_of(record)) is not None]
 
 
-def _published(asker: Asker, manifest: Manifest, verb: str) -> Answer:
+def _publish(asker: Asker, manifest: Manifest, verb: str) -> Answer:
     replicas = asker.put(DEPLOYMENTS, manifest.name, manifest.packed())
-    line = f"{verb} {manifest.kind} {manifest.name} {manifest.label}; {replicas} replicas have it"
-    return {**_told(manifest), "replicas": replicas}, [line]
+    line = f"{verb} {manifest.kind} {manifest.name} {manifest.label}; stored by {replicas} replicas"
+    return {**_as_json(manifest), "replicas": replicas}, [line]
 
 
-def _told(manifest: Manifest) -> dict[str, Any]:
+def _as_json(manifest: Manifest) -> dict[str, Any]:
     before = [edition.version for edition in manifest.before]
     about = {"name": manifest.name, "kind": manifest.kind, "version": manifest.version, "digest": manifest.digest}
     return {**about, "size": manifest.size, "before": before, "withdrawn": manifest.withdrawn}
 
 
-def _past(manifest: Manifest) -> str:
-    taken_back = f", {manifest.withdrawn} was taken back" if manifest.withdrawn > manifest.version else ""
-    before = f", before it {manifest.before[0].version}" if manifest.before else ""
-    return taken_back + before
+def _history(manifest: Manifest) -> str:
+    withdrawn = f", {manifest.withdrawn} was withdrawn" if manifest.withdrawn > manifest.version else ""
+    before = f", previous version {manifest.before[0].version}" if manifest.before else ""
+    return withdrawn + before

@@ -1,7 +1,7 @@
-"""Gateway: the way of phones into the team, through the node that serves the page.
+"""Gateway for phones: the node that serves the page runs a node for each phone.
 
-Each phone is a node of its own, with identity, port, agent and a driver that is handed what the phone sees.  Its
-identity follows from a secret of the phone and from the team, so it is the same device at every web node.
+Each phone has a node with an identity, a port, an agent, and a driver that receives the phone's pictures.  The identity
+is derived from a secret of the phone and from the team, so the phone is the same device at every web node.
 """
 
 from __future__ import annotations
@@ -42,42 +42,42 @@ from webnode.board import Wanted
 from webnode.errors import Refusal
 
 MOST = 8
-"""Phones at one web node: each costs it the memory and the work of a node."""
+"""Maximum number of phones at one web node; each takes the memory and CPU time of a node."""
 SILENCE_S = 1.0
-"""A phone that says nothing for so long has left."""
+"""Seconds of silence after which a phone is considered gone."""
 FIRST_S = 5.0
-"""It has so long until its first look: its visitor may be asked for the camera once more."""
+"""Seconds until the first picture: the browser may have to ask the visitor for the camera."""
 IDLE_FPS = 5.0
-"""Pictures a second while it has no task: enough not to look gone, and it spares the battery."""
+"""Frame rate without a task: enough to be considered present, and it saves the phone's battery."""
 LOOKS, LOOKS_S = 20.0, 15.0
-"""So many looks at once, and so many a second."""
+"""Rate limit of pictures: burst, and pictures per second."""
 JOINS, JOINS_S = 8.0, 1.0
 PLACE_S = 1.0
-"""Where the phone is is told to the others at most so often."""
+"""Minimum seconds between two published positions."""
 PLACE: Mapping[str, int] = {"lat": 5, "lon": 5, "accuracy": 0}
-"""What is told of it, to so many decimals: a metre."""
+"""Published fields of the position and their decimals: about a metre."""
 PERSON = b"phone"
 
 
 def seed_of(team: bytes, secret: bytes) -> bytes:
-    """The seed of a phone's identity, by its own ``secret``; another one in each team, which ``team`` names."""
+    """Return the seed of a phone's identity in the team ``team``, derived from the phone's ``secret``."""
     return hashlib.blake2s(secret, key=team, person=PERSON).digest()
 
 
 def sides(jpeg: bytes) -> tuple[int, int]:
-    """Width and height in pixels of a phone's picture; raises ``Refusal`` 400 for what is none that is used here."""
+    """Return width and height of a picture in pixels; raises ``Refusal`` 400 for an unsupported picture."""
     size = size_of(jpeg)
     if size is None or max(size) > MOST_SIDE:
-        problem = "it is no JPEG picture that is used here" if jpeg else "it is missing or empty"
-        raise Refusal("body", problem, f"send a whole JPEG of at most {MOST_SIDE} pixels a side")
+        problem = "it is not a supported JPEG picture" if jpeg else "it is missing or empty"
+        raise Refusal("body", problem, f"send a complete JPEG of at most {MOST_SIDE} pixels a side")
     return size
 
 
 class Gateway:
     """The phones that take part through ``node``.
 
-    ``seams`` makes the seams of one more node; ``others`` are the devices that are here.  A phone that leaves, or falls
-    silent, gives back what it holds: this node still speaks for it, so another goes on at once.
+    ``seams`` returns the dependencies of one more node; ``others`` returns the present devices.  When a phone leaves or
+    falls silent, its node still runs and releases its lease, so another device continues at once.
     """
 
     _log = Logger()
@@ -91,11 +91,11 @@ class Gateway:
         self._others = others
         self._phones: dict[str, _Phone] = {}
         self._ending: dict[str, Deferred[Any]] = {}
-        self._away: dict[str, float] = {}
+        self._removed: dict[str, float] = {}
         self._joins = TokenBucket(JOINS_S, JOINS)
 
     def join(self, secret: bytes, name: str, can: Mapping[str, Any]) -> Deferred[str]:
-        """Let a phone take part; fires with its uuid, fails with ``Refusal`` 409, 429 or 503."""
+        """Start the node of a phone; fires with its uuid, fails with ``Refusal`` 409, 429 or 503."""
         closed = self._node.team
         seed = seed_of(self._settings.node.team_secret if closed is None else closed.roll.operator, secret)
         uuid = Identity(seed).node_id.hex()
@@ -103,46 +103,46 @@ class Gateway:
             self._phones[uuid].wait(FIRST_S)
             return succeed(uuid)
         now = self._node.clock.seconds()
-        sent_away = self._away.get(uuid, now) - now
-        if sent_away > 0.0:
-            return fail(Refusal("phone", "an operator sent it away", f"wait {sent_away:.0f} s", 409))
+        removed_for = self._removed.get(uuid, now) - now
+        if removed_for > 0.0:
+            return fail(Refusal("phone", "an operator removed it", f"wait {removed_for:.0f} s", 409))
         if len(self._phones) >= MOST:
             remedy = "wait until one leaves, or join at another web node"
-            return fail(Refusal("phone", f"{MOST} phones take part at this node", remedy, 409))
+            return fail(Refusal("phone", f"this node already has {MOST} phones", remedy, 409))
         team = self._node.team
         if team is not None and GATEWAY not in team.door.me.roles:
-            remedy = f"have the operator say: swarm promote {team.door.me.name} --role {GATEWAY}"
-            return fail(Refusal("phone", "this node may not bring guests into its team", remedy, 409))
+            remedy = f"ask the operator to run: swarm promote {team.door.me.name} --role {GATEWAY}"
+            return fail(Refusal("phone", "this node may not admit guests to its team", remedy, 409))
         if not self._joins.take(now):
-            return fail(Refusal("phone", "too many join at once", "try again in a few seconds", 429))
+            return fail(Refusal("phone", "too many phones join at once", "try again in a few seconds", 429))
         joined: Deferred[str] = Deferred()
 
         def enter(left: Any) -> Any:
             try:
                 if uuid not in self._phones:
-                    self._phones[uuid] = self._made(uuid, seed, self._free(name, uuid), can)
+                    self._phones[uuid] = self._start_phone(uuid, seed, self._unique_name(name, uuid), can)
                 joined.callback(uuid)
             except FAULTS as error:
-                joined.errback(Refusal("phone", f"it cannot take part: {error}", "try again in a moment", 503))
+                joined.errback(Refusal("phone", f"its node cannot start: {error}", "try again in a moment", 503))
             return left
 
-        # A phone that comes back while it still says goodbye would be there twice.
+        # Wait until a former node of the same phone has stopped.
         self._ending.get(uuid, succeed(None)).addCallback(enter)
         return joined
 
     def look(self, uuid: str, jpeg: bytes, values: Mapping[str, float]) -> Wanted:
-        """Take what a phone sees and measures; raises ``Refusal`` 400, 404 or 429."""
+        """Process a picture and readings of a phone; raises ``Refusal`` 400, 404 or 429."""
         size = sides(jpeg)
         phone = self._phones.get(uuid)
         if phone is None:
-            raise Refusal("uuid", "this phone takes no part here", "join by POST /api/v1/phones", 404)
+            raise Refusal("uuid", "this phone has not joined at this node", "join by POST /api/v1/phones", 404)
         phone.wait(SILENCE_S)
         if not phone.bucket.take(self._node.clock.seconds()):
-            raise Refusal("phone", "it looks too often", f"send at most {FPS:g} looks a second", 429)
+            raise Refusal("phone", "it sends too many pictures", f"send at most {FPS:g} a second", 429)
         return phone.look(jpeg, size, values)
 
     def leave(self, uuid: str) -> None:
-        """Let a phone go; one that is not here has gone already."""
+        """Stop the node of a phone, if there is one."""
         phone = self._phones.pop(uuid, None)
         if phone is None:
             return
@@ -154,46 +154,46 @@ class Gateway:
         ending.addBoth(gone)
 
     def close(self) -> Deferred[Any]:
-        """Let all of them go; fires when they have."""
+        """Stop the nodes of all phones; fires when they have stopped."""
         for uuid in list(self._phones):
             self.leave(uuid)
         waiting = [ending.addCallback(lambda _: None) for ending in self._ending.values()]
         return DeferredList(waiting, consumeErrors=True)
 
-    def _made(self, uuid: str, seed: bytes, name: str, can: Mapping[str, Any]) -> _Phone:
+    def _start_phone(self, uuid: str, seed: bytes, name: str, can: Mapping[str, Any]) -> _Phone:
         seams = self._seams()
         seams.store.note("identity", seed)
         if self._node.team is not None:
             from middleware.admission.membership import MemoryMembership
 
             seams = replace(seams, membership=MemoryMembership(self._node.team.guest(seed, name)))
-        settings = _settings_of(self._settings, self._node, name, can)
+        settings = _make_settings(self._settings, self._node, name, can)
         assembly = assembled(settings, seams)
         assert isinstance(assembly.driver, PhoneDriver) and assembly.agent is not None
-        phone = _Phone(assembly.node, assembly.agent, assembly.driver, partial(self._silent, uuid))
-        assembly.node.on_disconnect(partial(self._sent_away, uuid))
+        phone = _Phone(assembly.node, assembly.agent, assembly.driver, partial(self._on_silence, uuid))
+        assembly.node.on_disconnect(partial(self._on_removed, uuid))
         phone.start()
         return phone
 
-    def _free(self, name: str, uuid: str) -> str:
-        """``name``, or where another device has it one like it that none has."""
+    def _unique_name(self, name: str, uuid: str) -> str:
+        """Return ``name``, or a unique variant of it if another device has it."""
         taken = {device.name for device in self._others() if device.uuid != uuid}
         taken |= {phone.name for other, phone in self._phones.items() if other != uuid}
         return name if name not in taken else f"{name[:35]}-{uuid[:4]}"
 
-    def _silent(self, uuid: str) -> None:
-        self._log.info("{name} says nothing any more", name=self._phones[uuid].name)
+    def _on_silence(self, uuid: str) -> None:
+        self._log.info("{name} has stopped sending", name=self._phones[uuid].name)
         self.leave(uuid)
 
-    def _sent_away(self, uuid: str, seconds: float) -> None:
+    def _on_removed(self, uuid: str, seconds: float) -> None:
         now = self._node.clock.seconds()
-        self._away = {other: until for other, until in self._away.items() if until > now}
-        self._away[uuid] = now + seconds
+        self._removed = {other: until for other, until in self._removed.items() if until > now}
+        self._removed[uuid] = now + seconds
         self.leave(uuid)
 
 
 class _Phone:
-    """One phone: its node, its agent, and its driver; ``silent`` is called when it says nothing any more."""
+    """The node, agent and driver of one phone; ``silent`` is called when the phone stops sending."""
 
     def __init__(self, node: SwarmNode, agent: Service, driver: PhoneDriver, silent: Callable[[], None]) -> None:
         self.name = node.presence.device.name
@@ -206,26 +206,26 @@ class _Phone:
         self._placed_at = 0.0
 
     def start(self) -> None:
-        """Open the port and join; raises one of ``FAULTS`` where that cannot be."""
+        """Open the port and join; raises one of ``FAULTS`` if that fails."""
         self._node.startService()
         self._agent.startService()
         self.wait(FIRST_S)
 
     def stop(self) -> Deferred[Any]:
-        """Give back what it holds, then say goodbye."""
+        """Release the lease, then leave the network."""
         if self._timer is not None and self._timer.active():
             self._timer.cancel()
         return maybeDeferred(self._agent.stopService).addBoth(lambda _: self._node.stopService())
 
     def wait(self, seconds: float) -> None:
-        """Expect something of it within so long."""
+        """Restart the timer for the next picture."""
         if self._timer is not None and self._timer.active():
             self._timer.reset(seconds)
         else:
             self._timer = self._node.clock.callLater(seconds, self._silent)
 
     def look(self, jpeg: bytes, size: tuple[int, int], values: Mapping[str, float]) -> Wanted:
-        """Hand on what it sees, and say what is wanted of it."""
+        """Pass on a picture, and return the requested frame rate and the instruction for the visitor."""
         self._driver.look(jpeg, *size, values)
         now = self._node.clock.seconds()
         place = {key: round(values[f"position.{key}"], n) for key, n in PLACE.items() if f"position.{key}" in values}
@@ -233,17 +233,17 @@ class _Phone:
             self._placed_at = now
             self._node.presence.change(position=place)
         device = self._node.presence.device
-        return Wanted(FPS if device.task else IDLE_FPS, self._words(device, SIGHT[0] in values))
+        return Wanted(FPS if device.task else IDLE_FPS, self._instruction(device, SIGHT[0] in values))
 
-    def _words(self, device: Device, is_seen: bool) -> str:
-        """What whoever holds it is asked to do."""
+    def _instruction(self, device: Device, is_seen: bool) -> str:
+        """Return the instruction for the visitor."""
         if self._node.halt.is_stopped:
             return "The team is stopped. Wait."
         if device.status == EXECUTING:
             return (
                 "You have the task: keep the target in view."
                 if is_seen
-                else "You have the task, and the target is out of sight: turn until you see it."
+                else "You have the task, but the target is out of sight: turn until you see it."
             )
         if device.status == DONE:
             return "Done. Thank you."
@@ -254,8 +254,8 @@ class _Phone:
         )
 
 
-def _settings_of(settings: Settings, node: SwarmNode, name: str, can: Mapping[str, Any]) -> Settings:
-    """Those of a phone: it joins through the node that it comes by, and nobody makes it fail or pushes code to it."""
+def _make_settings(settings: Settings, node: SwarmNode, name: str, can: Mapping[str, Any]) -> Settings:
+    """Return the settings of a phone's node: it joins through this node, without faults and deployment."""
     known = (node.entangled.contact.address, *settings.node.known_nodes)
     of_node = replace(
         settings.node,
@@ -276,7 +276,7 @@ def _settings_of(settings: Settings, node: SwarmNode, name: str, can: Mapping[st
 
 
 def gateway(settings: Settings, node: SwarmNode, seams: Seams, reactor: Any, view: TeamView) -> Gateway:
-    """The phones that take part through the web node with these ``seams``, each at a UDP port of its own."""
+    """Return the gateway of the web node with these ``seams``; each phone has a separate UDP port."""
     from middleware.entangled.network.udp import UdpNetwork
 
     def of_phone() -> Seams:

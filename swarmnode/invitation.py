@@ -1,7 +1,7 @@
-"""Invitation: where the page of a node of this machine is and how to sign in there, in a note and at a terminal.
+"""Address and sign-in code of a node's page, in a file and at the terminal.
 
-The note lies beside the node's control socket, for the eyes of the node's user alone; ``swarm web`` reads it.  The log,
-which is kept, sent on and read by others, says where the page is and never how to sign in.
+The file is next to the node's control socket, readable for the node's user only; ``swarm web`` reads it.  The log
+contains the address but never the code, because logs are kept, forwarded and read by others.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ _log = Logger()
 
 @dataclass(frozen=True)
 class Invitation:
-    """The page of the node ``name``: ``pid`` is the node's process, ``code`` is empty where nobody needs to sign in.
+    """The page of the node ``name``: ``pid`` is the node's process, ``code`` is empty if no sign-in is needed.
 
-    ``secure`` is the page's address over TLS, empty where there is none.
+    ``secure`` is the page's address over TLS, or empty.
     """
 
     name: str
@@ -39,12 +39,12 @@ class Invitation:
 
     @property
     def link(self) -> str:
-        """The address that signs in by itself; what stands behind the ``#`` is never sent."""
+        """The address that signs in automatically; browsers do not send the part after the ``#``."""
         return f"{self.url}#code={self.code}" if self.code else self.url
 
 
 def url_of(host: str, port: int, scheme: str = "http") -> str:
-    """The address of a page, for a browser of this machine."""
+    """Return the address of a page for a browser on this machine."""
     here = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
     return f"{scheme}://[{here}]:{port}/" if ":" in here else f"{scheme}://{here}:{port}/"
 
@@ -52,13 +52,13 @@ def url_of(host: str, port: int, scheme: str = "http") -> str:
 def invited(
     name: str, host: str, port: Callable[[], int], code: str, secure_port: int = 0, terminal: TextIO | None = None
 ) -> None:
-    """Say in the log where the page is, and leave the note; where none can be left, the log says why.
+    """Log the address of the page, and write its file; if that fails, log the reason.
 
-    ``terminal`` is where a person looks on who may know the code.
+    ``terminal`` is the terminal of a user who may see the code.
     """
     secure = url_of(host, secure_port, "https") if secure_port else ""
     invitation = Invitation(name, url_of(host, port()), code, os.getpid(), secure)
-    how = "; the command swarm web tells how to sign in" if code else "; whoever opens it is an operator"
+    how = "; run swarm web to see the sign-in code" if code else "; no sign-in: anyone who opens it is an operator"
     also = f", and over TLS at {secure}" if secure else ""
     _log.info("the page is at {url}{also}{how}", url=invitation.url, also=also, how=how)
     if code and terminal is not None:
@@ -67,21 +67,21 @@ def invited(
     try:
         keep(made(name).with_suffix(ENDING), json.dumps(asdict(invitation)).encode())
     except (NoControl, OSError) as error:
-        _log.warn("swarm web will not know of the page: {error}", error=error)
+        _log.warn("swarm web cannot show this page: {error}", error=error)
 
 
 def at_terminal() -> TextIO | None:
-    """The terminal from which this process was started, where there is one and it is no log."""
-    # Once twistd logs, what is written to sys.stderr ends up in the log.
+    """Return the terminal from which this process was started; None if there is none, or it is a log."""
+    # twistd redirects sys.stderr to its log.
     stream = sys.__stderr__
     try:
         return stream if stream is not None and stream.isatty() else None
-    except ValueError:  # closed by a daemon
+    except ValueError:  # closed by daemonization
         return None
 
 
 def invitations() -> list[Invitation]:
-    """The pages of this machine whose nodes run, by name; raises ``NoControl`` where another user made the folder."""
+    """Return the pages of running nodes on this machine; raises ``NoControl`` if the folder is another user's."""
     found = []
     for path in files(ENDING):
         try:

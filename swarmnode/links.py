@@ -1,6 +1,6 @@
-"""Links: ``swarm links``, how a node of this machine reaches each of its peers, and how well.
+"""``swarm links``: path and quality of a node's link to each of its peers.
 
-The figures are those of the page and of ``swarm doctor``: small questions to each peer, judged by
+The page and ``swarm doctor`` show the same values: round-trip times of small probes, rated by
 ``middleware.entangled.control.link``.
 """
 
@@ -20,71 +20,72 @@ from middleware.entangled.control.word import printable
 from swarmnode.asker import Asker, Refusal
 
 WAYS = {
-    "none": "no way yet",
+    "none": "no path yet",
     "machine": "this machine",
     "lan": "LAN",
     "direct": "direct",
-    "punched": "punched",
+    "punched": "hole punched",
     "tunnel": "tunnel",
 }
 SPANS = (("d", 86_400), ("h", 3600), ("min", 60), ("s", 1))
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command line."""
+    """Return the parser of the command line."""
     links = argparse.ArgumentParser(
         prog="swarm links",
-        description="Print how a node reaches each of its peers, and how well, from 0 (not at all) to 100.",
+        description="Show path and quality of a node's link to each peer; quality is from 0 (no reply) to 100.",
+        epilog="Example: swarm links --node dog1",
     )
-    links.add_argument("--node", metavar="NAME", help="which node of this machine, where several run")
-    links.add_argument("--json", action="store_true", help="answer in JSON, on one line")
+    links.add_argument("--node", metavar="NAME", help="node on this machine, if several run")
+    links.add_argument("--json", action="store_true", help="print JSON, on one line")
     return links
 
 
 def main(words: Sequence[str] | None = None, out: TextIO | None = None, ask: Ask = asked) -> int:
-    """Run the command; returns 0, 1 where the node refused or a peer does not answer, 2 where nobody can be asked."""
+    """Run the command; returns 0, 1 if the node refused or a peer does not reply, 2 if no node can be asked."""
     out = out or sys.stdout
-    wishes = parser().parse_args(words)
+    options = parser().parse_args(words)
     try:
-        asker = Asker(wishes.node, ask)
-        told = asker.links()
+        asker = Asker(options.node, ask)
+        links = asker.links()
         names = {device.uuid: device.name for device, _ in asker.devices()}
     except (Refusal, NoControl) as problem:
         sys.stderr.write(printable(f"swarm links: {problem}") + "\n")
         return FAILED if isinstance(problem, Refusal) else WRONG
-    judged = sorted(((each, _judged(each)) for each in told), key=lambda pair: (pair[1].score, pair[0]["id"]))
-    out.write(_as_json(judged, names) if wishes.json else _as_text(judged, names))
-    return FAILED if any(found.round_trip is None for _, found in judged) else 0
+    rated = sorted(((each, _rate(each)) for each in links), key=lambda pair: (pair[1].score, pair[0]["id"]))
+    out.write(_as_json(rated, names) if options.json else _as_text(rated, names))
+    return FAILED if any(found.round_trip is None for _, found in rated) else 0
 
 
 def figures(found: Link) -> str:
-    """Round trip, jitter and loss for people."""
+    """Return round-trip time, jitter and loss as text."""
     if found.round_trip is None or found.jitter is None:
-        return "does not answer"
+        return "does not reply"
     return f"{1000 * found.round_trip:.1f} ms, jitter {1000 * found.jitter:.1f} ms, {100 * found.loss:.0f} % lost"
 
 
-def _judged(told: dict[str, Any]) -> Link:
-    return link(told["times"], bool(told["relayed"]))
+def _rate(row: dict[str, Any]) -> Link:
+    return link(row["times"], bool(row["relayed"]))
 
 
-def _as_json(judged: Sequence[tuple[dict[str, Any], Link]], names: dict[str, str]) -> str:
+def _as_json(rated: Sequence[tuple[dict[str, Any], Link]], names: dict[str, str]) -> str:
     rows = [
         {"name": names.get(each["id"], ""), **{key: each[key] for key in ("id", "address", "way", "by", "for")}}
         | {"score": found.score, **asdict(found)}
-        for each, found in judged
+        for each, found in rated
     ]
     return json.dumps({"links": rows}) + "\n"
 
 
-def _as_text(judged: Sequence[tuple[dict[str, Any], Link]], names: dict[str, str]) -> str:
-    if not judged:
-        return "this node knows no peer; swarm doctor says why\n"
-    rows = [(_name(each["id"], names), _way(each, names), each, found) for each, found in judged]
-    wide, far = (max(len(row[place]) for row in rows) for place in (0, 1))  # type: ignore[arg-type]
+def _as_text(rated: Sequence[tuple[dict[str, Any], Link]], names: dict[str, str]) -> str:
+    if not rated:
+        return "this node has no peers; run swarm doctor to see why\n"
+    rows = [(_name(each["id"], names), _path(each, names), each, found) for each, found in rated]
+    wide, far = (max(len(each[place]) for each in rows) for place in (0, 1))  # type: ignore[arg-type]
     lines = [
-        f"{name:{wide}}  {found.score:3}/100  {way:{far}}  {figures(found)}{_span(each['for'])}"
-        for name, way, each, found in rows
+        f"{name:{wide}}  {found.score:3}/100  {path:{far}}  {figures(found)}{_span(each['for'])}"
+        for name, path, each, found in rows
     ]
     return "".join(printable(line) + "\n" for line in lines)
 
@@ -93,10 +94,10 @@ def _name(node_id: str, names: dict[str, str]) -> str:
     return names.get(node_id) or node_id[:10]
 
 
-def _way(told: dict[str, Any], names: dict[str, str]) -> str:
-    if told["way"] == "carried":
-        return f"carried by {_name(told['by'], names)}" if told["by"] else "carried by nobody now"
-    return WAYS.get(told["way"], str(told["way"]))
+def _path(row: dict[str, Any], names: dict[str, str]) -> str:
+    if row["way"] == "carried":
+        return f"relayed by {_name(row['by'], names)}" if row["by"] else "relay lost"
+    return WAYS.get(row["way"], str(row["way"]))
 
 
 def _span(seconds: float | None) -> str:

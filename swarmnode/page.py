@@ -1,6 +1,6 @@
-"""Page: the page of a web node, made of its parts: what it reads, the board, its ports.
+"""Composition of a web node's page: data sources, API and ports.
 
-Whoever imports this has the libraries of the extra ``web``.
+Importing this module requires the libraries of the extra ``web``.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ if TYPE_CHECKING:
 
 
 class PageService(MultiService):
-    """The page, its line to the yard where there is one, and what says where it is: to its user and to the team.
+    """The page's service, with a connection to the robot simulator if there is one.
 
-    ``phones`` take part through it, and leave with it.
+    ``tell`` announces the page to its user and to the team.  ``phones`` take part through the page and stop with it.
     """
 
     def __init__(
@@ -58,14 +58,14 @@ class PageService(MultiService):
         web.setServiceParent(self)
 
     def startService(self) -> None:
-        """Open its ports, say where it is, and reach for the yard."""
+        """Open the ports, announce the page, and connect to the simulator."""
         super().startService()
         self._tell()
         if self._operator is not None:
             self._operator.connect().addErrback(lambda _: None)
 
     def stopService(self) -> Any:
-        """Let the phones and the yard go and close its ports; fires when they are."""
+        """Stop the phones, disconnect from the simulator, and close the ports; fires when done."""
         if self._operator is not None:
             self._operator.disconnect()
         left = self._phones.close()
@@ -75,19 +75,19 @@ class PageService(MultiService):
 def page(
     settings: Settings, seams: Seams, reactor: Any, node: SwarmNode, door: Callable[..., TlsDoor] | None
 ) -> PageService:
-    """The page over the data store of ``node``; ``door`` makes its port over TLS, where it is to have one."""
+    """Return the page over the data store of ``node``; ``door`` creates its TLS port, if it has one."""
     address, wall, store = settings.web, seams.wall, settings.node.store
     operator = None
     if address.yard is not None:
         operator = YardOperator(TcpConnector(), reactor, address.yard.host, address.yard.port)
     client = TeamClient(node)
     desk = TeamDesk(client, TASKS, DEMO, operator)
-    tls = None if door is None else door(settings, node.store, reactor, wall, seams.rng, _names)
+    tls = None if door is None else door(settings, node.store, reactor, wall, seams.rng, _machine_names)
     team = TeamFallbacks(node, reactor.seconds)
     phones = gateway(settings, node, seams, reactor, client.view)
 
     def urls() -> list[str]:
-        return web.urls(_names())
+        return web.urls(_machine_names())
 
     authority, fingerprint = (b"", "") if tls is None else (tls.signer.pem, tls.signer.fingerprint)
     board = Board(
@@ -102,7 +102,7 @@ def page(
         invites=TeamInvites(urls, authority, fingerprint, reactor, reactor.getThreadPool()),
     )
     live = partial(state_from, client.read, Departed(), settings.node.name)
-    # A memory of the departed of its own: the file lags what is watched by a commit, and one would doubt the other.
+    # A separate memory of departed devices: the file is one commit behind the watched records.
     on_file = partial(state_from, partial(read_records, Path(store)), Departed(), settings.node.name)
     stored = live if store == IN_MEMORY else on_file
     web = WebService(
@@ -127,19 +127,19 @@ def page(
 
 
 def hosts_of(settings: Settings, machine: str) -> frozenset[str]:
-    """The names by which a browser may open the page of this ``machine``, beside its addresses."""
+    """Return the host names by which a browser may open the page, in addition to addresses."""
     short = {machine.split(".")[0].lower(), settings.node.name.lower()}
     local = {f"{name}{end}" for name in short for end in ("", *LOCAL_ENDS)}
     return frozenset({machine.lower(), *local, *settings.web.names})
 
 
-def _names() -> Sequence[str]:
-    """What others in the network call this machine: its address, and its name where that is announced."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as way:
+def _machine_names() -> Sequence[str]:
+    """Return the names of this machine in the network: its address, and its mDNS name."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
-            # Nothing is sent: the system says only from which of its addresses it would be.
-            way.connect(("192.0.2.1", 9))
-            address = str(way.getsockname()[0])
+            # Sends nothing: connect only selects the source address.
+            probe.connect(("192.0.2.1", 9))
+            address = str(probe.getsockname()[0])
         except OSError:
             address = ""
     name = socket.gethostname().split(".")[0]

@@ -1,4 +1,4 @@
-"""Password: ``swarm password``, the hash of a password for ``[web] password``; it stores nothing."""
+"""``swarm password``: print the hash of a password for ``[web] password``; the password is not stored."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from webnode.password import LEAST, MOST, SALT, hashed
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command line."""
-    about = "Ask for a password, and print its hash, to be put into the settings as [web] password."
-    return argparse.ArgumentParser(prog="swarm password", description=about)
+    """Return the parser of the command line."""
+    about = "Ask for a password, and print its hash for the settings, as [web] password."
+    return argparse.ArgumentParser(prog="swarm password", description=about, epilog="Example: swarm password")
 
 
 def main(
@@ -24,20 +24,20 @@ def main(
     ask: Callable[[str], str] = getpass.getpass,
     salt: Callable[[int], bytes] = os.urandom,
 ) -> int:
-    """Run the command; returns 0, or 1 where there is no password to hash."""
+    """Run the command; returns 0, or 1 if there is no valid password."""
     out = out or sys.stdout
     parser().parse_args(words)
     try:
         password = ask("Password: ")
         problem = ""
         if not LEAST <= len(password) <= MOST:
-            problem = f"it has {len(password)} characters; take {LEAST} to {MOST}"
+            problem = f"the password has {len(password)} characters; use {LEAST} to {MOST}"
         elif password != password.strip() or not password.isprintable():
-            problem = "it begins or ends with a space, or holds what cannot be typed into a page; take another"
-        elif ask("Once more: ") != password:
-            problem = "the two are not the same; try again"
+            problem = "the password begins or ends with a space, or has an unprintable character; use another one"
+        elif ask("Repeat the password: ") != password:
+            problem = "the passwords are not the same; try again"
     except (EOFError, KeyboardInterrupt):
-        problem = "there was none"
+        problem = "no password entered"
     if problem:
         sys.stderr.write(f"swarm password: {problem}\n")
         return 1

@@ -1,4 +1,4 @@
-"""Plugin: what ``twistd swarm-node`` takes and makes; every refusal is one line and exit code 2."""
+"""The ``twistd swarm-node`` plugin: command line options and service; every error is one line and exit code 2."""
 
 from __future__ import annotations
 
@@ -42,83 +42,82 @@ KEYS: Sequence[tuple[type[Exception], str]] = (
     (PortTaken, "[web] port"),
     (MissingExtra, "[node] roles"),
 )
-"""Which setting to look at for which fault."""
+"""Setting to name in the message of each error."""
 
 KEY_FILE = "team-key-file"
 TRIES = 5
-"""Ports that are tried where programs that start at the same moment take one another's."""
+"""Number of ports to try if programs that start at the same moment compete for them."""
 
 
 class Options(usage.Options):
-    """What ``twistd swarm-node`` takes; a flag wins over the file."""
+    """Command line of ``twistd swarm-node``; flags take precedence over the file."""
 
     synopsis = "[--config FILE] [flags]"
     longdesc = (
-        "Run one node of a swarm: a peer of the network, the agent of a device, and the page if it has the web role."
+        "Run one node of a team: peer of the network, agent of a device, and page if it has the web role.\n\n"
+        "Example: twistd --nodaemon swarm-node --config dog1.toml"
     )
     optParameters = [
-        ["config", "c", None, "TOML file of the node"],
+        ["config", "c", None, "settings file of the node (TOML)"],
         ["name", "n", None, "name of the node"],
         ["kind", "k", None, "kind of the device"],
         ["host", None, None, "address to listen on"],
-        ["port", "p", None, "UDP port; 0 takes any"],
-        ["lan", None, None, "false: do not look for the team on the LAN"],
-        ["known-nodes", None, None, "nodes to join through, as HOST:PORT,HOST:PORT"],
+        ["port", "p", None, "UDP port; 0 picks any free one"],
+        ["lan", None, None, "false: do not search for the team on the LAN"],
+        ["known-nodes", None, None, "bootstrap nodes, as HOST:PORT,HOST:PORT"],
         ["store", "s", None, "path of the data store, or :memory:"],
-        ["membership", None, None, "file of a member of a closed team"],
+        ["membership", None, None, "membership file of a closed team"],
         ["team-key-file", None, None, "file with the secret of an open team; - for standard input"],
-        ["tunnels", None, None, "ways in over TLS where UDP is blocked, as wss://HOST:PORT,wss://HOST:PORT"],
-        ["tunnel-port", None, None, "TCP port that lets those in to whom UDP is blocked; 0: none"],
-        ["roles", "r", None, "of edge,bootstrap,web"],
+        ["tunnels", None, None, "TLS tunnels to use where UDP is blocked, as wss://HOST:PORT,wss://HOST:PORT"],
+        ["tunnel-port", None, None, "TCP port that accepts tunnels from other nodes; 0: none"],
+        ["roles", "r", None, "roles of the node: edge, bootstrap, web, separated by commas"],
         ["agent-module", "a", None, "agent of the device"],
-        ["driver-kind", "d", None, "driver of its robot"],
+        ["driver-kind", "d", None, "driver of the robot"],
         ["web-host", None, None, "address of the page"],
         ["web-port", None, None, "TCP port of the page"],
-        ["web-tls", None, None, "auto: the page over TLS as well"],
+        ["web-tls", None, None, "auto: also serve the page over TLS"],
         ["web-tls-port", None, None, "TCP port of the page over TLS"],
-        ["web-yard", None, None, "yard that the page's map shows, as HOST:PORT"],
+        ["web-yard", None, None, "robot simulator to show on the page's map, as HOST:PORT"],
     ]
     settings: Settings
 
     def opt_team_key(self, key: str) -> None:
-        """Refused: every user of the computer can read a command line; see --team-key-file."""
-        problem = "can be read by every user of this computer"
-        remedy = (
-            "write the secret to a file of mode 0600 and say --team-key-file FILE, and change the one that was here"
-        )
+        """Rejected, because all users of the computer can read command lines; use --team-key-file."""
+        problem = "can be read by all users of this computer"
+        remedy = "write a new secret to a file of mode 0600 and pass --team-key-file FILE; replace the one given here"
         _refuse(BadSetting(COMMAND_LINE, "--team-key", problem, remedy))
 
     def postOptions(self) -> None:
-        """Read the file and the flags; what is wrong is said in one line, with exit code 2."""
+        """Read the file and the flags; an error is printed in one line, with exit code 2."""
         flags = {name.replace("-", "_"): value for name, value in self.items() if name not in ("config", KEY_FILE)}
         try:
             if self[KEY_FILE] is not None:
-                flags["team_key"] = _team_key(self[KEY_FILE])
+                flags["team_key"] = _read_team_key(self[KEY_FILE])
             if self["config"]:
                 settings = Settings.load(self["config"])
             elif self["name"] is None:
-                raise BadSetting(COMMAND_LINE, "--name", "is missing", "say --name NAME, or --config FILE")
+                raise BadSetting(COMMAND_LINE, "--name", "is missing", "pass --name NAME, or --config FILE")
             else:
                 settings = Settings.from_mapping({"node": {"name": "unnamed"}}, COMMAND_LINE)
             self.settings = settings.with_flags(**flags)
         except (SwarmError, BadKeyFile) as error:
             _refuse(error)
-        # Here at the latest, as the reactor comes next.
+        # This is the last moment before the reactor is imported.
         if not ("web" in self.settings.node.roles and self.settings.web.tls):
             drop_tls()
 
 
-def _team_key(file: str) -> str:
-    """The secret in a file of the owner alone, or on standard input, without the end of its line."""
+def _read_team_key(file: str) -> str:
+    """Return the secret in a private file, or from standard input, without the newline at its end."""
     content = sys.stdin.buffer.read(MAX_FILE + 1) if file == "-" else read_bytes(Path(file))
     try:
         return content.decode().rstrip("\r\n")
     except UnicodeDecodeError:
-        raise BadKeyFile(f"{file} holds no text; write the secret of the team into it") from None
+        raise BadKeyFile(f"{file} is not text; write the secret of the team into it") from None
 
 
 def makeService(options: Options) -> IService:
-    """The service that ``twistd`` runs."""
+    """Return the service that ``twistd`` runs."""
     from twisted.internet import reactor
 
     settings = options.settings
@@ -137,10 +136,10 @@ def makeService(options: Options) -> IService:
 
 
 class CheckedService(NodeService):
-    """A node service whose failure to start is one line for a person and exit code 2."""
+    """A node service that reports a failed start in one line, with exit code 2."""
 
     def startService(self) -> None:
-        """Start; where no port was set and another program took the usual one since it was looked up, at the next."""
+        """Start; if the default port has been taken since it was checked, try the next ones."""
         try:
             for left in reversed(range(TRIES)):
                 try:
@@ -161,7 +160,7 @@ class CheckedService(NodeService):
 
 
 def told(error: Exception, origin: str) -> str:
-    """One line that says in which file, at which key, what is wrong and what to do."""
+    """Return one line with file, key, problem and remedy."""
     if isinstance(error, BadSetting):
         return str(error)
     key = next((key for kind, key in KEYS if isinstance(error, kind)), "")
@@ -169,7 +168,7 @@ def told(error: Exception, origin: str) -> str:
 
 
 def _refuse(problem: object) -> NoReturn:
-    # Once twistd logs, what is written to sys.stderr ends up in the log and not before the person's eyes.
+    # twistd redirects sys.stderr to its log, which the user does not see.
     stream = sys.__stderr__ if isinstance(sys.stderr, LoggingFile) else sys.stderr
     if stream is not None:
         stream.write(f"swarm-node: {problem}\n")

@@ -1,4 +1,4 @@
-"""Ports: where the settings name none, a port that is in use gives way, so that a node can be started twice at once."""
+"""Selection of a free port if the default port is in use, so several nodes can run on one machine."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from twisted.logger import Logger
 from middleware.config.settings import Settings
 
 NEXT = 8
-"""Ports that are tried, the usual one and those after it, so that a firewall can be opened for them; then any."""
+"""Number of ports to try: the default and the next ones, so a firewall can be opened for them; then any port."""
 
 IsFree = Callable[[socket.SocketKind, str, int], bool]
 _log = Logger()
 
 
 def is_free(kind: socket.SocketKind, host: str, port: int) -> bool:
-    """Whether a program could listen there now; also where ``host`` itself is the trouble, which others can say."""
+    """Return whether a program could listen there now; True also for an invalid ``host``, which is reported later."""
     try:
         found = socket.getaddrinfo(host or None, port, type=kind, flags=socket.AI_PASSIVE)
         with socket.socket(found[0][0], kind) as tried:
             if kind == socket.SOCK_STREAM:
-                # As the real one does: a port in TIME_WAIT is free.
+                # As the real listener does: a port in TIME_WAIT is free.
                 tried.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             tried.bind(found[0][4])
     except OSError as error:
@@ -32,26 +32,26 @@ def is_free(kind: socket.SocketKind, host: str, port: int) -> bool:
 
 
 def given_way(settings: Settings, is_free: IsFree = is_free) -> Settings:
-    """``settings`` with another port for each usual one that is in use; a port that was set stays, busy or not."""
+    """Replace each default port that is in use by a free one; ports that were set stay."""
     node, web = settings.node, settings.web
     if not settings.is_given("node", "port"):
         host = "" if node.host == "*" else node.host
-        node = replace(node, port=_port("[node] port", socket.SOCK_DGRAM, host, node.port, is_free))
+        node = replace(node, port=_select_port("[node] port", socket.SOCK_DGRAM, host, node.port, is_free))
     if "web" in node.roles:
         if not settings.is_given("web", "port"):
-            web = replace(web, port=_port("[web] port", socket.SOCK_STREAM, web.host, web.port, is_free))
+            web = replace(web, port=_select_port("[web] port", socket.SOCK_STREAM, web.host, web.port, is_free))
         if web.tls and not settings.is_given("web", "tls_port"):
-            tls_port = _port("[web] tls_port", socket.SOCK_STREAM, web.host, web.tls_port, is_free)
+            tls_port = _select_port("[web] tls_port", socket.SOCK_STREAM, web.host, web.tls_port, is_free)
             web = replace(web, tls_port=tls_port)
     return replace(settings, node=node, web=web)
 
 
-def _port(key: str, kind: socket.SocketKind, host: str, usual: int, is_free: IsFree) -> int:
+def _select_port(key: str, kind: socket.SocketKind, host: str, usual: int, is_free: IsFree) -> int:
     for port in range(usual, usual + NEXT):
         if is_free(kind, host, port):
             if port != usual:
-                _log.info("{key}: {usual} is in use, so this node takes {port}", key=key, usual=usual, port=port)
+                _log.info("{key}: {usual} is in use; using {port}", key=key, usual=usual, port=port)
             return port
     last = usual + NEXT - 1
-    _log.info("{key}: {usual} to {last} are in use, so this node takes any", key=key, usual=usual, last=last)
+    _log.info("{key}: {usual} to {last} are in use; using any free port", key=key, usual=usual, last=last)
     return 0

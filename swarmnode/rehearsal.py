@@ -1,6 +1,6 @@
-"""The rehearsal: a laptop, three dogs and their yard in one process, on one turned clock (``swarm trials``).
+"""A simulated team in one process in virtual time: a laptop, three dogs and the robot simulator (``swarm trials``).
 
-It wires what the front door wires, with the twins in memory of clock, wire and disk in place of the real ones.
+The nodes are real ones, with in-memory implementations of clock, network and store.
 """
 
 from __future__ import annotations
@@ -40,20 +40,19 @@ from webnode.state import Departed
 from webnode.team import TeamDesk
 
 LAN = Weather(delay_s=0.002, jitter_s=0.001)
-"""A quiet network in one house."""
+"""Link quality of an idle home network."""
 RESTARTED = 15.0
-"""Seconds after which a node that was killed by a fault is there again, as in a demonstration."""
+"""Seconds after which a node killed by a fault is restarted, as in the demo."""
 HERE_S = 2.0
 ANSWER_S = 6.0
 
 
 class VirtualTeam(World):
-    """A laptop and its dogs; a seed replays them exactly.
+    """A laptop and its dogs; a seed reproduces a run exactly.
 
-    What runs is what runs on a robot: the real node, agent, driver, yard and detection.  ``dogs`` are those that are
-    there from the start, the yard has a body for each of ``DOGS``; ``others`` are nodes without a body, which join
-    before the dogs; ``weather`` is that of every link; with ``faults`` the nodes can be made to fail as in a
-    demonstration.
+    Node, agent, driver, simulator and detection are the real ones.  ``dogs`` are the dogs that join at the start; the
+    simulator has a robot for each of ``DOGS``.  ``others`` are nodes without a robot, which join before the dogs.
+    ``weather`` applies to every link.  With ``faults`` the nodes accept fault injection.
     """
 
     BOOTSTRAP = "vaio"
@@ -77,8 +76,8 @@ class VirtualTeam(World):
         self.machines: dict[str, Machine] = {}
         self.connectors: dict[str, MemoryConnector] = {}
         self.operator = drawn(f"team-{seed}", random.Random(f"{seed}/operator"))
-        self._dice = random.Random(f"{seed}/members")
-        self._secret = self._dice.randbytes(SECRET_BYTES)
+        self._member_rng = random.Random(f"{seed}/members")
+        self._secret = self._member_rng.randbytes(SECRET_BYTES)
         self._memberships: dict[str, MemoryMembership] = {}
         self._names = (self.BOOTSTRAP, *self.DOGS, *others)
         self._fps = camera_fps
@@ -94,9 +93,9 @@ class VirtualTeam(World):
         self.clock.advance(self.JOINING)
 
     def add(self, name: str, tables: Mapping[str, Mapping[str, Any]] | None = None, shelf: Any = None) -> None:
-        """Start the node ``name``, the laptop, one of the dogs or of the others, with further ``tables`` of settings.
+        """Start the node ``name`` (the laptop, a dog or another node) with additional ``tables`` of settings.
 
-        ``shelf`` is where it keeps deployed modules.
+        ``shelf`` stores its deployed modules.
         """
         port = self.address_of(name).port
         mapping: dict[str, Any] = {"node": {"name": name, "port": port}}
@@ -126,19 +125,19 @@ class VirtualTeam(World):
         self.services[name].startService()
 
     def _membership(self, name: str) -> MemoryMembership:
-        """The place of the node ``name`` in the team, the same in each of its lives; its operator has met everybody."""
+        """Return the membership of the node ``name``, the same after each restart, issued by the team's operator."""
         if name not in self._memberships:
             roles, now = ("device",) if name in self.DOGS else FIRST, self.clock.seconds()
-            membership = self.operator.founded(name, roles, now, self._dice, self._secret)
+            membership = self.operator.founded(name, roles, now, self._member_rng, self._secret)
             self._memberships[name] = MemoryMembership(membership)
         return self._memberships[name]
 
     def address(self, place: int) -> Address:
-        """Where the node of this place listens."""
+        """Return the address of the node number ``place``."""
         return Address("127.0.0.1", 7000 + place)
 
     def address_of(self, name: str) -> Address:
-        """Where the node ``name`` listens."""
+        """Return the address of the node ``name``."""
         return self.address(self._names.index(name))
 
     def run_demo(self) -> str:
@@ -146,41 +145,41 @@ class VirtualTeam(World):
         return str(self.desk.run_demo())
 
     def state(self) -> dict[str, Any]:
-        """What the page shows now."""
+        """Return the state that the page shows now."""
         return state_from(self.desk.read, self._departed, self.BOOTSTRAP, self.clock.seconds())
 
     def truth(self) -> dict[str, Any]:
-        """Where everything in the yard really is."""
+        """Return the true positions in the simulator."""
         return self.yard.world.snapshot()
 
     def scatter(self, seed: int) -> None:
-        """Set the dogs down at random places."""
+        """Put the dogs at random places."""
         self.yard.world.scatter(seed)
 
     def kill(self, name: str) -> None:
-        """End a node as SIGKILL does: without a word to anybody."""
+        """End a node as SIGKILL does, without sending anything."""
         self.services[name].vanish()
 
     def freeze(self, name: str) -> None:
-        """Stop a node as SIGSTOP does; its body is another machine, and goes on."""
+        """Stop a node as SIGSTOP does; its robot is another machine and continues."""
         self.machines[name].freeze()
 
     def thaw(self, name: str) -> None:
-        """Let a frozen node go on."""
+        """Let a frozen node continue."""
         self.machines[name].thaw()
 
     def silence(self, name: str, one_way: bool = False) -> None:
-        """Let nothing pass between a node and the others; ``one_way``: it still hears them."""
+        """Block all datagrams between a node and the others; with ``one_way`` it still receives."""
         for other in self._names:
             if other != name:
                 self.board.cut(self.address_of(name), self.address_of(other), one_way)
 
     def unplug(self, name: str) -> None:
-        """Let nothing pass between the node of a dog and its body, though no connection is closed."""
+        """Block all data between a dog's node and its robot, without closing the connection."""
         self.connectors[name].silence()
 
     def stop(self) -> None:
-        """End everything."""
+        """Stop all nodes and the simulator."""
         for service in self.services.values():
             if service.running:
                 service.stopService()
@@ -203,7 +202,7 @@ class _Process:
 
 
 class RehearsedStage:
-    """A virtual team whose every node allows faults; ``digest`` tells whether two runs were the same."""
+    """A virtual team with fault injection at every node; ``digest`` shows whether two runs were identical."""
 
     def __init__(self, seed: int) -> None:
         self.team = VirtualTeam(seed, faults=True)
@@ -212,58 +211,58 @@ class RehearsedStage:
         self.team.clock.advance(HERE_S)
 
     def seconds(self) -> float:
-        """The turned clock."""
+        """Return the virtual time in seconds."""
         return self.team.clock.seconds()
 
     def wait(self, seconds: float) -> None:
-        """Turn it."""
+        """Advance the virtual time."""
         self.team.clock.advance(seconds)
 
     def devices(self) -> list[Device]:
-        """Who is there, as the laptop sees it."""
+        """Return the present devices, as seen by the laptop."""
         return [device for device, _ in devices_of(self._watch.records)]
 
     def assign(self, task: str) -> str:
-        """Let the laptop publish it."""
-        return str(self._called(self._node.presence.device, ASSIGN, task))
+        """Publish the task from the laptop."""
+        return str(self._call(self._node.presence.device, ASSIGN, task))
 
     def cause(self, device: Device, fault: Fault) -> float:
-        """Let the laptop ask for it."""
-        return begins_in(self._called(device, CAUSE, fault.kind, fault.seconds, fault.amount or None))
+        """Order the fault from the laptop."""
+        return begins_in(self._call(device, CAUSE, fault.kind, fault.seconds, fault.amount or None))
 
     def is_over(self, task_id: str) -> bool:
-        """Whether its outcome is recorded."""
-        task = tasks_of(self._answer(self._node.entangled.get(TASKS_KEY))).get(task_id)
-        records = self._answer(self._node.entangled.get(group_key(task_id)))
+        """Return whether the outcome of the task is recorded."""
+        task = tasks_of(self._wait_for(self._node.entangled.get(TASKS_KEY))).get(task_id)
+        records = self._wait_for(self._node.entangled.get(group_key(task_id)))
         return task is not None and outcome_of(task, records) is not None
 
     def digest(self) -> str:
-        """The running hash over every delivery."""
+        """Return the running hash over every delivery."""
         return self.team.board.digest()
 
     def stop(self) -> None:
-        """End everything."""
+        """Stop the team."""
         self.team.stop()
 
-    def _called(self, device: Device, method: str, *arguments: Any) -> Any:
+    def _call(self, device: Device, method: str, *arguments: Any) -> Any:
         record = next((record for each, record in devices_of(self._watch.records) if each.uuid == device.uuid), None)
         contact = None if record is None else self._node.contact_of(record)
         if contact is None:
-            raise Refusal(f"{device.name} is not there")
-        return self._answer(self._node.entangled.call(contact, method, *arguments, changes=True))
+            raise Refusal(f"{device.name} is not present")
+        return self._wait_for(self._node.entangled.call(contact, method, *arguments, changes=True))
 
-    def _answer(self, work: Deferred[Any]) -> Any:
-        came: list[Any] = []
+    def _wait_for(self, work: Deferred[Any]) -> Any:
+        results: list[Any] = []
         problems: list[str] = []
-        work.addCallbacks(came.append, lambda failure: problems.append(failure.getErrorMessage()))
+        work.addCallbacks(results.append, lambda failure: problems.append(failure.getErrorMessage()))
         end = self.seconds() + ANSWER_S
-        while not (came or problems) and self.seconds() < end:
+        while not (results or problems) and self.seconds() < end:
             self.wait(0.01)
-        if not came:
-            raise Refusal(problems[0] if problems else "no answer")
-        return came[0]
+        if not results:
+            raise Refusal(problems[0] if problems else f"no reply within {ANSWER_S:g} s")
+        return results[0]
 
 
 def main(arguments: list[str]) -> int:
-    """``swarm trials``: both experiments with this team, many times."""
+    """Run ``swarm trials``: repeat both experiments with this team."""
     return run_trials(arguments, VirtualTeam)

@@ -1,7 +1,7 @@
-"""Sandbox: the process in which one pushed module runs; ``python -m swarmnode.sandbox PARENT``.
+"""The process in which one pushed module runs: ``python -m swarmnode.sandbox PARENT``.
 
-It reads questions from standard input and writes answers to standard output.  It first imports the libraries of a fixed
-list that the module names, then gives up its rights, and only then reads the source as Python.
+It reads requests from standard input and writes replies to standard output.  It first imports those libraries of a
+fixed list that the module uses, then drops its privileges, and only then parses the source as Python.
 """
 
 from __future__ import annotations
@@ -28,24 +28,24 @@ LIBRARIES = (
     *("traceback", "types", "typing", "zlib", "cv2", "numpy"),
 )
 PREFIXES = ("agents.", "drivers.reading", "middleware.consensus.", "middleware.entangled.value", "numpy.")
-"""Where else a module may import from: names that begin so."""
+"""Further names that a module may import, by prefix."""
 LATER = {"numpy": ("numpy.fft", "numpy.random")}
-"""Modules that a library imports at first use, which is too late here."""
+"""Modules that a library imports at first use, when imports are no longer possible."""
 _IMPORT = re.compile(rb"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import|import[ \t]+([\w., \t]+))", re.MULTILINE)
 
 
 def kinds() -> Mapping[str, Kind]:
-    """How modules of each kind are served."""
+    """Return the handler of each kind of module."""
     return {STRATEGY: StrategyKind(), BEHAVIOUR: BehaviourKind()}
 
 
 def simulated() -> Channel:
-    """The twin of a process, for simulated teams."""
+    """Return an in-memory channel, for simulated teams."""
     return MemoryChannel(kinds())
 
 
 def wanted(source: bytes) -> list[str]:
-    """The allowed libraries that ``source`` names, to be imported before the rights are given up."""
+    """Return the allowed libraries that ``source`` imports; they are loaded before privileges are dropped."""
     named: set[str] = set()
     for one, several in _IMPORT.findall(source):
         words = [one] if one else [part.split()[0] for part in several.split(b",") if part.split()]
@@ -54,7 +54,7 @@ def wanted(source: bytes) -> list[str]:
     return sorted(known.union(*(LATER.get(name, ()) for name in known)))
 
 
-def _prepared(parent: int, source: bytes) -> list[str]:
+def _prepare(parent: int, source: bytes) -> list[str]:
     for name in wanted(source):
         with suppress(Exception):  # the module's own import raises again
             importlib.import_module(name)
@@ -64,14 +64,14 @@ def _prepared(parent: int, source: bytes) -> list[str]:
 
 
 def main() -> None:
-    """Answer until the node closes the pipe."""
+    """Answer requests until the node closes the pipe."""
     out = os.dup(1)
     null = os.open(os.devnull, os.O_RDWR)
-    os.dup2(null, 1)  # output of the module is no answer
+    os.dup2(null, 1)  # output of the module must not be taken for a reply
     os.close(null)
     with suppress(OSError):
-        os.rmdir(os.getcwd())  # the folder is empty, and stays so
-    host = Host(kinds(), partial(_prepared, int(sys.argv[1])))
+        os.rmdir(os.getcwd())  # the folder is empty and not needed
+    host = Host(kinds(), partial(_prepare, int(sys.argv[1])))
     questions = Splitter(MAX_QUESTION)
     while data := os.read(0, READ_BYTES):
         for question in questions.feed(data):

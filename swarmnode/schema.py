@@ -1,4 +1,4 @@
-"""Schema: ``swarm schema``, the JSON schema of a settings file, for editors that check TOML by one."""
+"""``swarm schema``: print the JSON schema of a settings file, for editors that validate TOML by a schema."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from middleware.config.settings import TABLES
 
 
 def json_schema() -> dict[str, Any]:
-    """Return the schema; the program refuses more values for settings that have a step after the conversion."""
-    tables = {name: _struct_of(name, cls) for name, cls in TABLES.items()}
+    """Return the schema; settings with a further conversion step accept fewer values than it allows."""
+    tables = {name: _make_struct(name, cls) for name, cls in TABLES.items()}
     optional: list[tuple[str, Any, Any]] = [
         (name, table, msgspec.field(default_factory=dict)) for name, table in tables.items() if name != "node"
     ]
-    whole = msgspec.defstruct("Settings", [("node", tables["node"]), *optional], forbid_unknown_fields=True)
-    return msgspec.json.schema(whole)
+    struct = msgspec.defstruct("Settings", [("node", tables["node"]), *optional], forbid_unknown_fields=True)
+    return msgspec.json.schema(struct)
 
 
-def _struct_of(name: str, cls: type[Any]) -> type[Any]:
+def _make_struct(name: str, cls: type[Any]) -> type[Any]:
     hints = get_type_hints(cls, include_extras=True)
     known: list[tuple[Any, ...]] = []
     for each in fields(cls):
@@ -37,6 +37,11 @@ def _struct_of(name: str, cls: type[Any]) -> type[Any]:
 
 def main(words: Sequence[str] | None = None, out: TextIO | None = None) -> int:
     """Run the command; returns 0."""
-    argparse.ArgumentParser(prog="swarm schema", description=__doc__.partition(": ")[2]).parse_args(words)
+    parser = argparse.ArgumentParser(
+        prog="swarm schema",
+        description="Print the JSON schema of a settings file, for editors that validate TOML by a schema.",
+        epilog="Example: swarm schema > swarm-node.schema.json",
+    )
+    parser.parse_args(words)
     (out or sys.stdout).write(json.dumps(json_schema(), indent=2) + "\n")
     return 0

@@ -1,4 +1,4 @@
-"""Seams: where a node touches the world."""
+"""Dependencies of a node on its environment."""
 
 from __future__ import annotations
 
@@ -21,14 +21,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Seams:
-    """Where a node touches the world; everything else is logic.
+    """The environment of a node: clock, network, store and processes.
 
-    ``network`` makes the node's port each time that it enters the network; ``connector`` opens links to robots and
-    yards (None: TCP); ``wall`` is unix time, for people; ``shelf`` is where deployed modules are kept (None: they are
-    forgotten when the node ends); ``process`` is what an injected fault kills or freezes (None: neither);
-    ``lan`` makes its place in the group of the LAN (None: it does not look there).
-    ``spawn`` starts the process of a deployed module (None: a process of this machine, confined).
-    ``membership`` is the node's place in a closed team (None: the team is open).
+    ``network`` creates the node's port each time it joins.  ``connector`` opens links to robots and simulators
+    (None: TCP).  ``wall`` returns Unix time.  ``shelf`` stores deployed modules (None: in memory).  ``process`` is
+    killed or frozen by an injected fault (None: not possible).  ``lan`` creates the multicast socket for discovery
+    (None: no discovery).  ``spawn`` starts the process of a deployed module (None: a confined process on this machine).
+    ``membership`` is the node's membership of a closed team (None: the team is open).
     """
 
     clock: IReactorTime

@@ -1,4 +1,4 @@
-"""Simulation: the ``sim`` command, whole teams in one process on one turned clock."""
+"""The ``sim`` command: simulate whole teams in one process in virtual time."""
 
 from __future__ import annotations
 
@@ -19,31 +19,32 @@ from sim.team.scale.command import scale
 
 WRONG = 2
 SPARING = 200_000, 20, 20
-"""Objects made between two looks for garbage, and how often older ones are looked at; of Python's own 700, 10, 10 a
-large team makes one look after the other at what is none."""
+"""Garbage collection thresholds.  With Python's defaults of 700, 10, 10 a large team spends its time in collections
+that find nothing."""
 Verb = Callable[[Sequence[str], Environment], int]
 VERBS: Mapping[str, tuple[Verb, str]] = {
-    "run": (run, "play a scenario with whole nodes, to its verdict"),
-    "scale": (scale, "measure teams of many sizes, and draw the curves"),
+    "run": (run, "run a scenario with whole nodes, and print the verdict"),
+    "scale": (scale, "measure teams of many sizes, and plot the results"),
 }
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the verb that the command line names; returns its exit code."""
+    """Run the verb in ``arguments``; returns its exit code."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     verb = words[0] if words else ""
     if verb not in VERBS:
         lines = "".join(f"  {name:9}{about}\n" for name, (_, about) in VERBS.items())
-        usage = f"usage: sim VERB [options]\n\n{lines}\nsim VERB --help says more.\n"
+        example = "sim run --scenario steady --nodes 100 --seed 7"
+        usage = f"usage: sim VERB [options]\n\n{lines}\nexample:\n  {example}\n\nSee sim VERB --help.\n"
         if verb in ("", "--help", "-h"):
             sys.stdout.write(usage)
             return 0
-        sys.stderr.write(f"sim: no verb {verb!r}; there is {', '.join(VERBS)}; sim --help says more\n")
+        sys.stderr.write(f"sim: no verb {verb!r}; verbs: {', '.join(VERBS)}; see sim --help\n")
         return WRONG
     signals: list[int] = []
 
     def end(number: int, frame: FrameType | None) -> None:
-        """After the first signal a run ends in good order, after the second at once."""
+        """Let the run end with a report after the first signal, and immediately after the second."""
         if signals:
             raise KeyboardInterrupt
         signals.append(number)
@@ -55,23 +56,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
         read=lambda path: Path(path).read_text(encoding="ascii"),
         columns=shutil.get_terminal_size().columns if sys.stderr.isatty() else 0,
         is_stopped=lambda: bool(signals),
-        grown=_spare_the_collector,
+        grown=_reduce_garbage_collection,
     )
-    # Until somebody listens Twisted keeps what is logged, and so each life of each node that logged it.
+    # Without an observer Twisted buffers log events, which keep references to nodes that have ended.
     globalLogBeginner.beginLoggingTo([], discardBuffer=True, redirectStandardIO=False)
-    _spare_the_collector()
+    _reduce_garbage_collection()
     try:
         return VERBS[verb][0](words[1:], world)
     except SwarmError as error:
         sys.stderr.write(f"sim {verb}: {error}\n")
         return WRONG
     except KeyboardInterrupt:
-        sys.stderr.write(f"\nsim {verb}: ended, without a report\n")
+        sys.stderr.write(f"\nsim {verb}: interrupted, without a report\n")
         return 130
 
 
-def _spare_the_collector() -> None:
-    """Look for garbage rarely, and never at what is there now, for this process ends with it."""
+def _reduce_garbage_collection() -> None:
+    """Collect garbage rarely, and never among current objects, because this process ends with them."""
     gc.collect()
     gc.freeze()
     gc.set_threshold(*SPARING)

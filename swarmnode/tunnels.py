@@ -1,4 +1,4 @@
-"""Tunnels: what a node's settings and its environment say of them, wired around its UDP port."""
+"""Creation of a node's network with or without tunnels."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def with_tunnels(
     rng: random.Random,
     environment: Mapping[str, str],
 ) -> Callable[[], Network]:
-    """What makes the node's network; without tunnels it is ``udp`` alone."""
+    """Return the factory of the node's network; ``udp`` if there are no tunnels."""
     urls = settings.tunnel_urls
     if not (urls or settings.tunnel_port):
         return udp
@@ -43,14 +43,14 @@ def with_tunnels(
 
 
 def proxy_for(environment: Mapping[str, str], url: Url) -> Proxy | None:
-    """The HTTP proxy by which ``https_proxy`` and ``no_proxy`` send whoever goes to ``url``; None for none."""
-    said = environment.get("https_proxy") or environment.get("HTTPS_PROXY") or ""
-    spared = environment.get("no_proxy") or environment.get("NO_PROXY") or ""
-    for name in (word.strip().lstrip(".") for word in spared.split(",")):
+    """Return the HTTP proxy for ``url`` by ``https_proxy`` and ``no_proxy``; None if there is none."""
+    proxy = environment.get("https_proxy") or environment.get("HTTPS_PROXY") or ""
+    excluded = environment.get("no_proxy") or environment.get("NO_PROXY") or ""
+    for name in (word.strip().lstrip(".") for word in excluded.split(",")):
         if name and (name == "*" or url.host == name or url.host.endswith("." + name)):
             return None
     try:
-        return Proxy.of(said) if said and url.is_tls else None
+        return Proxy.of(proxy) if proxy and url.is_tls else None
     except ValueError as error:
-        _log.warn("https_proxy is not used: {error}", error=error)
+        _log.warn("https_proxy is ignored: {error}", error=error)
         return None

@@ -1,4 +1,4 @@
-"""Web: the role of a node that serves the page: its code to sign in with, and what it needs to be installed."""
+"""The web role of a node: its sign-in code and the import of the page."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from swarmnode.seams import Seams
 
 
 def with_code(settings: Settings, rng: random.Random) -> Settings:
-    """``settings`` with a code to sign in with: made once, as a node that falls off the network comes back with it."""
+    """Return ``settings`` with a sign-in code; drawn once, so the code stays the same when the node rejoins."""
     from webnode.password import draw_code
 
     web = settings.web
@@ -24,21 +24,21 @@ def with_code(settings: Settings, rng: random.Random) -> Settings:
 
 
 def web_page(settings: Settings, seams: Seams, reactor: Any, node: SwarmNode) -> IService:
-    """The page over the node's data store; raises ``MissingExtra``, or ``BadSetting`` where TLS cannot be had."""
+    """Return the page over the node's data store; raises ``MissingExtra``, or ``BadSetting`` if TLS is unavailable."""
     try:
         from swarmnode.page import page
     except ModuleNotFoundError as error:
         raise MissingExtra("the web role", "web") from error
-    return page(settings, seams, reactor, node, _doorway(settings) if settings.web.tls else None)
+    return page(settings, seams, reactor, node, _tls_factory(settings) if settings.web.tls else None)
 
 
-def _doorway(settings: Settings) -> Callable[..., Any]:
-    """What makes the page's port over TLS; raises ``BadSetting`` where its libraries are missing."""
+def _tls_factory(settings: Settings) -> Callable[..., Any]:
+    """Return the factory of the page's TLS port; raises ``BadSetting`` if its libraries are missing."""
     try:
         from webnode.tls import door
     except ModuleNotFoundError as error:
         library = (error.name or "").split(".")[0]
-        problem = f"is {settings.web.tls!r}, and the library {library} is not installed"
-        remedy = "install it by: pip install 'swarm-node[tls]', or leave tls out"
+        problem = f"is {settings.web.tls!r}, but the library {library} is not installed"
+        remedy = "install it by: pip install 'swarm-node[tls]', or remove tls"
         raise BadSetting(settings.origin, "[web] tls", problem, remedy) from error
     return door

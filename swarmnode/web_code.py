@@ -1,4 +1,4 @@
-"""Web code: ``swarm web``, where the pages of this machine's nodes are, and the code to sign in with."""
+"""``swarm web``: show the pages of the nodes on this machine, with their sign-in codes."""
 
 from __future__ import annotations
 
@@ -15,10 +15,14 @@ from swarmnode.invitation import Invitation, invitations
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command line."""
-    web = argparse.ArgumentParser(prog="swarm web", description="Where the page is, and the code to sign in with.")
-    web.add_argument("--node", metavar="NAME", help="of which node of this machine, where several have a page")
-    web.add_argument("--json", action="store_true", help="answer in JSON, one line a page")
+    """Return the parser of the command line."""
+    web = argparse.ArgumentParser(
+        prog="swarm web",
+        description="Show the address of the page of each node on this machine, and the code to sign in.",
+        epilog="Example: swarm web --node vaio",
+    )
+    web.add_argument("--node", metavar="NAME", help="show only the page of this node")
+    web.add_argument("--json", action="store_true", help="print JSON, one line per page")
     return web
 
 
@@ -27,28 +31,29 @@ def main(
     out: TextIO | None = None,
     known: Callable[[], list[Invitation]] = invitations,
 ) -> int:
-    """Run the command; returns 0, or 2 where there is no page."""
+    """Run the command; returns 0, or 2 if there is no page."""
     out = out or sys.stdout
-    wishes = parser().parse_args(words)
+    options = parser().parse_args(words)
     try:
         here = known()
     except NoControl as problem:
         sys.stderr.write(printable(f"swarm web: {problem}") + "\n")
         return 2
-    found = [each for each in here if wishes.node in (None, each.name)]
+    found = [each for each in here if options.node in (None, each.name)]
     if not found:
-        there = f"there are those of {', '.join(each.name for each in here)}" if here else "start a node with the role"
-        whose = "no node with a page" if wishes.node is None else f"no page of a node {wishes.node!r}"
+        names = ", ".join(each.name for each in here)
+        remedy = f"nodes with a page: {names}" if here else "start a node with the role web"
+        which = "no node" if options.node is None else f"no node {options.node!r}"
         sys.stderr.write(
-            printable(f"swarm web: {whose} runs on this machine; {there}; ")
+            printable(f"swarm web: {which} with a page runs on this machine; {remedy}; ")
             + "see docs/explanation/access-and-robot-safety.md\n"
         )
         return 2
     for each in found:
-        if wishes.json:
+        if options.json:
             out.write(json.dumps(asdict(each) | {"link": each.link}) + "\n")
         else:
-            code = f"code {each.code}, or open {each.link}" if each.code else "no sign-in; whoever opens it may do all"
+            code = f"code {each.code}, or open {each.link}" if each.code else "no sign-in: anyone may control the team"
             also = f" and {each.secure}" if each.secure else ""
             out.write(printable(f"{each.name}: {each.url}{also}  {code}") + "\n")
     return 0

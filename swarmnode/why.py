@@ -1,6 +1,6 @@
-"""Why: ``swarm why TASK``, the decisions of a task explained from the agents' signed verdicts.
+"""``swarm why TASK``: explain the assignments of a task from the agents' signed decision records.
 
-Whatever it tells it reads under three keys, through the control socket of a node of this machine.
+All data is read under three keys, through the control socket of a node on this machine.
 """
 
 from __future__ import annotations
@@ -25,21 +25,25 @@ LISTED = 5
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command line."""
-    why = argparse.ArgumentParser(prog="swarm why", description="Explain who was chosen for a task, and why.")
-    why.add_argument("task", metavar="TASK", help=f"the beginning of a task's id, or {LAST!r} for the newest")
-    why.add_argument("--node", metavar="NAME", help="which node of this machine, where several run")
-    why.add_argument("--json", action="store_true", help="answer in JSON, on one line")
+    """Return the parser of the command line."""
+    why = argparse.ArgumentParser(
+        prog="swarm why",
+        description="Explain the choice of a device for a task.",
+        epilog="Example: swarm why last",
+    )
+    why.add_argument("task", metavar="TASK", help=f"beginning of a task's id, or {LAST!r} for the newest task")
+    why.add_argument("--node", metavar="NAME", help="node on this machine, if several run")
+    why.add_argument("--json", action="store_true", help="print JSON, on one line")
     return why
 
 
 def main(words: Sequence[str] | None = None, out: TextIO | None = None, ask: Ask = asked) -> int:
-    """Run the command; returns 0, 1 where there is nothing to tell or the node refused, 2 where nobody can be asked."""
+    """Run the command; returns 0, 1 if there is no decision or the node refused, 2 if no node can be asked."""
     out = out or sys.stdout
-    wishes = parser().parse_args(words)
+    options = parser().parse_args(words)
     try:
-        asker = Asker(wishes.node, ask)
-        task = chosen(wishes.task, list(tasks_of(asker.records("tasks")).values()))
+        asker = Asker(options.node, ask)
+        task = chosen(options.task, list(tasks_of(asker.records("tasks")).values()))
         outcome = outcome_of(task, asker.records(f"task/{task.task_id}"))
         records = asker.records(verdicts_text(task.task_id))
     except (Refusal, NoControl) as problem:
@@ -47,31 +51,31 @@ def main(words: Sequence[str] | None = None, out: TextIO | None = None, ask: Ask
         return FAILED if isinstance(problem, Refusal) else WRONG
     verdicts = [verdict for each in records if (verdict := verdict_of(each)) is not None]
     explanation = explained(verdict for verdict in verdicts if verdict.task == task.task_id)
-    if wishes.json:
-        told = {"task": task.task_id, "title": task.title, "strategy": task.strategy}
+    if options.json:
+        head_fields = {"task": task.task_id, "title": task.title, "strategy": task.strategy}
         ended = None if outcome is None else {"outcome": outcome.outcome, "by": outcome.by, "took": outcome.took}
-        out.write(json.dumps({**told, "outcome": ended, "epochs": asdict(explanation)["epochs"]}) + "\n")
+        out.write(json.dumps({**head_fields, "outcome": ended, "epochs": asdict(explanation)["epochs"]}) + "\n")
         return 0 if explanation.epochs else FAILED
     ended_by = "" if outcome is None else f", {outcome.outcome.lower()} by {outcome.by}"
     head = printable(f"task {task.task_id}: {task.title}{ended_by}")
     out.write(f"{head}\n{as_text(explanation)}")
     if not explanation.epochs:
-        out.write("nobody has decided anything yet\n")
+        out.write("no decision yet\n")
     return 0 if explanation.epochs else FAILED
 
 
 def chosen(wanted: str, tasks: Sequence[Task]) -> Task:
-    """The task whose id begins with ``wanted``, or the newest for ``last``; raises ``Refusal`` with those near."""
+    """Return the task with the id prefix ``wanted``, or the newest for ``last``; raises ``Refusal`` with candidates."""
     newest = {task.task_id: task for task in tasks}
     known = sorted(tasks, key=lambda task: (-task.created, task.task_id))
     if not known:
         raise Refusal("the team has no task; assign one on the page of its web node")
     if wanted == LAST:
         return known[0]
-    meant = [task for task in known if task.task_id.startswith(wanted)] if wanted else []
-    if len(meant) == 1 or (wanted in newest):
-        return newest[wanted] if wanted in newest else meant[0]
-    near = ", ".join(task.task_id for task in (meant or known)[:LISTED])
-    if meant:
-        raise Refusal(f"{len(meant)} tasks begin with {wanted!r}: {near}; say more of the id")
+    matching = [task for task in known if task.task_id.startswith(wanted)] if wanted else []
+    if len(matching) == 1 or (wanted in newest):
+        return newest[wanted] if wanted in newest else matching[0]
+    near = ", ".join(task.task_id for task in (matching or known)[:LISTED])
+    if matching:
+        raise Refusal(f"{len(matching)} tasks begin with {wanted!r}: {near}; give more of the id")
     raise Refusal(f"no task begins with {wanted!r}; the newest are {near}")

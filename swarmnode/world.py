@@ -1,4 +1,4 @@
-"""World: the real clock, network, store and control socket, for nodes that run on this machine."""
+"""The real clock, network, store and control socket of nodes on this machine."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _log = Logger()
 
 
 def real_seams(settings: Settings, reactor: Any) -> Seams:
-    """The seams of a node that runs on this machine."""
+    """Return the dependencies of a node on this machine."""
     membership = None
     if settings.node.membership:
         from middleware.admission.membership import MembershipFile
@@ -65,7 +65,7 @@ def real_seams(settings: Settings, reactor: Any) -> Seams:
 
 
 def real_network(node: NodeSettings, reactor: Any, rng: random.Random) -> Callable[[], Network]:
-    """What makes the node's UDP port, and its tunnels where it has any."""
+    """Return the factory of the node's UDP port, with tunnels if it has any."""
     from middleware.entangled.network.udp import UdpNetwork
 
     return with_tunnels(node, partial(UdpNetwork, reactor, node.host, node.port), reactor, rng, os.environ)
@@ -75,7 +75,7 @@ LookUp = Callable[..., Sequence[tuple[Any, ...]]]
 
 
 def resolved(settings: Settings, look_up: LookUp = socket.getaddrinfo) -> Settings:
-    """``settings`` with an address in figures for every host name; raises ``BadSetting`` for a name that has none."""
+    """Replace each host name in ``settings`` by its address; raises ``BadSetting`` for an unknown name."""
     family = socket.AF_INET6 if ":" in settings.node.host else socket.AF_INET
     if settings.node.host == EVERYWHERE:
         family = socket.AF_UNSPEC
@@ -87,7 +87,7 @@ def resolved(settings: Settings, look_up: LookUp = socket.getaddrinfo) -> Settin
         except (OSError, UnicodeError, IndexError) as error:
             why = getattr(error, "strerror", None) or str(error)
             problem = f"no address is known for {address.host!r} ({why})"
-            raise BadSetting(settings.origin, key, problem, "mend the name, or write the address in figures") from error
+            raise BadSetting(settings.origin, key, problem, "fix the name, or write a numeric address") from error
 
     known = tuple(figures(address, "[node] known_nodes", family) for address in settings.node.known_nodes)
     yard = settings.web.yard
@@ -97,7 +97,7 @@ def resolved(settings: Settings, look_up: LookUp = socket.getaddrinfo) -> Settin
 
 
 def control_socket(settings: Settings, reactor: Any, node: SwarmNode) -> IService:
-    """The socket that ``swarm dht`` and its like speak to; where none can be made, the log says why."""
+    """Return the control socket for ``swarm dht`` and similar commands; if it cannot be opened, log the reason."""
     from middleware.entangled.control.place import NoControl, made
     from middleware.entangled.control.port import ControlPort
 

@@ -1,1 +1,1 @@
-"""Admission: who belongs to a closed team, how one comes into it, and how one is put out of it again."""
+"""Admission to closed teams: invitations, certificates, the membership list, renewal and revocation."""

@@ -1,18 +1,20 @@
-"""Certificate: what a member shows of itself when it opens a session (its *pass*), and what of it is believed.
+"""Certificates of members: formats, creation and verification.
 
-A pass is one msgpack array, of at most ``ROOM`` bytes: either the operator's grant, or a chain, which takes two to
-make: ``[1, invite, wish, proof, name, not before, not after, signature, grant]``.  The ``proof`` is the invitation's
-signature under the newcomer's key and the name that it wished for; the ``signature`` that of the bootstrap node which
-let it in, and whose own ``grant``, by the operator, has the role ``bootstrap``.  So a bootstrap node alone can admit
-nobody, and neither can a code that leaked.
+A node shows its certificate (its *pass*) in the handshake of a session.  A pass is one msgpack array of at most
+``ROOM`` bytes, in one of four formats:
 
-``[3, word, not before, not after, signature, grant]`` renews one of these two: ``word`` is what the operator said of
-the member, ``[grant]`` or ``[invite, wish, proof, name, admitter]``, and ``signature`` that of a bootstrap node, whose
-``grant`` follows.  Name and roles are those of ``word``, so a renewal changes nothing but the dates.  Only what the
-operator made for ``YEAR`` or longer is renewed, and only a bootstrap node of that kind renews.
-
-Another kind is that of a guest, such as a visitor's phone: ``[2, name, not before, not after, signature, gateway,
-pass]``.  A member with the role ``gateway`` vouches for it, for a day at most, and its guests are gone with it.
+* ``[0, grant]``: the operator's grant.
+* ``[1, invite, wish, proof, name, not before, not after, signature, grant]``: an admission by invitation.  ``proof`` is
+  the invitation's signature over the newcomer's key and the name that it asked for; ``signature`` is the bootstrap
+  node's, and ``grant`` is the operator's grant to that node with the role ``bootstrap``.  So neither a bootstrap node
+  alone nor the holder of a leaked code alone can admit a member.
+* ``[2, name, not before, not after, signature, gateway, pass]``: a guest, such as a visitor's phone.  A member with the
+  role ``gateway`` signs it, for a day at most; it becomes invalid when the gateway's own pass does.
+* ``[3, content, not before, not after, signature, grant]``: a renewal of format 0 or 1.  ``content`` has the fields
+  that the operator signed, ``[grant]`` or ``[invite, wish, proof, name, admitter]``; the bootstrap node adds its
+  ``signature`` and its ``grant``.  Name and roles follow from ``content``, so a renewal changes only the dates.  Only
+  certificates that the operator issued for ``YEAR`` or longer are renewed, and only by bootstrap nodes that have such
+  a certificate.
 """
 
 from __future__ import annotations
@@ -27,15 +29,15 @@ from middleware.entangled.errors import Forged, Malformed
 from middleware.entangled.identity import Identity, verified
 
 ROOM = 640
-"""Bytes that a pass may have."""
+"""Maximum size of a pass in bytes."""
 SKEW = 300
-"""Seconds by which two clocks of one team may differ."""
+"""Maximum clock difference within a team, in seconds."""
 BOOTSTRAP = "bootstrap"
 GATEWAY = "gateway"
 ADMISSION = 9
-"""The kind of an admission among the entries of the membership list, beside those of statements."""
+"""Entry kind of admissions on the membership list, next to the kinds of statements."""
 GUEST_LIFE = 86_400
-"""Seconds for which a gateway vouches for a guest at most."""
+"""Maximum validity of a guest pass, in seconds."""
 _GUEST = b"swarm-guest-1 "
 _JOIN = b"swarm-join-1 "
 _ADMIT = b"swarm-admit-1 "
@@ -44,14 +46,14 @@ _RENEW = b"swarm-renew-1 "
 
 @dataclass(frozen=True)
 class Member:
-    """What a pass says of who holds ``public``.
+    """A member as described by its pass; ``public`` is its key.
 
-    ``invitation`` is the public key of that by which it came, good for ``uses`` newcomers, ``admitter`` that of the
-    bootstrap node; both are empty where the operator named the member itself.  ``voucher`` is the member that vouches
-    for a guest.
+    ``invitation`` is the public key of the invitation by which the member joined, valid for ``uses`` newcomers, and
+    ``admitter`` is the public key of the bootstrap node; both are empty if the operator granted the certificate
+    directly.  ``voucher`` is the gateway that signed a guest's pass.
 
-    ``since`` and ``life`` are those of the operator's word: the moment from which it holds, and the seconds for which
-    the certificate was made.  ``renewer`` is the bootstrap node that renewed it; empty where none did.
+    ``since`` is the moment from which the operator-signed content is valid, and ``life`` the number of seconds for
+    which the certificate was issued.  ``renewer`` is the bootstrap node that renewed it, or empty.
     """
 
     public: bytes
@@ -69,14 +71,15 @@ class Member:
 
     @property
     def is_renewable(self) -> bool:
-        """Whether bootstrap nodes may renew it: guests and shorter certificates end."""
+        """Whether bootstrap nodes may renew the certificate; guest passes and shorter certificates expire."""
         return self.life >= YEAR and self.voucher is None
 
     @property
     def unrenewed(self) -> Member:
-        """The member by its certificate before any renewal.
+        """The member with the dates of its certificate before any renewal.
 
-        The renewal of a member that came by a code does not say when that certificate ended: it counts as over.
+        The renewal of a member that joined by a code does not contain the first end date: the certificate then counts
+        as expired.
         """
         if not self.renewer:
             return self
@@ -84,25 +87,25 @@ class Member:
         return replace(self, not_before=self.since, not_after=end, renewer=b"")
 
     def trouble(self, now: float) -> str:
-        """``early`` or ``expired``, or nothing where the pass is valid at that moment of the wall clock."""
+        """Return ``early`` or ``expired``, or an empty string if the pass is valid at ``now`` (wall clock)."""
         if now < self.not_before - SKEW:
             return "early"
         return "expired" if now >= self.not_after else ""
 
 
 def pass_of(grant: bytes) -> bytes:
-    """The pass of who got a grant of the operator's own."""
+    """Return the pass of a member with a certificate from the operator."""
     return bytes(msgpack.packb([0, grant]))
 
 
 def proof(invitation: Identity, public: bytes, wish: str) -> bytes:
-    """The signature by which whoever has the code brings in the key ``public``."""
-    return invitation.sign(_wished(public, wish))
+    """Sign the newcomer's key ``public`` and the name that it asks for with the invitation's key."""
+    return invitation.sign(_join_content(public, wish))
 
 
 def is_proof(invitation: bytes, public: bytes, wish: str, signature: bytes) -> bool:
-    """Whether the holder of an invitation's key brings in ``public``."""
-    return verified(invitation, _wished(public, wish), signature)
+    """Return whether the invitation's key signed ``public`` and ``wish``."""
+    return verified(invitation, _join_content(public, wish), signature)
 
 
 def chained(
@@ -113,26 +116,29 @@ def chained(
     name: str,
     now: int,
 ) -> bytes:
-    """The pass that a bootstrap node makes: ``invite`` as packed and as read, ``newcomer`` its key, wish and proof."""
+    """Return the pass that a bootstrap node issues.
+
+    ``invite`` is the invitation, packed and parsed; ``newcomer`` is its key, wish and proof.
+    """
     packed, terms = invite
     public, wish, signature = newcomer
     end = now + terms.life
-    admission = bootstrap.sign(_admitted(terms.public, public, name, now, end))
+    admission = bootstrap.sign(_admission_content(terms.public, public, name, now, end))
     return bytes(msgpack.packb([1, packed, wish, signature, name, now, end, admission, grant]))
 
 
 def renewed(bootstrap: Identity, grant: bytes, member: Member, shown: bytes, now: int) -> bytes:
-    """Renew the pass ``shown`` of ``member``, which it says, from ``now`` on for as long as the operator made it.
+    """Renew the pass ``shown`` of ``member`` from ``now`` on, with its original validity.
 
-    ``grant`` is that of ``bootstrap``.  Raises ``Malformed`` for the pass of a guest.
+    ``grant`` is the grant of ``bootstrap``.  Raises ``Malformed`` for the pass of a guest.
     """
-    word, end = _word_of(member, shown), now + member.life
-    signature = bootstrap.sign(_renewed(member.public, word, now, end))
-    return bytes(msgpack.packb([3, word, now, end, signature, grant]))
+    content, end = _extract_signed_content(member, shown), now + member.life
+    signature = bootstrap.sign(_renewal_content(member.public, content, now, end))
+    return bytes(msgpack.packb([3, content, now, end, signature, grant]))
 
 
-def _word_of(member: Member, shown: bytes) -> list[Any]:
-    """The operator's word in a pass that says ``member``."""
+def _extract_signed_content(member: Member, shown: bytes) -> list[Any]:
+    """Return the operator-signed content of the pass of ``member``."""
     kind, *rest = unpacked(shown)
     if kind == 0:
         return [rest[0]]
@@ -141,17 +147,17 @@ def _word_of(member: Member, shown: bytes) -> list[Any]:
         return [invite, wish, signature, name, member.admitter]
     if kind == 3:
         return list(rest[0])
-    raise Malformed("the pass of a guest is not renewed")
+    raise Malformed("the pass of a guest cannot be renewed")
 
 
 def grant_of(operator: bytes, shown: bytes) -> tuple[Grant, bytes] | None:
-    """Return the operator's grant that a renewed pass has in it, and it as packed; None where it came by a code."""
-    word = unpacked(shown)[1]
-    return (_grant(operator, word[0]), word[0]) if len(word) == 1 else None
+    """Return the operator's grant in a renewed pass, parsed and packed; None if the member joined by a code."""
+    content = unpacked(shown)[1]
+    return (_parse_grant(operator, content[0]), content[0]) if len(content) == 1 else None
 
 
 def entries_of(public: bytes, shown: bytes) -> list[bytes]:
-    """Return the entries of the membership list that a good pass of ``public`` has in it; none for that of a guest."""
+    """Return the entries for the membership list that a valid pass of ``public`` contains; none for a guest."""
     kind, *rest = unpacked(shown)
     if kind == 0:
         return [bytes(rest[0])]
@@ -160,144 +166,148 @@ def entries_of(public: bytes, shown: bytes) -> list[bytes]:
 
 
 def guest_pass(gateway: Identity, own: bytes, public: bytes, name: str, now: int, life: int = GUEST_LIFE) -> bytes:
-    """The pass of a guest, made by the ``gateway`` whose ``own`` pass that is.
+    """Return a guest pass signed by ``gateway``, with the gateway's own pass ``own``.
 
-    Raises ``Malformed`` where that one is too long to stand in another: its operator has to grant it one (swarm
-    promote).
+    Raises ``Malformed`` if ``own`` is too long to be embedded; the operator then has to issue a grant (swarm promote).
     """
     end = now + min(life, GUEST_LIFE)
-    signature = gateway.sign(_vouched(public, name, now, end))
+    signature = gateway.sign(_guest_content(public, name, now, end))
     shown = bytes(msgpack.packb([2, name, now, end, signature, gateway.public, own]))
     if len(shown) > ROOM:
-        raise Malformed("the pass of this gateway is too long to vouch for others; have the operator grant it one")
+        raise Malformed("the pass of this gateway is too long to embed in a guest's pass; run swarm promote for it")
     return shown
 
 
 def member_of(operator: bytes, public: bytes, shown: bytes) -> Member:
-    """What the pass says of ``public``, if it goes back to that operator; raises ``Malformed`` or ``Forged``.
+    """Verify a pass of ``public`` against the ``operator``'s key; raises ``Malformed`` or ``Forged``.
 
-    Whether it is the time for it, and whether anything of it was revoked, is for the caller to look after.
+    The caller checks dates and revocations.
     """
     if len(shown) > ROOM:
-        raise Malformed("a pass that is too long")
+        raise Malformed(f"the pass has {len(shown)} bytes, more than {ROOM}")
     fields = unpacked(shown)
     try:
         kind, *rest = fields
         if kind == 0:
-            [whole] = rest
-            return member_by(_own_grant(operator, public, whole))
+            [packed_grant] = rest
+            return member_by(_parse_own_grant(operator, public, packed_grant))
         if kind == 1:
-            return _chain(operator, public, rest)
+            return _verify_chain(operator, public, rest)
         if kind == 2:
-            return _guest(operator, public, rest)
+            return _verify_guest(operator, public, rest)
         if kind == 3:
-            return _renewal(operator, public, rest)
+            return _verify_renewal(operator, public, rest)
     except (ValueError, TypeError) as error:
-        raise Malformed("a pass with other fields than it should have") from error
-    raise Malformed("a pass of no known kind")
+        raise Malformed("the pass has invalid fields") from error
+    raise Malformed("the pass is of an unknown kind")
 
 
 def member_by(grant: Grant) -> Member:
-    """The member that the operator's ``grant`` makes."""
+    """Return the member described by the operator's ``grant``."""
     begin, end = grant.not_before, grant.not_after
     return Member(grant.public, grant.name, grant.roles, begin, end, since=begin, life=grant.life)
 
 
-def _renewal(operator: bytes, public: bytes, fields: list[Any]) -> Member:
-    word, begin, end, signature, whole = fields
-    if not isinstance(word, list):
-        raise Malformed("a renewal without the operator's word")
-    member = member_by(_own_grant(operator, public, word[0])) if len(word) == 1 else _invited(operator, public, word)
+def _verify_renewal(operator: bytes, public: bytes, fields: list[Any]) -> Member:
+    content, begin, end, signature, packed_grant = fields
+    if not isinstance(content, list):
+        raise Malformed("the renewal has no operator-signed content")
+    member = (
+        member_by(_parse_own_grant(operator, public, content[0]))
+        if len(content) == 1
+        else _verify_invited(operator, public, content)
+    )
     if not member.is_renewable:
-        raise Forged("a certificate that the operator did not make to be renewed")
-    grant = _grant(operator, whole)
+        raise Forged("the operator did not issue this certificate as renewable")
+    grant = _parse_grant(operator, packed_grant)
     if BOOTSTRAP not in grant.roles or grant.life < YEAR:
-        raise Forged("a renewal by a node that may not renew")
+        raise Forged("the renewal is signed by a node that may not renew")
     moment(begin, max(0, max(member.since, grant.not_before) - SKEW))
     moment(end, begin + 1, begin + member.life)
-    if not verified(grant.public, _renewed(public, word, begin, end), sized(signature, 64)):
-        raise Forged("a renewal that no bootstrap node signed")
+    if not verified(grant.public, _renewal_content(public, content, begin, end), sized(signature, 64)):
+        raise Forged("the renewal's signature is not valid")
     return replace(member, not_before=begin, not_after=end, renewer=grant.public)
 
 
-def _invited(operator: bytes, public: bytes, word: list[Any]) -> Member:
-    """The member that came by a code, with no dates; the name has to be one that the invitation and the wish allow."""
-    packed, wish, signature, name, admitter = word
-    invite = _invitation(operator, public, packed, wish, signature)
+def _verify_invited(operator: bytes, public: bytes, content: list[Any]) -> Member:
+    """Return the member that joined by a code, without dates; checks that invitation and wish allow the name."""
+    packed, wish, signature, name, admitter = content
+    invite = _verify_invitation(operator, public, packed, wish, signature)
     if not invite.allows(named(name), wish):
-        raise Forged("a name that the invitation does not give")
+        raise Forged("the invitation does not allow this name")
     since = max(0, invite.not_before - SKEW)
     origin = invite.public, sized(admitter, 32)
     return Member(public, name, invite.roles, 0, 0, *origin, uses=invite.uses, since=since, life=invite.life)
 
 
-def _invitation(operator: bytes, public: bytes, packed: Any, wish: Any, signature: Any) -> Invite:
-    """The invitation whose holder brings in the key ``public`` under the name ``wish``."""
+def _verify_invitation(operator: bytes, public: bytes, packed: Any, wish: Any, signature: Any) -> Invite:
+    """Verify that the invitation's key signed ``public`` and ``wish``, and return the invitation."""
     invite = opened(operator, packed)
     if not isinstance(invite, Invite):
-        raise Malformed("a chain begins with an invitation")
+        raise Malformed("the pass does not begin with an invitation")
     if wish != "":
         named(wish)
     if not is_proof(invite.public, public, wish, sized(signature, 64)):
-        raise Forged("the invitation does not stand for this key")
+        raise Forged("the invitation's signature does not cover this key")
     return invite
 
 
-def _chain(operator: bytes, public: bytes, fields: list[Any]) -> Member:
-    packed, wish, signature, name, begin, end, admission, whole = fields
-    invite = _invitation(operator, public, packed, wish, signature)
+def _verify_chain(operator: bytes, public: bytes, fields: list[Any]) -> Member:
+    packed, wish, signature, name, begin, end, admission, packed_grant = fields
+    invite = _verify_invitation(operator, public, packed, wish, signature)
     moment(begin, max(0, invite.not_before - SKEW), invite.not_after)
     moment(end, begin + 1, begin + invite.life)
-    grant = _grant(operator, whole)
-    # A bootstrap node that is renewed outlives its grant, which goes on to say what it may do until it is revoked.
+    grant = _parse_grant(operator, packed_grant)
+    # A renewed bootstrap node outlives its grant; the grant stays valid for its roles until it is revoked.
     is_over = begin >= grant.not_after and grant.life < YEAR
     if BOOTSTRAP not in grant.roles or begin < grant.not_before - SKEW or is_over:
-        raise Forged("who let this key in was no bootstrap node then")
-    if not verified(grant.public, _admitted(invite.public, public, named(name), begin, end), sized(admission, 64)):
-        raise Forged("no bootstrap node let this key in")
+        raise Forged("the node that admitted this key was not a bootstrap node at that time")
+    content = _admission_content(invite.public, public, named(name), begin, end)
+    if not verified(grant.public, content, sized(admission, 64)):
+        raise Forged("the bootstrap node's signature is not valid")
     origin = invite.public, grant.public
     return Member(public, name, invite.roles, begin, end, *origin, uses=invite.uses, since=begin, life=invite.life)
 
 
-def _guest(operator: bytes, public: bytes, fields: list[Any]) -> Member:
+def _verify_guest(operator: bytes, public: bytes, fields: list[Any]) -> Member:
     name, begin, end, signature, gateway, own = fields
     if not isinstance(own, bytes):
-        raise Malformed("a guest wants somebody's pass")
+        raise Malformed("the guest's pass does not contain a gateway's pass")
     voucher = member_of(operator, sized(gateway, 32), own)
     moment(begin)
     moment(end, begin + 1, begin + GUEST_LIFE)
     if voucher.voucher is not None:
-        raise Forged("a guest vouches for nobody")
-    if not verified(voucher.public, _vouched(public, named(name), begin, end), sized(signature, 64)):
-        raise Forged("nobody vouches for this key")
+        raise Forged("a guest cannot vouch for another guest")
+    if not verified(voucher.public, _guest_content(public, named(name), begin, end), sized(signature, 64)):
+        raise Forged("the gateway's signature is not valid")
     return Member(public, name, ("device",), begin, end, voucher=voucher)
 
 
-def _vouched(public: bytes, name: str, begin: int, end: int) -> bytes:
+def _guest_content(public: bytes, name: str, begin: int, end: int) -> bytes:
     return _GUEST + bytes(msgpack.packb([public, name, begin, end]))
 
 
-def _grant(operator: bytes, whole: Any) -> Grant:
-    grant = opened(operator, whole)
+def _parse_grant(operator: bytes, packed_grant: Any) -> Grant:
+    grant = opened(operator, packed_grant)
     if not isinstance(grant, Grant):
-        raise Malformed("a pass wants a grant")
+        raise Malformed("the pass does not contain a grant")
     return grant
 
 
-def _own_grant(operator: bytes, public: bytes, whole: Any) -> Grant:
-    grant = _grant(operator, whole)
+def _parse_own_grant(operator: bytes, public: bytes, packed_grant: Any) -> Grant:
+    grant = _parse_grant(operator, packed_grant)
     if grant.public != public:
-        raise Forged("a grant of somebody else")
+        raise Forged("the grant is for another key")
     return grant
 
 
-def _wished(public: bytes, wish: str) -> bytes:
+def _join_content(public: bytes, wish: str) -> bytes:
     return _JOIN + public + wish.encode()
 
 
-def _admitted(invitation: bytes, public: bytes, name: str, begin: int, end: int) -> bytes:
+def _admission_content(invitation: bytes, public: bytes, name: str, begin: int, end: int) -> bytes:
     return _ADMIT + bytes(msgpack.packb([invitation, public, name, begin, end]))
 
 
-def _renewed(public: bytes, word: list[Any], begin: int, end: int) -> bytes:
-    return _RENEW + bytes(msgpack.packb([public, word, begin, end]))
+def _renewal_content(public: bytes, content: list[Any], begin: int, end: int) -> bytes:
+    return _RENEW + bytes(msgpack.packb([public, content, begin, end]))

@@ -1,6 +1,6 @@
-"""Doorkeeper: the door of a closed team: who shows a pass of this team, and is not revoked, is let in.
+"""Admission check of a closed team: verify passes against the membership list.
 
-What each role may do stands in ``roles``.
+The module ``roles`` defines the permissions of each role.
 """
 
 from __future__ import annotations
@@ -22,30 +22,30 @@ from middleware.entangled.wire.door import FOREIGN, NONCE, REVOKED, UNLISTED, Au
 MAX_MET = 4096
 MAX_PASSES = 1024
 MAX_VOUCHED = 64
-"""Guests of one gateway that a node lets in at a time."""
+"""Maximum number of guests of one gateway that a node accepts at a time."""
 JUDGED_S = 1.0
-"""Seconds for which the authority of an owner is remembered, unless the roll changes before."""
+"""Seconds for which an owner's authority is cached, unless the membership list changes."""
 LIVED = "admission/life"
-"""The note of the number of the node's last life."""
+"""Name of the stored note with the number of the node's last life."""
 
 
 def begun(store: Store, wall: float, rng: random.Random) -> Life:
-    """The life that begins now, noted in ``store``, where its number is higher than that of the last one."""
+    """Start a new life with a higher number than the last one, and store the number in ``store``."""
     try:
         last = int(store.noted(LIVED) or b"0")
-    except ValueError:  # a rotten file may hold anything
+    except ValueError:  # damaged file
         last = 0
-    # In milliseconds: a guest may go and come again within a second, and keeps nothing meanwhile.
+    # In milliseconds: a guest can leave and return within a second, and stores nothing in between.
     number = next_life(max(0, last), wall * 1000.0)
     store.note(LIVED, b"%d" % number)
     return Life(number, rng.randbytes(NONCE))
 
 
 class Doorkeeper:
-    """Judges passes by the roll; a ``Door``.
+    """Verify passes against the membership list ``roll``; implements ``Door``.
 
-    ``membership`` is what this node has of its own; passes that were found good are remembered by their digest, so that
-    each costs its signatures once.
+    ``membership`` returns this node's own membership.  Verified passes are cached by digest, so each pass costs its
+    signature checks once.
     """
 
     room = ROOM
@@ -60,35 +60,35 @@ class Doorkeeper:
         self.list_entry: Callable[[bytes], object] = lambda packed: roll.add(packed, wall())
         self._passes: OrderedDict[bytes, Member] = OrderedDict()
         self._met: OrderedDict[bytes, Member] = OrderedDict()
-        self._shown: dict[bytes, bytes] = {}  # the passes of those of ``_met`` that are not on the roll
+        self._shown: dict[bytes, bytes] = {}  # passes of members in ``_met`` that are not on the list
         self._authorities: dict[bytes, Authority] = {}
-        self._judged_at = (b"", 0.0)
+        self._cached_at = (b"", 0.0)
 
     @property
     def me(self) -> Member:
-        """What this node is in its team."""
+        """This node as a member of its team."""
         return self._roll.known_as(self._me, self._wall())
 
     @property
     def shown(self) -> bytes:
-        """The operator's last word about this node, or the pass that it got when it was let in, as it was renewed."""
+        """The pass to show: the operator's latest grant, or the pass issued at admission, with its latest renewal."""
         return self._roll.best_pass(self._me, self._membership().shown, self._wall())
 
     def judge(self, public: bytes, shown: bytes) -> str:
-        """The name of the refusal of a node with this key that shows this pass; empty where it is let in."""
+        """Return the refusal for a node with key ``public`` and pass ``shown``; empty if it is accepted."""
         try:
-            member = self._read(public, shown)
+            member = self._verify_pass(public, shown)
         except RemoteError:
             return FOREIGN
         now = self._wall()
-        return self._roll.refusal(self._roll.known_as(member, now), now) or self._count_guest(member)
+        return self._roll.refusal(self._roll.known_as(member, now), now) or self._check_guest_quota(member)
 
     def admit(self, public: bytes, shown: bytes) -> str:
-        """Judge a node that has confirmed its session, and remember it where it is let in."""
+        """Judge a node that has confirmed its session, and remember it if it is accepted."""
         refusal = self.judge(public, shown)
         if not refusal:
-            member = self._read(public, shown)
-            refusal = self._list(public, shown, member)
+            member = self._verify_pass(public, shown)
+            refusal = self._add_to_list(public, shown, member)
         if not refusal:
             self._met[public] = member
             self._met.move_to_end(public)
@@ -100,19 +100,19 @@ class Doorkeeper:
         return refusal
 
     def may(self, public: bytes, method: str) -> bool:
-        """Whether ``public`` is the key of a present member that may call ``method``."""
+        """Return whether ``public`` is the key of a current member that may call ``method``."""
         authority = self.authority(public)
         return not authority.refusal and roles.may_call(authority.roles, method)
 
     def roles_of(self, public: bytes) -> frozenset[str]:
-        """Return the roles that the holder of that key has now, none for a stranger or a revoked or expired member."""
+        """Return the current roles of a key; none for strangers and for revoked or expired members."""
         return frozenset(self.authority(public).roles)
 
-    def _list(self, public: bytes, shown: bytes, member: Member) -> str:
-        """Have a member on the membership list, so that all know it and the operator can revoke it by name.
+    def _add_to_list(self, public: bytes, shown: bytes, member: Member) -> str:
+        """Add a member to the membership list, so that all nodes know it and the operator can revoke it by name.
 
-        Returns the refusal of one for whom the list has no room: who is not on it is no member.  A guest is not listed;
-        its voucher is.  A renewal that the list does not have is listed, too.
+        Returns a refusal if the list is full, because only listed keys are members.  Guests are not listed; their
+        gateway is.  Unknown renewals are listed, too.
         """
         entries = entries_of(public, shown) if member.voucher is None else []
         is_off_roll = self.is_off_roll(public)
@@ -125,8 +125,8 @@ class Doorkeeper:
                 return UNLISTED if is_off_roll else ""
         return ""
 
-    def _count_guest(self, member: Member) -> str:
-        """Return a refusal where the voucher of a guest vouches for too many others at present."""
+    def _check_guest_quota(self, member: Member) -> str:
+        """Return a refusal if the guest's gateway already has the maximum number of other guests here."""
         if member.voucher is None:
             return ""
         now, voucher = self._wall(), member.voucher.public
@@ -140,30 +140,30 @@ class Doorkeeper:
         return "" if others < MAX_VOUCHED else UNLISTED
 
     def may_store(self, slot: Slot) -> bool:
-        """Whether the certificate of the owner of ``slot``, as it is at present, allows it to write there."""
+        """Return whether the current certificate of the owner of ``slot`` permits writing there."""
         authority = self.authority(slot.owner)
         return not authority.refusal and roles.may_store(authority.roles, slot, authority.name)
 
     def may_stay(self, slot: Slot) -> bool:
-        """Whether what is held in ``slot`` may be held on and shown."""
+        """Return whether a stored record in ``slot`` may be kept and returned to readers."""
         return self.may_store(slot) or (self.authority(slot.owner).refusal != FOREIGN and roles.lasts(slot))
 
     def authority(self, owner: bytes) -> Authority:
-        """Whether the certificate of an owner of records holds at present, its roles and its name."""
+        """Return whether the certificate of an owner of records is valid now, with its roles and name."""
         now = self._wall()
-        digest, at = self._judged_at
+        digest, at = self._cached_at
         if digest != self._roll.digest or not 0.0 <= now - at < JUDGED_S:
             self._authorities.clear()
-            self._judged_at = (self._roll.digest, now)
+            self._cached_at = (self._roll.digest, now)
         found = self._authorities.get(owner)
         if found is None:
-            found = self._authorities[owner] = self._judged(owner, now)
+            found = self._authorities[owner] = self._compute_authority(owner, now)
             if len(self._authorities) > MAX_MET:
                 del self._authorities[next(iter(self._authorities))]
         return found
 
     def certificate(self, owner: bytes) -> bytes:
-        """The operator's last word about an owner, or the pass that it showed; empty where neither is known."""
+        """Return an owner's pass: the operator's latest grant, or the pass it showed; empty if neither is known."""
         if owner == self._me.public:
             return self.shown
         now, grant, admission = self._wall(), self._roll.granted(owner), self._roll.admitted(owner)
@@ -175,23 +175,23 @@ class Doorkeeper:
         return self._shown.get(owner, b"") if renewal is None else renewal.shown
 
     def is_off_roll(self, public: bytes) -> bool:
-        """Whether the roll says nothing of the holder of ``public``: a guest, or a member of which it has yet to."""
+        """Return whether the membership list has no entry for ``public``: a guest, or a member not listed yet."""
         known = self._roll.granted(public), self._roll.admitted(public), self._roll.renewal(public)
         return known == (None, None, None)
 
     def learn(self, owner: bytes, certificate: bytes) -> bool:
-        """Take in the pass of an owner that another node showed; whether it holds."""
+        """Accept an owner's pass that another node relayed; returns whether it is valid."""
         return not self.admit(owner, certificate)
 
     def member(self, public: bytes) -> Member | None:
-        """What is known of the holder of ``public``, met or only heard of."""
+        """Return the known member with key ``public``, from a session or from the membership list."""
         if public == self._me.public:
             return self.me
         met, now = self._met.get(public), self._wall()
         return self._roll.member(public, now) if met is None else self._roll.known_as(met, now)
 
     def swept(self) -> list[tuple[bytes, str]]:
-        """Those that were met and are members no more, each with the name of the refusal; each is told once."""
+        """Return and forget the nodes met that are no longer members, each with its refusal."""
         now = self._wall()
         gone = [
             (public, refusal)
@@ -203,7 +203,7 @@ class Doorkeeper:
             self._shown.pop(public, None)
         return gone
 
-    def _judged(self, owner: bytes, now: float) -> Authority:
+    def _compute_authority(self, owner: bytes, now: float) -> Authority:
         if self._roll.revoked(owner) is not None:
             return Authority(REVOKED)
         member = self.member(owner)
@@ -212,7 +212,7 @@ class Doorkeeper:
         refusal = self._roll.refusal(member, now)
         return Authority(refusal) if refusal else Authority("", member.roles, member.name)
 
-    def _read(self, public: bytes, shown: bytes) -> Member:
+    def _verify_pass(self, public: bytes, shown: bytes) -> Member:
         key = hashlib.blake2s(public + shown, digest_size=16).digest()
         member = self._passes.get(key)
         if member is None:

@@ -1,13 +1,13 @@
-"""Every exception of admission beside those of the library below; ``str()`` is one line that a person can act upon.
+"""Exceptions of admission; ``str()`` is one line with the cause and the remedy.
 
 ::
 
     EntangledError
       LocalError
-        BadCode       read the code again, or ask for another one
-        BadKeyFile    mend the file, its mode or its place
+        BadCode       check the code, or ask for another one
+        BadKeyFile    fix the file, its mode or its path
       Refused
-        NotWelcome    ask the team's operator; ``code`` says why
+        NotWelcome    ask the team's operator; ``code`` is the reason
 """
 
 from __future__ import annotations
@@ -16,30 +16,30 @@ from middleware.entangled.errors import LocalError, Refused
 
 _ASK = "ask the operator for another one (swarm invite)"
 WHY = {
-    "unknown": f"nobody there knows this code: it is of another team, was withdrawn, or ran out long ago; {_ASK}",
+    "unknown": f"the team does not know this code: it is of another team, was withdrawn, or expired long ago; {_ASK}",
     "used": f"this code was used as often as it may be; {_ASK}",
-    "expired": f"this code has run out; {_ASK}, and look whether this machine's clock is right",
-    "early": "this code is not valid yet; look whether the clocks of both machines are right",
+    "expired": f"this code has expired; {_ASK}, and check the clock of this machine",
+    "early": "this code is not valid yet; check the clocks of both machines",
     "revoked": f"this code was revoked; {_ASK}",
     "name": "another member has this name; choose another one (swarm join CODE --name NAME)",
-    "later": "too few of the team can be reached to say whether this code was used; try again when more are there",
-    "role": "the node asked lets nobody in; name a bootstrap node, or make it one (swarm promote NAME)",
+    "later": "the bootstrap node reaches too few members to check this code; try again when more are online",
+    "role": "that node does not admit newcomers; name a bootstrap node, or make it one (swarm promote NAME)",
     "old": f"this code was made by an older version of the software; {_ASK}",
-    "foreign": "the answer comes from another team than the code; read it again, or ask the operator",
+    "foreign": "the reply comes from another team than the code; check the code, or ask the operator",
 }
-"""What each refusal of a newcomer means, and what to do."""
+"""Meaning and remedy of each refusal of a newcomer."""
 
 
 class BadCode(LocalError):
-    """A code of an invitation that cannot be one: what is wrong, and where."""
+    """The text is not a valid join code."""
 
 
 class BadKeyFile(LocalError):
-    """A file with secrets that cannot be used as it is; the message says why and what to do."""
+    """A file with secrets cannot be used; the message says why and what to do."""
 
 
 class NotWelcome(Refused):
-    """A team does not let this newcomer in; ``code`` is a key of ``WHY``."""
+    """The team rejects this newcomer; ``code`` is a key of ``WHY``."""
 
     code = "unknown"
 

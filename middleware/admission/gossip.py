@@ -1,7 +1,7 @@
-"""Gossip: how what one member knows of its team comes to all others: told on at once, and compared now and then.
+"""Gossip of the membership list: epidemic push of new entries, and periodic anti-entropy.
 
-Who learns something new tells it to a few others at random, who do the same (an epidemic); and every few seconds each
-member compares its roll with that of one other, so that whoever was cut off, asleep or missed by chance catches up.
+A node that learns a new entry sends it to a few random members, which do the same.  Every few seconds each member
+compares its list with another member's, so members that were partitioned, asleep or missed by the push catch up.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from middleware.entangled.errors import EntangledError, Full, RemoteError
 from middleware.entangled.wire.endpoint import Endpoint
 
 SPREAD = 8
-"""Members that one tells of what is new to it.  More reaches all in fewer steps; fewer costs less."""
+"""Number of members that a node sends a new entry to.  More means fewer hops and more traffic."""
 COMPARED = 5.0
-"""Seconds between two comparisons.  Less catches up sooner after a cut."""
+"""Seconds between two comparisons.  Less catches up sooner after a partition."""
 NEWS = 8
-"""Entries that are told on at once."""
+"""Maximum number of entries that are pushed at once."""
 PAGE = 32
 PAGE_BYTES = 65_536 + 16_384
 
 
 class Gossip:
-    """The roll of one node, kept the same as those of the others.
+    """Keep the membership list of one node in sync with the other members.
 
-    ``on_new`` is called with each entry that is new here, from wherever it came; ``wall`` is the wall clock.
+    ``on_new`` is called with each entry that is new to this node; ``wall`` is the wall clock in seconds.
     """
 
     _log = Logger()
@@ -60,25 +60,25 @@ class Gossip:
         endpoint.expose("roll.fetch", self._answer_fetch)
 
     def start(self) -> None:
-        """Begin to compare."""
+        """Start the periodic comparison."""
         self._chores.every(COMPARED, self._compare_with_one)
 
     def add(self, packed: bytes) -> Entry | None:
-        """Take in what is known here first, and tell it on; raises as ``Roll.add`` does."""
+        """Add an entry that originates at this node, and push it; raises as ``Roll.add`` does."""
         entry = self._roll.add(packed, self._wall())
         if entry is not None:
             self._on_new(entry)
-            self._spread([packed], ())
+            self._push([packed], ())
         return entry
 
     def met(self, contact: Contact) -> None:
-        """Compare with who is new or back."""
+        """Compare lists with a contact that is new or has returned."""
         self._chores.fork(self._compare(contact))
 
-    # -- inside -----------------------------------------------------------------------------------------------------
+    # -- implementation ---------------------------------------------------------------------------------------------
 
-    def _taken(self, entries: Iterable[object], but: tuple[bytes, ...]) -> None:
-        """Take in what another member knows; what is new goes on to others, ``but`` not to those."""
+    def _add_received(self, entries: Iterable[object], but: tuple[bytes, ...]) -> None:
+        """Add entries from another member, and push new ones to members except ``but``."""
         fresh: list[bytes] = []
         try:
             for packed in entries:
@@ -87,21 +87,21 @@ class Gossip:
                     fresh.append(packed)
                     self._on_new(entry)
         except RemoteError as error:
-            self._log.warn("a member tells what is none of this team's: {error}", error=error)
+            self._log.warn("a member sent an entry that is not valid in this team: {error}", error=error)
         except Full as error:
             if not self._is_full:
                 self._log.warn("{error}", error=error)
             self._is_full = True
         finally:
-            # Many at once are new to a newcomer alone; where they are not, the others find out when they compare.
+            # Many new entries at once occur at a newcomer only; otherwise the others catch up by comparison.
             if len(fresh) <= NEWS:
-                self._spread(fresh, but)
+                self._push(fresh, but)
 
-    def _spread(self, packed: list[bytes], but: tuple[bytes, ...]) -> None:
+    def _push(self, packed: list[bytes], but: tuple[bytes, ...]) -> None:
         others = [contact for contact in self._contacts() if contact.public not in but]
-        for page in _pages(packed):
+        for page in _split_pages(packed):
             for contact in self._rng.sample(others, min(SPREAD, len(others))):
-                self._endpoint.ask(contact, "roll.tell", page, changes=True).addErrback(self._untold)
+                self._endpoint.ask(contact, "roll.tell", page, changes=True).addErrback(self._log_unexpected)
 
     def _compare_with_one(self) -> None:
         self._roll.expire(self._wall())
@@ -118,30 +118,30 @@ class Gossip:
         wanted = sorted(theirs - mine)
         while wanted:
             found = await self._endpoint.ask(contact, "roll.fetch", wanted[:PAGE])
-            come = {digest_of(each) for each in found if isinstance(each, bytes)} if isinstance(found, list) else set()
-            if not come.intersection(wanted):
+            received = {digest_of(e) for e in found if isinstance(e, bytes)} if isinstance(found, list) else set()
+            if not received.intersection(wanted):
                 break
-            self._taken(found, (contact.public,))
-            wanted = [each for each in wanted if each not in come]
-        for page in _pages(self._roll.packed(sorted(mine - theirs))):
+            self._add_received(found, (contact.public,))
+            wanted = [each for each in wanted if each not in received]
+        for page in _split_pages(self._roll.packed(sorted(mine - theirs))):
             await self._endpoint.ask(contact, "roll.tell", page, changes=True)
 
     def _answer_tell(self, peer: Contact, entries: list[object]) -> None:
-        self._taken(entries[: PAGE * 2], (peer.public,))
+        self._add_received(entries[: PAGE * 2], (peer.public,))
 
     def _answer_compare(self, peer: Contact, digest: bytes) -> list[bytes] | None:
         self._roll.expire(self._wall())
         return None if digest == self._roll.digest else self._roll.digests
 
     def _answer_fetch(self, peer: Contact, wanted: list[object]) -> list[bytes]:
-        return next(_pages(self._roll.packed(each for each in wanted[:PAGE] if isinstance(each, bytes))), [])
+        return next(_split_pages(self._roll.packed(each for each in wanted[:PAGE] if isinstance(each, bytes))), [])
 
-    def _untold(self, failure: Failure) -> None:
+    def _log_unexpected(self, failure: Failure) -> None:
         if failure.check(EntangledError) is None:
-            self._log.failure("while telling the team who belongs to it", failure)
+            self._log.failure("while sending entries of the membership list", failure)
 
 
-def _pages(packed: Iterable[bytes]) -> Iterator[list[bytes]]:
+def _split_pages(packed: Iterable[bytes]) -> Iterator[list[bytes]]:
     page: list[bytes] = []
     size = 0
     for each in packed:

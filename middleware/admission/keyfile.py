@@ -1,4 +1,4 @@
-"""Keyfile: a small file with secrets, for the eyes of its owner alone, and replaced whole or not at all."""
+"""Files with secrets: readable by their owner only, and replaced atomically."""
 
 from __future__ import annotations
 
@@ -17,43 +17,43 @@ MAX_FILE = 2**20
 
 
 def read(path: Path) -> dict[str, Any]:
-    """The mapping that the file at ``path`` holds; raises ``BadKeyFile``, also where others can read it."""
+    """Return the mapping in the file at ``path``; raises ``BadKeyFile``, also if other users can read it."""
     content = read_bytes(path)
     try:
         found = json.loads(content)
     except (ValueError, RecursionError):
         found = None
     if not isinstance(found, dict) or len(content) > MAX_FILE:
-        raise BadKeyFile(f"{path} is not what it should be; take it from a backup, or have it made again")
+        raise BadKeyFile(f"{path} is damaged; restore it from a backup, or have it created again")
     return found
 
 
 def read_bytes(path: Path) -> bytes:
-    """The bytes of the file at ``path``, at most one more than ``MAX_FILE``; raises ``BadKeyFile`` as ``read`` does."""
+    """Return the content of ``path``, at most ``MAX_FILE`` + 1 bytes; raises ``BadKeyFile`` as ``read`` does."""
     try:
         with open(path, "rb") as file:
             state = os.fstat(file.fileno())
             if not stat.S_ISREG(state.st_mode):
-                raise BadKeyFile(f"{path} is no file; name the file itself")
+                raise BadKeyFile(f"{path} is not a regular file; name the file itself")
             if state.st_mode & 0o077:
                 mode = stat.S_IMODE(state.st_mode)
                 raise BadKeyFile(
-                    f"{path} holds secrets and can be read or changed by others (mode {mode:04o}); "
-                    f"say chmod 600 {path}, and have the key replaced if somebody may have read it"
+                    f"{path} holds secrets, and other users can read or change it (mode {mode:04o}); "
+                    f"run chmod 600 {path}, and replace the key if another user may have read it"
                 )
             return file.read(MAX_FILE + 1)
     except OSError as error:
-        raise BadKeyFile(f"{path} cannot be read: {error.strerror or error}; name the right file") from error
+        raise BadKeyFile(f"{path} cannot be read: {error.strerror or error}; check the path") from error
 
 
 def write(path: Path, content: Mapping[str, Any], is_new: bool = False) -> None:
-    """Put ``content`` in the place of the file at ``path``, or make it where ``is_new``; raises ``BadKeyFile``.
+    """Replace the file at ``path`` with ``content``, or create it if ``is_new``; raises ``BadKeyFile``.
 
-    Whoever reads meanwhile, or after a loss of power, finds the old content or the new one whole.
+    A concurrent reader, and a reader after a power failure, finds either the old or the new content.
     """
     fresh = path.with_name(f".{path.name}.{os.getpid()}")
     if is_new and path.exists():
-        raise BadKeyFile(f"{path} is there already; remove it first if nobody needs it any more, or name another file")
+        raise BadKeyFile(f"{path} is there already; remove it if it is no longer needed, or name another file")
     try:
         with suppress(FileNotFoundError):
             fresh.unlink()

@@ -1,7 +1,7 @@
-"""Membership: what a member of a closed team keeps in a file of its own: who it is, and what lets it in.
+"""Membership file of a member of a closed team: identity, certificate and team secrets.
 
-The file is a secret: whoever has it is this member.  It is refused where others can read it, and replaced whole when
-the team's secret is rotated or the operator grants something else.
+The file is a secret: a holder of it can act as this member.  It is refused if other users can read it, and replaced
+when the team's secret is rotated or the operator issues another grant.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ MAX_KNOWN = 64
 
 @dataclass(frozen=True)
 class Membership:
-    """One member's place in its team.
+    """One member's keys and secrets.
 
-    ``operator`` is the public key of who signs for the team; ``secrets`` are the team's, the newest first: a
-    number, the secret, and the moment of the wall clock until which those before it are accepted; ``known`` are nodes
-    to enter through, and ``settings`` what the team wants of each node.
+    ``operator`` is the operator's public key.  ``secrets`` are the team's secrets, newest first, each as a number, the
+    secret, and the wall clock time until which the secrets before it are accepted.  ``known`` are addresses of
+    bootstrap nodes, and ``settings`` the settings that the team gives to each node.
     """
 
     team: str
@@ -48,19 +48,19 @@ class Membership:
 
     @property
     def member(self) -> Member:
-        """What the pass says; raises ``BadKeyFile`` where it is none of this team."""
+        """The member described by the pass; raises ``BadKeyFile`` if the pass is not of this team."""
         try:
             return member_of(self.operator, self.identity.public, self.shown)
         except RemoteError as error:
-            raise BadKeyFile(f"the certificate in the membership is none of this team: {error}; join again") from error
+            raise BadKeyFile(f"the certificate in the membership is not of this team: {error}; join again") from error
 
     def with_secret(self, number: int, secret: bytes, until: int) -> Membership:
-        """This membership with one more secret; those before it are accepted until ``until``."""
+        """Return this membership with one more secret; the secrets before it are accepted until ``until``."""
         secrets = [each for each in self.secrets if each[0] != number] + [(number, secret, until)]
         return replace(self, secrets=tuple(sorted(secrets, key=lambda each: -each[0])[:MAX_SECRETS]))
 
     def accepted(self, now: float) -> list[tuple[int, bytes, int]]:
-        """The secrets that hold at a moment of the wall clock, the newest first; that one holds always."""
+        """Return the secrets accepted at ``now`` (wall clock), newest first; the newest is always accepted."""
         found: list[tuple[int, bytes, int]] = []
         for each in self.secrets:
             if all(now < until for _, _, until in found):
@@ -68,7 +68,7 @@ class Membership:
         return found
 
     def packed(self) -> dict[str, Any]:
-        """As it stands in the file."""
+        """Return the content of the file."""
         return {
             "kind": KIND,
             "team": self.team,
@@ -82,7 +82,7 @@ class Membership:
 
 
 def unpacked(found: Mapping[str, Any]) -> Membership:
-    """The membership that a file holds; raises ``BadKeyFile``."""
+    """Parse the content of a membership file; raises ``BadKeyFile``."""
     try:
         if found["kind"] != KIND:
             raise ValueError("another kind of file")
@@ -99,14 +99,14 @@ def unpacked(found: Mapping[str, Any]) -> Membership:
             named(found["team"]), seed, operator, shown, tuple(secrets), tuple(known), dict(found["settings"])
         )
     except (KeyError, ValueError, TypeError, RemoteError) as error:
-        raise BadKeyFile(f"this is no membership of a team ({error}); join again, or take it from a backup") from error
-    # Whether it is one of that team is found out now and not at the first handshake.
+        raise BadKeyFile(f"not a valid membership ({error}); join again, or restore it from a backup") from error
+    # Verify the certificate now and not at the first handshake.
     assert membership.member
     return membership
 
 
 class MembershipFile:
-    """The file of one member, as it was read; ``keep`` replaces it."""
+    """The membership file of one member; ``keep`` replaces it."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -117,25 +117,25 @@ class MembershipFile:
             raise error if str(path) in text else BadKeyFile(f"{path}: {text}") from error
 
     def keep(self, membership: Membership) -> None:
-        """Put ``membership`` in the file's place; raises ``BadKeyFile``."""
+        """Write ``membership`` to the file; raises ``BadKeyFile``."""
         if membership != self.membership:
             keyfile.write(self.path, membership.packed())
             self.membership = membership
 
 
 class MemoryMembership:
-    """The same without a file, for nodes that are gone when their process ends."""
+    """A membership in memory, for nodes that are discarded when their process ends."""
 
     def __init__(self, membership: Membership) -> None:
         self.membership = membership
 
     def keep(self, membership: Membership) -> None:
-        """Remember ``membership``."""
+        """Store ``membership``."""
         self.membership = membership
 
 
 def made(path: Path, membership: Membership) -> None:
-    """Make the file of a new member; raises ``BadKeyFile``, also where there is one already."""
+    """Create the file of a new member; raises ``BadKeyFile``, also if it exists."""
     keyfile.write(path, membership.packed(), is_new=True)
 
 

@@ -1,6 +1,6 @@
-"""Newcomer: the other side of admission: knocks at bootstrap nodes, one after the other, until one answers.
+"""Client side of admission: send join requests to bootstrap nodes, one after the other, until one replies.
 
-It needs nothing but a code, and an address or two; what it is given becomes the membership that it keeps.
+It needs a code and one or more addresses, and returns a ``Membership``.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from middleware.entangled.network.network import Address, Network
 PATIENCE = 20.0
 """Seconds until a newcomer gives up."""
 FIRST, GROWTH, TRIES = 0.25, 1.6, 4
-"""Seconds until a knock is repeated, how much longer the next one waits, and how often one door is tried in a row."""
+"""Seconds until a request is repeated, growth factor of that delay, and requests per address in a row."""
 FINAL = ("used", "expired", "early", "revoked", "name", "foreign")
-"""Refusals that no other bootstrap node would take back."""
+"""Refusals that are the same at every bootstrap node."""
 MAX_DOORS = 64
 
 
 class Newcomer:
-    """Who has a code and wants in; ``seed`` is its lasting identity, ``wish`` what it would like to be called.
+    """Join a team with a code; ``seed`` is the newcomer's lasting identity, ``wish`` the name that it asks for.
 
-    ``network`` is its own for as long as it knocks, and closed afterwards.
+    The newcomer owns ``network`` while it joins, and closes it afterwards.
     """
 
     def __init__(
@@ -54,8 +54,8 @@ class Newcomer:
         self._clock = clock
         self._ephemeral = rng.randbytes(32)
         shared = bindings.crypto_scalarmult_base(self._ephemeral)
-        self._knock = knock.knock(self._key, self._public, shared, wish, rng)
-        self._doors: list[Address] = []
+        self._request = knock.knock(self._key, self._public, shared, wish, rng)
+        self._addresses: list[Address] = []
         self._place = self._tries = 0
         self._wait = FIRST
         self._hint = ""
@@ -64,58 +64,59 @@ class Newcomer:
         self._done: Deferred[Membership] | None = None
 
     def join(self, doors: Iterable[Address], timeout: float = PATIENCE) -> Deferred[Membership]:
-        """Knock at ``doors`` until one opens.
+        """Send requests to the addresses ``doors`` until a bootstrap node admits the newcomer.
 
-        Fails with ``NotWelcome``, or with ``NoAnswer`` where nobody answered in time; raises ``PortInUse``.
+        Fails with ``NotWelcome``, or with ``NoAnswer`` if there is no reply within ``timeout`` seconds; raises
+        ``PortInUse``.
         """
-        self._done = Deferred(self._cancelled)
-        self._network.listen(self._received)
-        self._end = self._clock.callLater(timeout, self._late)
+        self._done = Deferred(self._on_cancel)
+        self._network.listen(self._on_datagram)
+        self._end = self._clock.callLater(timeout, self._on_timeout)
         for door in doors:
             self.add(door)
         return self._done
 
     def add(self, door: Address) -> None:
-        """One more address to knock at, found meanwhile."""
-        if door not in self._doors and len(self._doors) < MAX_DOORS:
-            self._doors.append(door)
+        """Add an address, such as one discovered on the local network."""
+        if door not in self._addresses and len(self._addresses) < MAX_DOORS:
+            self._addresses.append(door)
             if self._call is None and self._done is not None:
-                self._knock_again()
+                self._send_request()
 
-    def _knock_again(self) -> None:
-        self._network.send(self._knock, self._doors[self._place % len(self._doors)])
+    def _send_request(self) -> None:
+        self._network.send(self._request, self._addresses[self._place % len(self._addresses)])
         self._tries += 1
         wait, self._wait = self._wait, self._wait * GROWTH
         if self._tries >= TRIES:
-            self._next_door()
-        self._call = self._clock.callLater(wait, self._knock_again)
+            self._select_next_address()
+        self._call = self._clock.callLater(wait, self._send_request)
 
-    def _next_door(self) -> None:
+    def _select_next_address(self) -> None:
         self._place, self._tries, self._wait = self._place + 1, 0, FIRST
 
-    def _received(self, datagram: bytes, source: Address) -> None:
-        if self._done is None or datagram[:1] != bytes([knock.WELCOME]) or source not in self._doors:
+    def _on_datagram(self, datagram: bytes, source: Address) -> None:
+        if self._done is None or datagram[:1] != bytes([knock.WELCOME]) or source not in self._addresses:
             return
         try:
             reply = knock.opened_welcome(datagram, self._code, self._public, self._ephemeral)
         except RemoteError:
-            return  # a member that is no bootstrap node may have made it: the right answer may still come
+            return  # a member that is not a bootstrap node can have sent it; the valid reply can still arrive
         if isinstance(reply, Hint):
-            self._put_off(reply.code, source)
+            self._try_next(reply.code, source)
         elif isinstance(reply.said, Welcome):
-            self._welcomed(reply.terms, reply.said, source)
+            self._accept_reply(reply.terms, reply.said, source)
         elif reply.said in FINAL:
-            self._failed(NotWelcome(reply.said))
+            self._fail(NotWelcome(reply.said))
         else:
-            self._put_off(reply.said, source)
+            self._try_next(reply.said, source)
 
-    def _put_off(self, code: str, source: Address) -> None:
-        """Ask another node: that one may open, or the same one a moment later."""
+    def _try_next(self, code: str, source: Address) -> None:
+        """Try the next address: that node may admit the newcomer, or the same node may later."""
         self._hint = code
-        if source == self._doors[self._place % len(self._doors)]:
-            self._next_door()
+        if source == self._addresses[self._place % len(self._addresses)]:
+            self._select_next_address()
 
-    def _welcomed(self, terms: TermsContent, said: Welcome, source: Address) -> None:
+    def _accept_reply(self, terms: TermsContent, said: Welcome, source: Address) -> None:
         try:
             member = member_of(terms.operator, self._public, said.shown)
         except RemoteError:
@@ -127,27 +128,27 @@ class Newcomer:
         membership = Membership(
             terms.team, self._seed, terms.operator, said.shown, secrets, tuple(known), dict(terms.settings)
         )
-        done = self._over()
+        done = self._finish()
         if done is not None:
             done.callback(membership)
 
-    def _late(self) -> None:
+    def _on_timeout(self) -> None:
         if self._hint:
-            self._failed(NotWelcome(self._hint))
+            self._fail(NotWelcome(self._hint))
             return
-        where = ", ".join(map(str, self._doors)) or "nobody was found to ask"
+        addresses = ", ".join(map(str, self._addresses)) or "no bootstrap node found"
         remedy = "name the address of a bootstrap node that runs (swarm join CODE --at HOST:PORT)"
-        self._failed(NoAnswer(f"nobody opens ({where}); {remedy}, and look whether UDP gets through"))
+        self._fail(NoAnswer(f"no reply to the join request ({addresses}); {remedy}, and check that UDP is not blocked"))
 
-    def _failed(self, error: Exception) -> None:
-        done = self._over()
+    def _fail(self, error: Exception) -> None:
+        done = self._finish()
         if done is not None:
             done.errback(error)
 
-    def _cancelled(self, _: object) -> None:
-        self._over()
+    def _on_cancel(self, _: object) -> None:
+        self._finish()
 
-    def _over(self) -> Deferred[Membership] | None:
+    def _finish(self) -> Deferred[Membership] | None:
         done, self._done = self._done, None
         for call in (self._call, self._end):
             if call is not None and call.active():

@@ -1,6 +1,6 @@
-"""Operator: who signs for a team, with a key that lies in a file outside the nodes.
+"""Operator of a team: sign grants, invitations, revocations and secrets with a key kept in a file outside the nodes.
 
-Whoever has the file is the operator; who has lost it cannot invite or revoke any more, so keep a copy of it.
+A holder of the file is the operator.  Without it a team cannot invite or revoke, so keep a copy.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ from middleware.entangled.identity import Identity
 KIND = "swarm-node operator 1"
 FIRST_SECRET = 1
 FIRST = ("device", "operator", "gateway", "bootstrap")
-"""What the first node of a team may do: everything."""
+"""Roles of the first node of a team: all."""
 
 
 class Invitation(NamedTuple):
-    """A code, and the two statements that make it good: the ``terms`` have to be known before the ``invite``."""
+    """A code and the two statements that activate it; publish ``terms`` before ``invite``."""
 
     code: code.Code
     invite: bytes
@@ -51,9 +51,9 @@ class Invitation(NamedTuple):
 
 @dataclass(frozen=True)
 class Operator:
-    """The operator of the team that people call ``team``; all moments are seconds of the wall clock.
+    """The operator of the team named ``team``; all times are seconds of the wall clock.
 
-    ``settings`` are those that newcomers get.
+    ``settings`` are the settings that newcomers receive.
     """
 
     team: str
@@ -62,16 +62,16 @@ class Operator:
 
     @property
     def identity(self) -> Identity:
-        """The key pair that signs."""
+        """The key pair that signs statements."""
         return Identity(self.seed)
 
     @property
     def public(self) -> bytes:
-        """The team's name for programs."""
+        """The operator's public key, which identifies the team."""
         return self.identity.public
 
     def grant(self, public: bytes, name: str, roles: Sequence[str], now: float, life: float = YEAR) -> bytes:
-        """The certificate of the holder of ``public``, for ``life`` seconds."""
+        """Sign a certificate for ``public``, valid for ``life`` seconds."""
         return signed(self.identity, Grant(public, name, tuple(roles), int(now), int(now + life)))
 
     def invite(
@@ -84,9 +84,9 @@ class Operator:
         rng: random.Random,
         life: float = YEAR,
     ) -> Invitation:
-        """Make a code that lets in ``uses`` newcomers within ``expires`` seconds, each for ``life`` seconds.
+        """Create a code that admits ``uses`` newcomers within ``expires`` seconds, each for ``life`` seconds.
 
-        Raises ``ValueError`` for what no invitation can have.
+        Raises ``ValueError`` for values that an invitation cannot have.
         """
         drawn = code.drawn(self.public, rng)
         end = int(now + expires)
@@ -103,11 +103,11 @@ class Operator:
         kept: Iterable[bytes] = (),
         renewals: Iterable[tuple[bytes, int]] = (),
     ) -> bytes:
-        """Sign the end of a member's key or of an invitation's.
+        """Revoke the key of a member or of an invitation.
 
-        ``kept`` are the public keys of the members that a bootstrap node admitted and that stay; the others go with it.
-        ``renewals`` are those of its renewals that go on to count, as the renewed key and its end.  Raises
-        ``ValueError`` where there are too many.
+        ``kept`` are the public keys of members admitted by a revoked bootstrap node that stay members; the others are
+        revoked with it.  ``renewals`` are its renewals that stay valid, as pairs of key and end.  Raises
+        ``ValueError`` if there are too many.
         """
         ids = (*(member_id(each) for each in kept), *(renewal_id(*each) for each in renewals))
         if len(ids) > MAX_KEPT:
@@ -115,14 +115,14 @@ class Operator:
         return signed(self.identity, Revoke(public, name, int(now), int(now) + MAX_LIFE, ids))
 
     def rotate(self, number: int, members: Iterable[bytes], now: float, grace: float, rng: random.Random) -> bytes:
-        """A new secret of the team, for those ``members``; the one before it is accepted for ``grace`` seconds."""
+        """Draw a new team secret for ``members``; the previous one is accepted for ``grace`` seconds."""
         secret = sealed_secret(rng.randbytes(SECRET_BYTES), number, members, int(now), int(grace), rng)
         return signed(self.identity, secret)
 
     def founded(
         self, name: str, roles: Sequence[str], now: float, rng: random.Random, secret: bytes | None = None
     ) -> Membership:
-        """The membership of a team's first node, or with the team's ``secret`` of any that needs no code."""
+        """Return a membership without a code: for the first node, or with the team's ``secret`` for another one."""
         seed = rng.randbytes(32)
         grant = self.grant(Identity(seed).public, name, roles, now)
         first = rng.randbytes(SECRET_BYTES) if secret is None else secret
@@ -130,7 +130,7 @@ class Operator:
 
 
 def drawn(team: str, rng: random.Random) -> Operator:
-    """The operator of a new team; raises ``BadKeyFile`` for a name that a team cannot have."""
+    """Create the operator of a new team; raises ``BadKeyFile`` if ``team`` is not a valid name."""
     try:
         return Operator(named(team), rng.randbytes(32))
     except RemoteError as error:
@@ -138,20 +138,20 @@ def drawn(team: str, rng: random.Random) -> Operator:
 
 
 def load(path: Path) -> Operator:
-    """The operator whose key the file at ``path`` holds; raises ``BadKeyFile``."""
+    """Load the operator's key from ``path``; raises ``BadKeyFile``."""
     found: dict[str, Any] = keyfile.read(path)
     try:
         if found["kind"] != KIND:
             raise ValueError("another kind of file")
         settings = found.get("settings", {})
         if not isinstance(settings, dict):
-            raise ValueError("settings that are no mapping")
+            raise ValueError("the settings are not a mapping")
         return Operator(named(found["team"]), sized(bytes.fromhex(found["seed"]), 32), settings)
     except (KeyError, ValueError, TypeError, RemoteError) as error:
-        raise BadKeyFile(f"{path} is no operator's key ({error}); name the file that swarm init made") from error
+        raise BadKeyFile(f"{path} is not an operator's key ({error}); name the file that swarm init made") from error
 
 
 def made(path: Path, operator: Operator) -> None:
-    """Make the file of a new operator; raises ``BadKeyFile``, also where there is one already."""
+    """Create the file of a new operator; raises ``BadKeyFile``, also if it exists."""
     content = {"kind": KIND, "team": operator.team, "seed": operator.seed.hex(), "settings": dict(operator.settings)}
     keyfile.write(path, content, is_new=True)

@@ -1,7 +1,7 @@
-"""Reception: the bootstrap node's side of admission: who knocks with a good code is let in (thesis, Figure 4.5).
+"""Server side of admission: a bootstrap node verifies join requests and admits newcomers (thesis, Figure 4.5).
 
-A knock that names no invitation of this team costs a look into a table, one that does not open one hash; only then is
-anything remembered, and the wire gets at most one answer to each, no longer than the knock.
+A request that names an unknown invitation costs one table lookup, and one that does not decrypt costs one hash.  State
+is kept only after that, and each request gets at most one reply, never longer than the request.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ from middleware.entangled.token_bucket import TokenBucket
 from middleware.entangled.wire.door import Noted
 
 RATE = 50.0
-"""Knocks a second whose signature is checked; these are 1 % of a core."""
+"""Join requests per second with a signature check; these take 1 % of a core."""
 HINTS = 20.0
-"""Knocks a second that name nothing known and are told so."""
+"""Hints per second to join requests with an unknown invitation id."""
 MAX_ANSWERS = 256
 
 
 class Reception:
-    """Lets newcomers in, for a node that may.
+    """Admit newcomers at a bootstrap node.
 
-    ``identity`` signs for the node, ``take`` uses an invitation once, ``admit`` tells the team of an admission,
-    ``given`` is what a newcomer with that pass is given, and ``send`` carries the answer.  ``now`` is the clock that
-    rates are measured by, ``wall`` that of statements.  ``refused`` is called when a newcomer is not let in, with its
-    key (empty: nobody knows its code) and the code of ``WHY``.
+    ``identity`` is the node's key pair.  ``take`` uses up one use of an invitation, ``admit`` publishes an admission,
+    ``given`` returns the reply content for a pass, and ``send`` sends a datagram.  ``now`` is the monotonic clock for
+    rate limits, ``wall`` the wall clock for statements.  ``refused`` is called for each rejected newcomer with its key
+    (empty if the code is unknown), its address and the code of ``WHY``.
     """
 
     _log = Logger()
@@ -63,20 +63,20 @@ class Reception:
         self._identity = identity
         self._take = take
         self._admit = admit
-        self._given = given
+        self._build_welcome = given
         self._send = send
         self._now = now
         self._wall = wall
         self._rng = rng
         self._answers: OrderedDict[bytes, bytes] = OrderedDict()
         self._under_way: dict[bytes, str] = {}
-        self._refused = refused
-        self._said = Noted()
-        self._opening = TokenBucket(RATE)
-        self._hinting = TokenBucket(HINTS)
+        self._on_refused = refused
+        self._logged = Noted()
+        self._request_rate = TokenBucket(RATE)
+        self._hint_rate = TokenBucket(HINTS)
 
     def on_knock(self, datagram: bytes, source: Address) -> None:
-        """Answer a KNOCK; nothing that it holds raises."""
+        """Handle a KNOCK; never raises because of its content."""
         digest = hashlib.blake2s(datagram, digest_size=16).digest()
         answer = self._answers.get(digest)
         if answer is not None:
@@ -86,36 +86,36 @@ class Reception:
             name = knock.id_of(datagram)
             known = self._roll.invited(name)
             if known is None:
-                if self._hinting.take(self._now()):
-                    self._say(name, "unknown", source)
+                if self._hint_rate.take(self._now()):
+                    self._log_refusal(name, "unknown", source)
                     self._send(knock.hint(name), source)
                 return
             invite, packed = known
-            heard = knock.opened_knock(datagram, invite.public)
-            # After that, or whoever has seen the id on its way could use up what is meant for those with the code.
-            if not self._opening.take(self._now()):
+            request = knock.opened_knock(datagram, invite.public)
+            # Checked after decryption: a node that only saw the id must not use up the rate of code holders.
+            if not self._request_rate.take(self._now()):
                 return
-            if not is_proof(invite.public, heard.public, heard.wish, heard.proof):
+            if not is_proof(invite.public, request.public, request.wish, request.proof):
                 return
         except RemoteError:
             return
-        if heard.public in self._under_way:
-            return  # it will ask again
-        self._under_way[heard.public] = ""
-        decided = Deferred.fromCoroutine(self._decide(heard, invite, packed))
-        decided.addBoth(self._decided, heard, invite, digest, source).addErrback(self._failed)
+        if request.public in self._under_way:
+            return  # the newcomer retransmits
+        self._under_way[request.public] = ""
+        decided = Deferred.fromCoroutine(self._decide_request(request, invite, packed))
+        decided.addBoth(self._reply, request, invite, digest, source).addErrback(self._log_unexpected)
 
-    async def _decide(self, heard: Knock, invite: Invite, packed: bytes) -> bytes | str:
-        """The pass of who knocked, or the code of the refusal."""
+    async def _decide_request(self, request: Knock, invite: Invite, packed: bytes) -> bytes | str:
+        """Return the pass of the newcomer, or the code of the refusal."""
         now = int(self._wall())
         me, own = self._roll.granted(self._identity.public), self._roll.member(self._identity.public, now)
         if me is None or own is None or BOOTSTRAP not in me[0].roles or self._roll.refusal(own, now):
             return "role"
         if self._roll.terms_of(invite.public) is None:
             return "old"
-        if self._roll.revoked(invite.public) is not None or self._roll.revoked(heard.public) is not None:
+        if self._roll.revoked(invite.public) is not None or self._roll.revoked(request.public) is not None:
             return "revoked"
-        before = self._roll.admitted(heard.public)
+        before = self._roll.admitted(request.public)
         if before is not None and before.member.invitation == invite.public:
             return before.shown
         if now < invite.not_before - SKEW:
@@ -124,75 +124,75 @@ class Reception:
             return "expired"
         if sum(each.member.invitation == invite.public for each in self._roll.admissions()) >= invite.uses:
             return "used"
-        name = self._named(heard, invite)
+        name = self._choose_name(request, invite)
         if name is None:
             return "name"
-        self._under_way[heard.public] = name
+        self._under_way[request.public] = name
         try:
             if not await self._take(invite):
                 return "used"
         except EntangledError:
             return "later"
-        came = (heard.public, heard.wish, heard.proof)
+        newcomer = (request.public, request.wish, request.proof)
         begin = max(now, invite.not_before)
-        shown = chained(self._identity, me[1], (packed, invite), came, name, begin)
-        self._admit(packed_admission(heard.public, shown))
+        shown = chained(self._identity, me[1], (packed, invite), newcomer, name, begin)
+        self._admit(packed_admission(request.public, shown))
         return shown
 
-    def _named(self, heard: Knock, invite: Invite) -> str | None:
-        """What the newcomer is to be called; None where another member is called so already."""
-        taken = {member.name for member in self._roll.members(self._wall()) if member.public != heard.public}
+    def _choose_name(self, request: Knock, invite: Invite) -> str | None:
+        """Choose the newcomer's name; None if another member has it already."""
+        taken = {member.name for member in self._roll.members(self._wall()) if member.public != request.public}
         taken.update(self._under_way.values())
         if invite.uses == 1:
             return invite.name if invite.name not in taken else None
-        if heard.wish:
-            return heard.wish if heard.wish not in taken else None
+        if request.wish:
+            return request.wish if request.wish not in taken else None
         free = (f"{invite.name[:NUMBERED]}-{number}" for number in range(1, len(taken) + 2))
         return next((name for name in free if name not in taken), None)
 
-    def _decided(
-        self, result: bytes | str | Failure, heard: Knock, invite: Invite, digest: bytes, source: Address
+    def _reply(
+        self, result: bytes | str | Failure, request: Knock, invite: Invite, digest: bytes, source: Address
     ) -> Any:
-        del self._under_way[heard.public]
+        del self._under_way[request.public]
         if isinstance(result, Failure):
             result.trap(EntangledError)
-            self._log.warn("a newcomer cannot be let in: {problem}", problem=result.getErrorMessage())
+            self._log.warn("cannot admit a newcomer: {problem}", problem=result.getErrorMessage())
             result = "later"
-        signer = self._signer(invite)
+        signer = self._make_signer(invite)
         if isinstance(result, bytes) and signer is not None:
-            answer = knock.welcome(invite.public, heard, self._given(result), signer, self._rng)
-            self._log.info("let in by the invitation of {name}: {public}", name=invite.name, public=heard.public.hex())
+            answer = knock.welcome(invite.public, request, self._build_welcome(result), signer, self._rng)
+            self._log.info(
+                "admitted by the invitation of {name}: {public}", name=invite.name, public=request.public.hex()
+            )
         else:
             code = result if isinstance(result, str) else "role"
-            self._say(heard.public, code, source, invite.name)
+            self._log_refusal(request.public, code, source, invite.name)
             if signer is None:
                 answer = knock.hint(invitation_id(invite.public), code)
             else:
-                answer = knock.refusal(invite.public, heard, code, signer, self._rng)
-        if result not in ("later", "role", "name", "old"):  # these may be otherwise in a moment
+                answer = knock.refusal(invite.public, request, code, signer, self._rng)
+        if result not in ("later", "role", "name", "old"):  # these can change at any time
             self._answers[digest] = answer
             if len(self._answers) > MAX_ANSWERS:
                 self._answers.popitem(last=False)
         self._send(answer, source)
         return None
 
-    def _signer(self, invite: Invite) -> Signer | None:
-        """Return what this node signs an answer with; None where it is no bootstrap node or has not got the terms."""
+    def _make_signer(self, invite: Invite) -> Signer | None:
+        """Return the signer of a reply; None if this node is not a bootstrap node or lacks the terms."""
         me, terms = self._roll.granted(self._identity.public), self._roll.terms_of(invite.public)
         if me is None or BOOTSTRAP not in me[0].roles or terms is None:
             return None
         return Signer(self._identity, me[1], terms)
 
-    def _failed(self, failure: Failure) -> None:
-        if failure.check(RemoteError) is None:  # an ephemeral key that is none is the newcomer's own fault
-            self._log.failure("while letting a newcomer in", failure)
+    def _log_unexpected(self, failure: Failure) -> None:
+        if failure.check(RemoteError) is None:  # an invalid ephemeral key is the newcomer's error
+            self._log.failure("while admitting a newcomer", failure)
 
-    def _say(self, who: bytes, code: str, source: Address, name: str = "") -> None:
-        """Once for each newcomer and reason, and not for each datagram; who makes up ids cannot fill the log."""
-        self._refused(b"" if code == "unknown" else who, source, code)
-        if not self._said.is_new(self._now(), who, code):
+    def _log_refusal(self, who: bytes, code: str, source: Address, name: str = "") -> None:
+        """Log a refusal once per newcomer and reason; a rate limit protects the log from invented ids."""
+        self._on_refused(b"" if code == "unknown" else who, source, code)
+        if not self._logged.is_new(self._now(), who, code):
             return
-        whose = f" by the invitation of {name}" if name else ""
-        self._log.warn(
-            "not let in{whose}, from {source}: {code}: {why}", whose=whose, source=source, code=code, why=WHY[code]
-        )
+        via = f" by the invitation of {name}" if name else ""
+        self._log.warn("rejected{via}, from {source}: {code}: {why}", via=via, source=source, code=code, why=WHY[code])

@@ -1,8 +1,8 @@
-"""Renewal: a bootstrap node renews the certificates of the members in sight, so that a team goes on unattended.
+"""Renewal of certificates: bootstrap nodes renew present members, so a team keeps running without its operator.
 
-Members ask for nothing.  Each bootstrap node looks over the membership list every few minutes; it signs a new end for
-members that are present, that the operator did not revoke, whose certificate is renewable, and of whose life a third is
-left.  The renewal goes to all by gossip.  Bootstrap nodes renew each other, and early enough that their ends stay
+Members do not ask for renewal.  Every few minutes each bootstrap node scans the membership list.  It signs a new end
+date for members that are present, are not revoked, have a renewable certificate, and have a third of its life left.
+The renewal is distributed by gossip.  Bootstrap nodes renew each other early enough that their end dates stay close
 together; the last one renews itself.
 """
 
@@ -20,17 +20,17 @@ from middleware.entangled.identity import Identity
 from middleware.entangled.wire.door import Noted
 
 SCANNED_S = 600.0
-"""Seconds between two looks at the list, on average.  Less renews sooner whoever is present for a short while only."""
+"""Mean seconds between two scans of the list.  Less renews members sooner that are present only briefly."""
 LEFT = 3
-"""One part in so many of a certificate's life is left when it is renewed."""
+"""A certificate is renewed when less than 1/``LEFT`` of its life is left."""
 BATCH = 8
-"""Renewals that are signed at once: so a team that was founded in one day is renewed over hours."""
+"""Renewals signed per scan: the renewals of a team that was founded in one day are spread over hours."""
 
 
 class Renewer:
-    """Renews for one node, where that may; ``now`` is in seconds of the wall clock.
+    """Renew certificates at one node, if it may; ``now`` is in seconds of the wall clock.
 
-    ``pass_of`` gives the pass of a member, and ``add`` tells the team.
+    ``pass_of`` returns the pass of a member, and ``add`` publishes an entry.
     """
 
     _log = Logger()
@@ -52,7 +52,7 @@ class Renewer:
         self._noted = Noted()
 
     def is_time(self, now: float) -> bool:
-        """Whether to look over the list; the next time is drawn, so that several nodes do so one after the other."""
+        """Return whether a scan is due, and draw the time of the next one, so that nodes scan at different times."""
         if now < self._next_at <= now + 2 * SCANNED_S:
             return False
         is_first, wait = not self._next_at, SCANNED_S
@@ -60,7 +60,7 @@ class Renewer:
         return not is_first
 
     def find_due(self, now: float) -> list[Member]:
-        """Return the members that this node may renew now and should; the present ones are for the caller to pick."""
+        """Return the members that this node may renew and that are due; the caller selects the present ones."""
         own = self._identity.public
         me, grant = self._roll.member(own, now), self._roll.granted(own)
         if me is None or grant is None or self._roll.refusal(me, now):
@@ -77,7 +77,7 @@ class Renewer:
         ]
 
     def renew(self, member: Member, now: float) -> bool:
-        """Sign a new end for ``member`` and tell the team; whether that was possible."""
+        """Sign a new end date for ``member`` and publish it; returns whether that succeeded."""
         grant, shown = self._roll.granted(self._identity.public), self._pass_of(member.public)
         try:
             if grant is None or not shown:
@@ -88,17 +88,17 @@ class Renewer:
             self._add(packed_admission(member.public, after))
         except (RemoteError, Full) as error:
             if self._noted.is_new(now, member.public):
-                self._log.warn("{name} cannot be renewed: {error}", name=member.name, error=error)
+                self._log.warn("cannot renew the certificate of {name}: {error}", name=member.name, error=error)
             return False
         return True
 
     def pick(self, due: list[Member]) -> list[Member]:
-        """Draw those that are renewed at once."""
+        """Draw the members that are renewed in this scan."""
         return self._rng.sample(due, min(len(due), BATCH))
 
     @staticmethod
     def _is_due(member: Member, latest: int, now: float) -> bool:
-        """Whether little is left of a certificate, or that of a bootstrap node would end well before ``latest``."""
+        """Return whether little of the certificate is left, or a bootstrap node's ends well before ``latest``."""
         end = now + member.life
         if end < member.not_after + STEP:
             return False

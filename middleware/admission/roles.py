@@ -1,9 +1,9 @@
-"""Roles: who may call what, and who may write what; one table, which both sides of every call go by.  Pure.
+"""Roles: the permissions to call methods and to write records, in one table that both sides of a call use.
 
-A member has one role or several, and may do what any of them may.  A *device* senses, bids and acts; an *operator*
-orders people's wishes; a *viewer* looks on; a *gateway* brings people in, as a web node does, and so may what a device
-and an operator may; a *bootstrap* lets newcomers in.  Whatever keeps the network itself together is open to all of
-them, for every member carries a part of it.
+A member has one or several roles, and the union of their permissions.  A *device* senses, bids and acts; an *operator*
+issues tasks and orders; a *viewer* only reads; a *gateway* (a web node) acts on behalf of people, with the permissions
+of device and operator, but cannot push modules; a *bootstrap* node admits newcomers.  Methods that maintain the network
+are open to all roles, because every member takes part in it.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ WORKING = ACTING | ORDERING
 WRITING = ALL - {VIEWER}
 
 METHODS: Mapping[str, frozenset[str]] = {
-    # The network itself.
+    # Overlay network and replication.
     "ping": ALL,
     "find_node": ALL,
     "members": ALL,
     "known": ALL,
     "settled": ALL,
-    "store": ALL,  # each record is judged by its kind
+    "store": ALL,  # each record is checked by its kind
     "find_value": ALL,
     "certificates": ALL,
     "cache": ALL,
@@ -51,29 +51,29 @@ METHODS: Mapping[str, frozenset[str]] = {
     "decree.claim": WRITING,
     "decree.confirm": WRITING,
     "decree.release": WRITING,
-    # What the operator signed.
+    # Membership list.
     "roll.tell": ALL,
     "roll.compare": ALL,
     "roll.fetch": ALL,
     "roll.secret": ALL,
-    # Ways to each other.
+    # NAT traversal.
     "reach.introduce": ALL,
     "reach.meet": ALL,
     "reach.seen": ALL,
-    # The right to act.  Members of a council are nodes near the task's key that may say ``lease.freed``.
+    # Leases.  Members of a quorum are nodes near the task's key that may call ``lease.freed``.
     "lease.prepare": WORKING,
     "lease.propose": ACTING,
     "lease.release": ACTING,
-    "lease.freed": WRITING,  # the word of a council
+    "lease.freed": WRITING,  # sent by a quorum
     "lease.close": ACTING,  # under the token that was granted
     "lease.cancel": ORDERING,
     "lease.change": WORKING,
     "lease.install": WORKING,
-    # Bids are signed and carried by others; who may bid at all is a matter of its kind of record.
+    # Bids are signed and forwarded by other nodes; the kind of record decides which roles may bid.
     "bid.offer": ALL,
-    "bid.announce": ALL,  # the word of a council
+    "bid.announce": ALL,  # sent by a quorum
     "bid.cry": ALL,
-    # Devices and people.
+    # Devices and operators.
     "device.message": ORDERING,
     "device.disconnect": ORDERING,
     "device.halt": ORDERING,
@@ -89,7 +89,7 @@ METHODS: Mapping[str, frozenset[str]] = {
     "stream.part": WORKING,
 }
 OTHER_METHODS = WORKING
-"""Who may call what a program exposes beside these."""
+"""Roles that may call a method that is not listed in ``METHODS``."""
 
 PRESENCE, TASKS, HALT, DEPLOYMENTS, SIGNED_OUT = "devices", "tasks", "halt", "deployments", "signed-out"
 MEMBER, RESULT, ORDER, VERDICT, SOURCE = "member", "result", "order", "verdict", "source"
@@ -97,15 +97,15 @@ COUNCIL, ENDED = "council", "done"
 OTHER = "other"
 
 BY_KEY, BY_NAME, REST = "key", "name", "rest"
-"""How the records of a namespace are recognised: by a key of that name, by the slot's name up to a ``/``, or as what is
-in none of the others."""
+"""Ways to recognise the records of a namespace: by a key of that name, by the slot's name up to a ``/``, or as the
+remaining records."""
 
 
 class Namespace(NamedTuple):
-    """A kind of record: the roles of the owners that may write it, how it is recognised, and what it is for.
+    """A kind of record: roles whose members may write it, way to recognise it, and purpose.
 
-    ``example`` is a slot of it, as the text of its key and the slot's name.  Where it ``lasts``, a record that replicas
-    hold when its owner is revoked stays there until it runs out: the team remains in the state in which it was.
+    ``example`` is a slot, as the text of its key and the slot's name.  Records of a namespace that ``lasts`` stay at
+    their replicas until they expire even if their owner is revoked, so a revocation does not change the team's state.
     """
 
     roles: frozenset[str]
@@ -115,14 +115,14 @@ class Namespace(NamedTuple):
     lasts: bool = False
 
     def slot(self, owner: bytes) -> Slot:
-        """The slot of ``owner`` that the example names."""
+        """Return the slot of ``owner`` with the example's key and name."""
         key, name = self.example
         return Slot(hashed_key(key), owner, name)
 
 
 NAMESPACES: Mapping[str, Namespace] = {
     PRESENCE: Namespace(
-        ALL, BY_KEY, "what a device says of itself, at its own places of the directory", (PRESENCE, "dog1")
+        ALL, BY_KEY, "the presence of a device, at its own places of the directory", (PRESENCE, "dog1")
     ),
     TASKS: Namespace(ORDERING, BY_KEY, "the tasks of the team", (TASKS, "task7")),
     HALT: Namespace(ORDERING, BY_KEY, "the emergency stop and its release", (HALT, "halt"), lasts=True),
@@ -132,19 +132,19 @@ NAMESPACES: Mapping[str, Namespace] = {
     ),
     SOURCE: Namespace(PUSHING, BY_NAME, "the source of a pushed module", ("source/7", SOURCE)),
     MEMBER: Namespace(ACTING, BY_NAME, "the report of a device in the group of a task", ("task/task7", MEMBER)),
-    RESULT: Namespace(ORDERING, BY_NAME, "how a task ended, by an operator", ("task/task7", RESULT)),
+    RESULT: Namespace(ORDERING, BY_NAME, "the result of a task, by an operator", ("task/task7", RESULT)),
     COUNCIL: Namespace(
         WORKING, BY_NAME, "the council of a task, signed by the council before it", ("task/task7", COUNCIL)
     ),
     ENDED: Namespace(
-        ACTING, BY_NAME, "how a task ended, signed by the council that granted the lease", ("task/task7", ENDED)
+        ACTING, BY_NAME, "the result of a task, signed by the council that granted the lease", ("task/task7", ENDED)
     ),
-    ORDER: Namespace(ORDERING, BY_NAME, "what an operator wants of a task under way", ("task/task7", ORDER)),
-    VERDICT: Namespace(ACTING, BY_NAME, "why an agent decided as it did", ("task/task7/why", f"{VERDICT}/1")),
-    OTHER: Namespace(WRITING, REST, "tuples, and whatever programs keep in the DHT", ("group/7", "anything")),
+    ORDER: Namespace(ORDERING, BY_NAME, "an operator's order for a running task", ("task/task7", ORDER)),
+    VERDICT: Namespace(ACTING, BY_NAME, "the decision record of an agent", ("task/task7/why", f"{VERDICT}/1")),
+    OTHER: Namespace(WRITING, REST, "tuples, and other records of programs in the DHT", ("group/7", "anything")),
 }
-"""Each kind of record, and who may write it.  A record that may not be written by its owner, by the owner's certificate
-as it is at present, is neither held nor shown nor believed anywhere."""
+"""Each kind of record with the roles that may write it.  Nodes neither store nor return nor accept a record whose
+owner's current certificate does not permit it."""
 
 KINDS: Mapping[str, frozenset[str]] = {kind: namespace.roles for kind, namespace in NAMESPACES.items()}
 _BY_KEY = {hashed_key(kind): kind for kind, namespace in NAMESPACES.items() if namespace.by == BY_KEY}
@@ -152,9 +152,9 @@ _BY_NAME = frozenset(kind for kind, namespace in NAMESPACES.items() if namespace
 
 
 def kind_of(slot: Slot) -> str:
-    """The kind of the records in ``slot``: by a key that is fixed, else by the slot's name (up to a ``/``).
+    """Return the kind of the records in ``slot``: by its key, otherwise by its name up to a ``/``.
 
-    In a large team a device has a place of its own in the directory (``prefix``).
+    In a large team each device has an own place in the directory (``prefix``).
     """
     kind = _BY_KEY.get(slot.key)
     if kind is None:
@@ -164,14 +164,14 @@ def kind_of(slot: Slot) -> str:
 
 
 def may_call(roles: Collection[str], method: str) -> bool:
-    """Whether a member with these roles may call ``method``."""
+    """Return whether a member with these roles may call ``method``."""
     return not METHODS.get(method, OTHER_METHODS).isdisjoint(roles)
 
 
 def may_store(roles: Collection[str], slot: Slot, name: str = "") -> bool:
-    """Whether a member with these roles may write in ``slot``, which is its own.
+    """Return whether a member with these roles may write in its own ``slot``.
 
-    A member announces itself under the ``name`` of its certificate only, where it has one.
+    A member with a certificate may publish its presence only under the certificate's ``name``.
     """
     kind = kind_of(slot)
     is_named = kind != PRESENCE or not name or slot.name == name
@@ -179,5 +179,5 @@ def may_store(roles: Collection[str], slot: Slot, name: str = "") -> bool:
 
 
 def lasts(slot: Slot) -> bool:
-    """Whether what is held in ``slot`` stays when its owner is revoked."""
+    """Return whether records in ``slot`` stay when their owner is revoked."""
     return NAMESPACES[kind_of(slot)].lasts

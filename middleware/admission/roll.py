@@ -1,10 +1,10 @@
-"""Roll: the statements about a team that a node knows, and who has been admitted; what follows from them.
+"""Membership list of a closed team: the operator's statements and the admissions that a node knows.
 
-It only grows, but for what has run out: two nodes that know the same statements know the same, whatever the order in
-which these came.  Of two statements about one thing the later one holds, and the other is let go of.  An admission (a
-newcomer's key with the pass that a bootstrap node made) is kept beside them, so that names are not given twice, a
-newcomer that asks another bootstrap node gets the same answer, and the operator sees who is a member.  So is the newest
-renewal of each key: it moves the end of what the operator or an admission said of the key, and changes nothing else.
+Entries are only added, until they expire, so the list is a grow-only set: two nodes with the same statements have the
+same state, in whatever order the statements arrived.  Of two statements about the same subject the later one wins, and
+the other is dropped.  The list also contains admissions (a newcomer's key with the pass that a bootstrap node issued),
+so that names stay unique, a newcomer gets the same reply from every bootstrap node, and the operator sees the members;
+and the newest renewal of each key, which changes only the end date of its grant or admission.
 """
 
 from __future__ import annotations
@@ -48,18 +48,18 @@ from middleware.entangled.errors import Full, Malformed
 MAX_ENTRIES = 4096
 MAX_BYTES = 2**20
 RESERVED, RESERVED_BYTES = 1024, 2**18
-"""Of these, what admissions, which bootstrap nodes sign, leave to the statements of the operator."""
+"""The share of the limits that is reserved for statements of the operator; bootstrap nodes sign admissions."""
 MAX_SECRETS = 4
-"""Secrets of the team that are remembered, the newest."""
+"""Number of team secrets that are kept, newest first."""
 STEP = 7 * 86_400
-"""Seconds that a renewal adds at least, and by which the ends of bootstrap nodes may differ before one is renewed."""
+"""Minimum seconds that a renewal adds; also the maximum gap between end dates of bootstrap nodes before a renewal."""
 DIGEST = 8
 ID = 8
 
 
 @dataclass(frozen=True)
 class SignedPass(Entry):
-    """The pass that a member shows, signed by a bootstrap node."""
+    """The pass of a member, signed by a bootstrap node."""
 
     member: Member
     shown: bytes
@@ -71,19 +71,19 @@ class SignedPass(Entry):
 
     @property
     def until(self) -> int:
-        """As long as the operator may want to renew it."""
+        """The time from which the operator can no longer renew it."""
         return remembered_until(self.member.not_after, self.member.life)
 
 
 @dataclass(frozen=True)
 class Admission(SignedPass):
-    """A newcomer that was let in."""
+    """A newcomer that a bootstrap node admitted."""
 
     kind = "admission"
 
     @property
     def rank(self) -> int:
-        """The later one holds."""
+        """The later admission wins."""
         return self.member.not_before
 
 
@@ -91,7 +91,7 @@ class Admission(SignedPass):
 class Renewal(SignedPass):
     """A member whose certificate a bootstrap node renewed.
 
-    ``grant`` is what the operator granted it, and that as packed; None where it came by a code.
+    ``grant`` is the operator's grant, parsed and packed; None if the member joined by a code.
     """
 
     kind = "renewal"
@@ -99,7 +99,7 @@ class Renewal(SignedPass):
 
     @property
     def rank(self) -> int:
-        """The one that ends later holds, so no bootstrap node can shorten what another one gave."""
+        """The renewal that ends later wins, so no bootstrap node can shorten another one's renewal."""
         return self.member.not_after
 
 
@@ -107,29 +107,29 @@ Kind = TypeVar("Kind", bound=Entry)
 
 
 class Held(NamedTuple):
-    """An entry, as it is packed."""
+    """An entry, parsed and packed."""
 
     entry: Entry
     packed: bytes
 
 
 def digest_of(packed: bytes) -> bytes:
-    """By what an entry is told from others."""
+    """Return the digest that identifies an entry."""
     return hashlib.blake2s(packed, digest_size=DIGEST).digest()
 
 
 def invitation_id(public: bytes) -> bytes:
-    """By what a newcomer names its invitation in clear."""
+    """Return the id by which a join request names its invitation in clear text."""
     return hashlib.blake2s(public, digest_size=ID, person=b"invite").digest()
 
 
 def packed_admission(public: bytes, shown: bytes) -> bytes:
-    """An admission or a renewal as it travels; it needs no signature of its own."""
+    """Pack an admission or a renewal; the pass in it is signed."""
     return bytes(msgpack.packb([ADMISSION, public, shown]))
 
 
 class Roll:
-    """What a node knows of the team of the operator with the public key ``operator``; plain logic, no clock.
+    """The membership list of the team with the operator key ``operator``; pure logic without a clock.
 
     ``now`` is in seconds of the wall clock.
     """
@@ -140,124 +140,126 @@ class Roll:
         self._slots: dict[tuple[str, bytes], bytes] = {}
         self._by_id: dict[bytes, bytes] = {}
         self.void: list[bytes] = []
-        """The keys of those whose admissions the last revocation made void."""
-        self._uses: dict[bytes, Counter[bytes]] = {}  # of each invitation the keys that came by it
+        """Keys of the members whose admission the last revocation invalidated."""
+        self._uses: dict[bytes, Counter[bytes]] = {}  # keys of the members that joined by each invitation
         self._digest = 0
         self._bytes = 0
 
     def __len__(self) -> int:
-        """How many entries there are."""
+        """Return the number of entries."""
         return len(self._held)
 
     @property
     def digest(self) -> bytes:
-        """Eight bytes that two nodes have in common when they know the same."""
+        """Eight bytes that are equal at two nodes with the same entries."""
         return self._digest.to_bytes(DIGEST)
 
     @property
     def digests(self) -> list[bytes]:
-        """That of each entry."""
+        """The digest of each entry."""
         return list(self._held)
 
     def packed(self, wanted: Iterable[bytes] | None = None) -> list[bytes]:
-        """The entries with those digests, or all, as they travel."""
+        """Return the packed entries with those digests, or all."""
         keys = self._held if wanted is None else wanted
         return [self._held[key].packed for key in keys if key in self._held]
 
     def has(self, packed: bytes) -> bool:
-        """Whether this entry is held."""
+        """Return whether the list contains this entry."""
         return digest_of(packed) in self._held
 
     def add(self, packed: object, now: float) -> Entry | None:
-        """Take an entry in; returns it where it is new and holds, else None.
+        """Add an entry; returns it if it is new and valid, else None.
 
-        Raises ``Malformed`` or ``Forged`` for what is none of this team, and ``Full`` where there is no room.
+        Raises ``Malformed`` or ``Forged`` for an entry that is not of this team, and ``Full`` if there is no room.
         """
         if not isinstance(packed, bytes):
-            raise Malformed("an entry of the roll is a string of bytes")
+            raise Malformed("an entry of the membership list has to be bytes")
         key = digest_of(packed)
         if key in self._held:
             return None
-        entry = self._read(packed)
-        if entry.until <= now or self._is_void(entry, now):
+        entry = self._parse(packed)
+        if entry.until <= now or self._is_invalid(entry, now):
             return None
         before = self._slots.get(entry.slot)
         if before is not None and (entry.rank, packed) <= (self._held[before].entry.rank, self._held[before].packed):
             return None
         if before is not None:
-            self._let_go(before)
+            self._remove(before)
         if isinstance(entry, Secret) and not self._has_room_for_secret(entry):
             return None
         self._check_room(entry, packed, now)
-        self._hold(key, Held(entry, packed))
+        self._insert(key, Held(entry, packed))
         if isinstance(entry, Revoke) or (isinstance(entry, Grant) and before is not None):
-            self._drop_void(self._held, now)
+            self._drop_invalid(self._held, now)
         elif isinstance(entry, Grant):
-            self._drop_void([self._slots[slot] for slot in [(Renewal.kind, entry.public)] if slot in self._slots], now)
+            self._drop_invalid(
+                [self._slots[slot] for slot in [(Renewal.kind, entry.public)] if slot in self._slots], now
+            )
         return entry
 
     def expire(self, now: float) -> int:
-        """Let go of what has run out; returns how much that was."""
+        """Drop expired entries, and return their number."""
         gone = [key for key, held in self._held.items() if held.entry.until <= now]
         for key in gone:
-            self._let_go(key)
+            self._remove(key)
         return len(gone)
 
-    # -- questions --------------------------------------------------------------------------------------------------
+    # -- queries ----------------------------------------------------------------------------------------------------
 
     def revoked(self, public: bytes) -> Revoke | None:
-        """The revocation of a member's key, or of an invitation's."""
-        return self._at(Revoke, public)
+        """Return the revocation of a member's or an invitation's key."""
+        return self._find(Revoke, public)
 
     def granted(self, public: bytes) -> tuple[Grant, bytes] | None:
-        """What the operator granted to the holder of ``public``, and that as packed."""
-        found, renewal = self._held_at(Grant, public), self.renewal(public)
+        """Return the operator's grant for ``public``, parsed and packed."""
+        found, renewal = self._find_packed(Grant, public), self.renewal(public)
         other = None if renewal is None else renewal.grant
         if found is None or (other is not None and found[0].not_before < other[0].not_before):
             return other
         return found
 
     def invited(self, name: bytes) -> tuple[Invite, bytes] | None:
-        """The invitation with that id, and it as packed."""
-        return self._held_at(Invite, self._by_id.get(name, b""))
+        """Return the invitation with that id, parsed and packed."""
+        return self._find_packed(Invite, self._by_id.get(name, b""))
 
     def terms_of(self, invitation: bytes) -> bytes | None:
-        """Return the sealed terms of the invitation with that public key; None where they are not known."""
-        entry = self._at(Terms, invitation)
+        """Return the encrypted terms of the invitation with that public key; None if they are not known."""
+        entry = self._find(Terms, invitation)
         return None if entry is None else entry.sealed
 
     def admitted(self, public: bytes) -> Admission | None:
-        """How the holder of ``public`` was let in."""
-        return self._at(Admission, public)
+        """Return the admission of ``public``."""
+        return self._find(Admission, public)
 
     def renewal(self, public: bytes) -> Renewal | None:
-        """The newest renewal of the certificate of ``public``."""
-        return self._at(Renewal, public)
+        """Return the newest renewal of the certificate of ``public``."""
+        return self._find(Renewal, public)
 
     def secrets(self) -> list[Secret]:
-        """The statements that carry the team's secrets, the newest first."""
-        return sorted(self._all(Secret), key=lambda each: -each.number)
+        """Return the statements with the team's secrets, newest first."""
+        return sorted(self._list_kind(Secret), key=lambda each: -each.number)
 
     def invites(self) -> list[Invite]:
-        """All invitations that are remembered, the oldest first."""
-        return sorted(self._all(Invite), key=lambda each: each.not_before)
+        """Return all known invitations, oldest first."""
+        return sorted(self._list_kind(Invite), key=lambda each: each.not_before)
 
     def revocations(self) -> list[Revoke]:
-        """All revocations."""
-        return self._all(Revoke)
+        """Return all revocations."""
+        return self._list_kind(Revoke)
 
     def admissions(self) -> list[Admission]:
-        """All that were let in by a bootstrap node."""
-        return self._all(Admission)
+        """Return all admissions by bootstrap nodes."""
+        return self._list_kind(Admission)
 
     def refusal(self, member: Member, now: float) -> str:
-        """Why a member is none any more: ``revoked``, ``expired`` or ``early``; empty where it is one."""
+        """Return ``revoked``, ``expired``, ``early`` or ``role`` for a key that is not a member; empty for a member."""
         if self.revoked(member.public) is not None or (
             member.invitation and self.revoked(member.invitation) is not None
         ):
             return "revoked"
         if member.admitter:
-            # Dates say nothing: who has the key of a revoked bootstrap node can sign any.
+            # Dates prove nothing: the holder of a revoked bootstrap node's key can sign any date.
             end = self.revoked(member.admitter)
             if end is not None and member_id(member.public) not in end.kept:
                 return "revoked"
@@ -269,9 +271,9 @@ class Roll:
         return member.trouble(now)
 
     def known_as(self, member: Member, now: float) -> Member:
-        """``member``, as its pass says it, by the operator's latest word about its key and the renewal that ends last.
+        """Update ``member`` from its pass with the operator's latest grant and the renewal that ends last.
 
-        A renewal counts for the word that it renews, and no later one; and only if its signer may renew at present.
+        A renewal applies only to the grant that it renews, and only if its signer may renew now.
         """
         found, renewals = member.unrenewed, [member] if member.renewer else []
         grant, held = self.granted(member.public), self.renewal(member.public)
@@ -290,7 +292,7 @@ class Roll:
             each
             for each in renewals
             if (not each.invitation and each.since == found.since if is_granted else _is_same_admission(each, found))
-            and self._counts(each, now)
+            and self._is_renewal_valid(each, now)
         ]
         last = max(counting, key=lambda each: each.not_after, default=found)
         if last.not_after <= found.not_after:
@@ -298,7 +300,7 @@ class Roll:
         return replace(found, not_after=last.not_after, renewer=last.renewer)
 
     def member(self, public: bytes, now: float) -> Member | None:
-        """What is known of the holder of ``public``, whether it is a member at present or not."""
+        """Return the last known state of ``public``, also if it is not a member now."""
         admission, grant, renewal = self.admitted(public), self.granted(public), self.renewal(public)
         if admission is not None:
             return self.known_as(admission.member, now)
@@ -307,7 +309,7 @@ class Roll:
         return None if renewal is None else self.known_as(renewal.member, now)
 
     def best_pass(self, member: Member, shown: bytes, now: float) -> bytes:
-        """The pass to show for ``member``, which the pass ``shown`` says: that of the latest end."""
+        """Return the pass with the latest end to show for ``member``, whose pass is ``shown``."""
         known, renewal, grant = self.known_as(member, now), self.renewal(member.public), self.granted(member.public)
         if known.renewer:
             is_held = renewal is not None and renewal.member.not_after == known.not_after
@@ -318,24 +320,24 @@ class Roll:
         return shown if admission is None else admission.shown
 
     def remembered(self, now: float) -> list[tuple[Member, str]]:
-        """All that are or were members, by name, each with why it is none at present (empty: it is one)."""
-        publics = [each.member.public for each in self._all(SignedPass)]
-        publics += [each.public for each in self._all(Grant)]
+        """Return all current and former members by name, each with its refusal (empty for a current member)."""
+        publics = [each.member.public for each in self._list_kind(SignedPass)]
+        publics += [each.public for each in self._list_kind(Grant)]
         known = [each for public in dict.fromkeys(publics) if (each := self.member(public, now)) is not None]
         return [(each, self.refusal(each, now)) for each in sorted(known, key=lambda each: (each.name, each.public))]
 
     def members(self, now: float) -> list[Member]:
-        """All that are members at that moment, by name."""
+        """Return the members at ``now``, by name."""
         return [each for each, refusal in self.remembered(now) if not refusal]
 
     def is_last_bootstrap(self, public: bytes, since: float, now: float) -> bool:
-        """Whether no bootstrap node but ``public`` can renew others: such a one renews itself.
+        """Return whether no other bootstrap node can renew certificates; the last one renews itself.
 
-        One that the operator named after ``since`` does not count, nor one that ends within two ``STEP``: bootstrap
-        nodes renew each other long before that, so it is gone.
+        A bootstrap node that the operator named after ``since`` does not count, nor does one that ends within two
+        ``STEP``: bootstrap nodes renew each other long before that, so it is offline.
         """
-        publics = {each.public for each in self._all(Grant)}
-        publics |= {each.member.public for each in self._all(Renewal)}
+        publics = {each.public for each in self._list_kind(Grant)}
+        publics |= {each.member.public for each in self._list_kind(Renewal)}
         for grant in map(self.granted, publics):
             if grant is None or grant[0].public == public or grant[0].not_before > since:
                 continue
@@ -348,51 +350,52 @@ class Roll:
                 return False
         return True
 
-    # -- inside -----------------------------------------------------------------------------------------------------
+    # -- implementation ---------------------------------------------------------------------------------------------
 
-    def _read(self, packed: bytes) -> Entry:
+    def _parse(self, packed: bytes) -> Entry:
         fields = unpacked(packed)
         if len(fields) == 3 and fields[0] == ADMISSION:
             public, shown = sized(fields[1], 32), fields[2]
             if not isinstance(shown, bytes):
-                raise Malformed("an admission without a pass")
+                raise Malformed("the admission has no pass")
             member = member_of(self.operator, public, shown)
             if member.renewer:
                 return Renewal(member, shown, grant_of(self.operator, shown))
             if not member.invitation:
-                raise Malformed("an admission without an invitation")
+                raise Malformed("the admission has no invitation")
             return Admission(member, shown)
         return opened(self.operator, packed)
 
     def _check_room(self, entry: Entry, packed: bytes, now: float) -> None:
-        """Raise ``Full`` where there is no room for ``entry``; a part of the room is for the operator alone."""
+        """Raise ``Full`` if there is no room for ``entry``; a share of the room is reserved for the operator."""
         most, most_bytes = MAX_ENTRIES, MAX_BYTES
         if isinstance(entry, SignedPass):
             most, most_bytes = MAX_ENTRIES - RESERVED, MAX_BYTES - RESERVED_BYTES
             member = entry.member
             users = self._uses.get(member.invitation, Counter())
             if member.invitation and member.public not in users and len(users) >= member.uses:
-                raise Full(f"the invitation by which {member.name} came was used {len(users)} times already")
+                raise Full(f"the invitation by which {member.name} joined was already used {len(users)} times")
         for is_tried in (False, True):
             if len(self._held) < most and self._bytes + len(packed) <= most_bytes:
                 return
             if not is_tried:
                 self._drop_ended(now)
-        raise Full(f"the roll of the team holds {len(self)} statements, {self._bytes} bytes; it has no room for more")
+        raise Full(f"the membership list is full: {len(self)} statements, {self._bytes} bytes")
 
     def _drop_ended(self, now: float) -> None:
-        """Let go of admissions and renewals that have ended and are remembered so that the operator can renew them.
+        """Drop expired admissions and renewals that are kept only so that the operator can renew them.
 
-        Grants stay: with one that ended its key would fall back to what was said of it before.
+        Grants stay: without an expired grant, an older statement about its key would apply again.
         """
         for key, held in list(self._held.items()):
             if isinstance(held.entry, SignedPass) and held.entry.member.not_after <= now:
-                self._let_go(key)
+                self._remove(key)
 
-    def _counts(self, renewal: Member, now: float) -> bool:
-        """Whether a renewal counts: its signer is a bootstrap node, or was when the operator revoked it and kept this.
+    def _is_renewal_valid(self, renewal: Member, now: float) -> bool:
+        """Return whether a renewal applies: its signer is a bootstrap node, or was revoked and the renewal kept.
 
-        Dates say nothing of a revoked signer: it can sign any.  A member renews itself only where no other one can.
+        Dates of a revoked signer prove nothing, because it can sign any date.  A member can renew itself only if no
+        other node can.
         """
         end, grant = self.revoked(renewal.renewer), self.granted(renewal.renewer)
         if end is not None and renewal_id(renewal.public, renewal.not_after) not in end.kept:
@@ -403,8 +406,8 @@ class Roll:
             return False
         return renewal.not_before <= now + SKEW
 
-    def _is_void(self, entry: Entry, now: float) -> bool:
-        """Whether an admission or a renewal does not count, whatever moment it is."""
+    def _is_invalid(self, entry: Entry, now: float) -> bool:
+        """Return whether an admission or a renewal is invalid at any time."""
         if not isinstance(entry, SignedPass):
             return False
         member = entry.member
@@ -414,18 +417,18 @@ class Roll:
             return False
         grant, admission = self.granted(member.public), self.admitted(member.public)
         if grant is not None and grant[0].not_before > member.since:
-            return True  # the operator said something else since
+            return True  # the operator issued a later grant
         is_by_one_code = admission is not None and admission.member.invitation == member.invitation
         if admission is not None and is_by_one_code and not _is_same_admission(member, admission.member):
             return True
-        return member.renewer != member.public and not self._counts(member, now)
+        return member.renewer != member.public and not self._is_renewal_valid(member, now)
 
-    def _drop_void(self, keys: Iterable[bytes], now: float) -> None:
-        """Let go of what a revocation or a later grant made void; whoever shows it is refused by that statement."""
-        void = [key for key in keys if self._is_void(self._held[key].entry, now)]
+    def _drop_invalid(self, keys: Iterable[bytes], now: float) -> None:
+        """Drop entries that a revocation or a later grant invalidated; that statement also rejects them when shown."""
+        void = [key for key in keys if self._is_invalid(self._held[key].entry, now)]
         members = [each.member for key in void if isinstance(each := self._held[key].entry, SignedPass)]
         for key in void:
-            self._let_go(key)
+            self._remove(key)
         self.void = [each.public for each in members if self.refusal(each, now) == "revoked"]
 
     def _has_room_for_secret(self, secret: Secret) -> bool:
@@ -435,31 +438,31 @@ class Roll:
         oldest = known[-1]
         if secret.number <= oldest.number:
             return False
-        self._let_go(self._slots[oldest.slot])
+        self._remove(self._slots[oldest.slot])
         return True
 
     def _count_use(self, entry: Entry, step: int) -> None:
-        """Count a key that came by an invitation: once, whether it is known by its admission, a renewal, or both."""
+        """Count a key that joined by an invitation once, even if it has both an admission and a renewal."""
         if isinstance(entry, SignedPass) and entry.member.invitation:
             users = self._uses.setdefault(entry.member.invitation, Counter())
             users[entry.member.public] += step
-            users += Counter()  # drops those of which nothing is left
+            users += Counter()  # drops keys with count 0
             if not users:
                 del self._uses[entry.member.invitation]
 
-    def _held_at(self, kind: type[Kind], public: bytes) -> tuple[Kind, bytes] | None:
+    def _find_packed(self, kind: type[Kind], public: bytes) -> tuple[Kind, bytes] | None:
         key = self._slots.get((kind.kind, public))
         held = None if key is None else self._held[key]
         return (held.entry, held.packed) if held is not None and isinstance(held.entry, kind) else None
 
-    def _at(self, kind: type[Kind], public: bytes) -> Kind | None:
-        found = self._held_at(kind, public)
+    def _find(self, kind: type[Kind], public: bytes) -> Kind | None:
+        found = self._find_packed(kind, public)
         return None if found is None else found[0]
 
-    def _all(self, kind: type[Kind]) -> list[Kind]:
+    def _list_kind(self, kind: type[Kind]) -> list[Kind]:
         return [held.entry for held in self._held.values() if isinstance(held.entry, kind)]
 
-    def _hold(self, key: bytes, held: Held) -> None:
+    def _insert(self, key: bytes, held: Held) -> None:
         self._held[key] = held
         self._slots[held.entry.slot] = key
         if isinstance(held.entry, Invite):
@@ -468,7 +471,7 @@ class Roll:
         self._digest ^= int.from_bytes(key)
         self._bytes += len(held.packed)
 
-    def _let_go(self, key: bytes) -> None:
+    def _remove(self, key: bytes) -> None:
         held = self._held.pop(key)
         self._slots.pop(held.entry.slot, None)
         if isinstance(held.entry, Invite):
@@ -479,5 +482,5 @@ class Roll:
 
 
 def _is_same_admission(member: Member, other: Member) -> bool:
-    """Whether both came by one code, at one bootstrap node and under one name."""
+    """Return whether both joined by the same code, bootstrap node and name."""
     return (member.invitation, member.admitter, member.name) == (other.invitation, other.admitter, other.name)

@@ -1,4 +1,4 @@
-"""Team: a closed team as one of its nodes lives it: door, roll, gossip and reception, wired around the node."""
+"""A closed team at one node: admission check, membership list, gossip and admission server, connected to the node."""
 
 from __future__ import annotations
 
@@ -34,17 +34,17 @@ if TYPE_CHECKING:
     from middleware.admission.uses import Uses
 
 ROLL = "admission/roll"
-"""The note of what the node knows of its team."""
+"""Name of the stored note with the membership list."""
 GUESTS, NO_GUESTS = "admission/guests", bytes(msgpack.packb([]))
-"""The note of the passes of owners of records that are not on the roll."""
+"""Name of the stored note with passes of record owners that are not on the membership list."""
 MAX_GUESTS = 256
-"""Owners whose passes are noted; of others the records are shown again when another member shows the pass."""
+"""Maximum number of owners whose passes are stored; other passes are requested again from members."""
 
 
 class Team:
-    """One node's closed team: made before the node, whose ``door`` it has, and then wired to it by ``attach``.
+    """The closed team of one node: created before the node, which uses its ``door``; ``attach`` connects them.
 
-    ``kept`` is the node's own place in the team.
+    ``kept`` stores the node's membership.
     """
 
     _log = Logger()
@@ -56,25 +56,25 @@ class Team:
         self._rng = rng
         self.identity = kept.membership.identity
         self.roll = Roll(kept.membership.operator)
-        self._remember()
+        self._load_list()
         self.door = Doorkeeper(self.roll, lambda: self.membership, wall, begun(store, wall(), rng))
-        self._remember_guests()
+        self._load_guest_passes()
         self._node: EntangledNode | None = None
         self._uses: Uses | None = None
         self._accepted = [secret for _, secret, _ in self.membership.accepted(wall())]
 
     @property
     def membership(self) -> Membership:
-        """This node's own place in the team, as it is now."""
+        """This node's current membership."""
         return self._kept.membership
 
     @property
     def secret(self) -> bytes:
-        """The team's newest secret that this node knows."""
+        """The newest team secret that this node knows."""
         return self.membership.secrets[0][1]
 
     def attach(self, node: EntangledNode, clock: IReactorTime) -> None:
-        """Be the team of ``node``, which has this door and is not started yet."""
+        """Connect to ``node``, which uses this team's ``door`` and is not started yet."""
         self._node, self._clock = node, clock
         self._chores = Background(clock)
         endpoint = node.endpoint
@@ -88,7 +88,7 @@ class Team:
             self.identity,
             lambda invite: self.uses.take(invite),
             self._gossip.add,
-            self._given,
+            self._build_welcome,
             endpoint.post,
             clock.seconds,
             self._wall,
@@ -102,40 +102,40 @@ class Team:
             endpoint.rekey(*self._accepted)
 
     def start(self) -> None:
-        """Begin to compare with others, and to look after what has run out."""
-        self._sweep()
+        """Start gossip, expiry and renewal."""
+        self._evict_former_members()
         self._log.info("member {name} of the closed team {team}", name=self.door.me.name, team=self.membership.team)
         trouble = self.door.me.trouble(self._wall())
         if trouble:
-            # It is not known here yet whether the clock is right, so both are said; nobody else may be there to say it.
-            self._log.warn("the certificate of this node does not hold by its clock: {why}", why=meaning(trouble))
+            # Whether the clock is right is unknown at this point, so the message has both causes.
+            self._log.warn("the certificate of this node is not valid by its clock: {why}", why=meaning(trouble))
         self._gossip.start()
-        self._chores.every(COMPARED, self._look_after)
+        self._chores.every(COMPARED, self._run_periodic)
 
     def stop(self) -> None:
-        """End what is under way."""
+        """Cancel pending work."""
         if self._node is not None:
             self._chores.stop()
         if self._uses is not None:
             self._uses.stop()
 
-    # -- what an operator does --------------------------------------------------------------------------------------
+    # -- operations of an operator ----------------------------------------------------------------------------------
 
     @property
     def uses(self) -> Uses:
-        """The uses of invitations; made when first somebody needs them."""
+        """The use counters of invitations, created on first use."""
         if self._uses is None:
             assert self._node is not None
-            # With it comes the tuple space: a node at which nobody knocks is spared a MiB.
+            # Imported here: without join requests the node saves 1 MiB for the tuple space.
             from middleware.admission.uses import Uses
 
             self._uses = Uses(self._node, self._clock, self._rng)
         return self._uses
 
     async def tell(self, packed: bytes) -> str:
-        """Tell the team what its operator signed; returns what it is, in a word.
+        """Publish a statement of the operator; returns its kind.
 
-        An invitation can be used when this is done.  Raises ``Refused`` for what is none of this team.
+        An invitation can be used when this is done.  Raises ``Refused`` for a statement that is not of this team.
         """
         check = Roll(self.roll.operator)
         try:
@@ -143,29 +143,29 @@ class Team:
         except RemoteError as error:
             raise Refused(f"{error}; sign with the key of the team {self.membership.team}") from error
         if entry is None:
-            raise Refused("that has run out already; look whether this machine's clock is right")
+            raise Refused("the statement has already expired; check the clock of this machine")
         if isinstance(entry, Invite) and self.roll.invited(invitation_id(entry.public)) is None:
             await self.uses.issue(entry)
         self._gossip.add(packed)
         return entry.slot[0]
 
     def members(self) -> list[Member]:
-        """All that are members now, as far as this node has heard, by name."""
+        """Return the current members that this node knows, by name."""
         return self.roll.members(self._wall())
 
     def guest(self, seed: bytes, name: str) -> Membership:
-        """The membership of a guest for whom this node vouches; raises ``Malformed`` where its own pass is too long."""
+        """Return the membership of a guest of this node; raises ``Malformed`` if this node's pass is too long."""
         own, now = self.membership, int(self._wall())
         shown = guest_pass(self.identity, self.door.shown, Identity(seed).public, name, now)
         return replace(own, seed=seed, shown=shown, known=())
 
-    # -- inside -----------------------------------------------------------------------------------------------------
+    # -- implementation ---------------------------------------------------------------------------------------------
 
-    def _remember(self) -> None:
-        """Take in what an earlier life knew, and what the own pass says."""
+    def _load_list(self) -> None:
+        """Load the stored membership list, and add the entries in this node's pass."""
         try:
             noted = msgpack.unpackb(self._store.noted(ROLL) or b"\x90", max_array_len=MAX_ENTRIES)
-        except Exception:  # a rotten file may hold anything
+        except Exception:  # damaged file
             noted = []
         shown, public = self.membership.shown, self.identity.public
         for packed in [*(noted if isinstance(noted, list) else []), *entries_of(public, shown)]:
@@ -174,60 +174,60 @@ class Team:
             except (RemoteError, Full):
                 continue
 
-    def _remember_guests(self) -> None:
-        """Take in the passes of guests whose records an earlier life held."""
+    def _load_guest_passes(self) -> None:
+        """Load the stored passes of guests whose records this node holds."""
         try:
             noted = msgpack.unpackb(self._store.noted(GUESTS) or NO_GUESTS, max_array_len=MAX_GUESTS)
             for owner, shown in noted:
                 self.door.learn(owner, shown)
-        except Exception:  # a rotten file may hold anything
-            self._log.warn("the noted passes of guests cannot be read; other members show them again")
+        except Exception:  # damaged file
+            self._log.warn("the stored passes of guests are damaged; other members will send them again")
 
     def _on_new(self, entry: Entry) -> None:
         self._store.note(ROLL, msgpack.packb(self.roll.packed()))
         if isinstance(entry, Revoke):
             self._log.info("revoked: {name}", name=entry.name)
-            self._keep_pass()
-            self._sweep()
-            self._part_with(entry.public)
+            self._store_pass()
+            self._evict_former_members()
+            self._evict_revoked(entry.public)
         elif isinstance(entry, Secret):
             found = entry.opened(self.identity)
             if found is not None:
-                self._take_over(entry, found)
+                self._adopt_secret(entry, found)
         elif isinstance(entry, Grant):
-            self._keep_pass()
-            self._sweep()
+            self._store_pass()
+            self._evict_former_members()
         elif isinstance(entry, Admission):
             self._log.info("{name} is a member now", name=entry.member.name)
         elif isinstance(entry, Renewal):
-            self._keep_pass()
-            self._log.info("the certificate of {name} is renewed", name=entry.member.name)
+            self._store_pass()
+            self._log.info("the certificate of {name} was renewed", name=entry.member.name)
 
-    def _look_after(self) -> None:
-        self._sweep()
-        self._go_by_secrets()
+    def _run_periodic(self) -> None:
+        self._evict_former_members()
+        self._apply_secrets()
         if self._renewer.is_time(self._wall()):
             self._chores.fork(self._renew_due())
         newest = next(iter(self.roll.secrets()), None)
         if newest is not None and newest.number > self.membership.secrets[0][0]:
-            self._chores.fork(self._ask_for(newest))
+            self._chores.fork(self._request_secret(newest))
 
     async def _renew_due(self) -> None:
         """Renew some of the members that are due and present."""
-        due = [each for each in self._renewer.find_due(self._wall()) if self._may_be_here(each)]
+        due = [each for each in self._renewer.find_due(self._wall()) if self._may_be_reachable(each)]
         for member in self._renewer.pick(due):
-            if await self._is_here(member):
+            if await self._is_reachable(member):
                 self._renewer.renew(member, self._wall())
 
-    def _may_be_here(self, member: Member) -> bool:
-        """Whether ``member`` is in sight, or may be, since in a large network a node does not see everybody."""
+    def _may_be_reachable(self, member: Member) -> bool:
+        """Return whether ``member`` may be reachable; in a large network a node does not know all contacts."""
         assert self._node is not None
         is_me = member.public == self.identity.public
         overlay = self._node.overlay
         return is_me or overlay.is_large or overlay.contact(node_id(member.public)) is not None
 
-    async def _is_here(self, member: Member) -> bool:
-        """Whether ``member`` is this node, or answers."""
+    async def _is_reachable(self, member: Member) -> bool:
+        """Return whether ``member`` is this node, or replies."""
         assert self._node is not None
         if member.public == self.identity.public:
             return True
@@ -244,59 +244,59 @@ class Team:
             return False
         return True
 
-    def _keep_pass(self) -> None:
-        """Keep the pass that this node shows now, for its next start."""
-        self._keep(replace(self.membership, shown=self.door.shown))
+    def _store_pass(self) -> None:
+        """Store the current pass for the next start."""
+        self._store_membership(replace(self.membership, shown=self.door.shown))
 
-    def _sweep(self) -> None:
+    def _evict_former_members(self) -> None:
         if self._node is not None:
             for public, refusal in self.door.swept():
                 self._node.evict(public, refusal)
             self._node.review()
-            self._note_guests(self._node)
+            self._store_guest_passes(self._node)
 
-    def _note_guests(self, node: EntangledNode) -> None:
-        """Note the passes of those owners of records that are not on the roll, for the next start."""
+    def _store_guest_passes(self, node: EntangledNode) -> None:
+        """Store the passes of record owners that are not on the membership list, for the next start."""
         owners = [owner for owner in node.store.owners() if self.door.is_off_roll(owner)][-MAX_GUESTS:]
         noted = msgpack.packb([[owner, self.door.certificate(owner)] for owner in owners])
         if noted != (self._store.noted(GUESTS) or NO_GUESTS):
             self._store.note(GUESTS, noted)
 
-    def _part_with(self, public: bytes) -> None:
-        """Also of who is absent nothing is expected any more."""
+    def _evict_revoked(self, public: bytes) -> None:
+        """Evict revoked members, including those that are offline."""
         if self._node is None:
             return
         for each in (public, *self.roll.void):
             if self._node.overlay.known(node_id(each)) is not None:
                 self._node.evict(each, REVOKED)
 
-    def _take_over(self, entry: Secret, secret: bytes) -> None:
+    def _adopt_secret(self, entry: Secret, secret: bytes) -> None:
         self._log.info("the team has a new secret, number {number}", number=entry.number)
-        self._keep(self.membership.with_secret(entry.number, secret, entry.at + entry.grace))
-        self._go_by_secrets()
+        self._store_membership(self.membership.with_secret(entry.number, secret, entry.at + entry.grace))
+        self._apply_secrets()
 
-    def _go_by_secrets(self) -> None:
+    def _apply_secrets(self) -> None:
         accepted = [secret for _, secret, _ in self.membership.accepted(self._wall())]
         if accepted != self._accepted and self._node is not None:
             self._accepted = accepted
             self._node.endpoint.rekey(*accepted)
 
-    async def _ask_for(self, entry: Secret) -> None:
-        """Ask another member for a secret that was not sealed for this one, since it came in meanwhile."""
+    async def _request_secret(self, entry: Secret) -> None:
+        """Request a secret from another member, because it was encrypted before this node joined."""
         assert self._node is not None
         others = self._node.overlay.contacts()
         if others:
             found = await self._node.endpoint.ask(self._rng.choice(others), "roll.secret", entry.number)
             if isinstance(found, bytes) and entry.is_it(found):
-                self._take_over(entry, found)
+                self._adopt_secret(entry, found)
 
     def _answer_secret(self, peer: Contact, number: int) -> bytes | None:
-        """Give the secret to a present member, which is on the membership list, or to a guest of one."""
+        """Return the secret to a current member or guest; None to others."""
         if not self.door.roles_of(peer.public):
             return None
         return next((secret for known, secret, _ in self.membership.secrets if known == number), None)
 
-    def _given(self, shown: bytes) -> Welcome:
+    def _build_welcome(self, shown: bytes) -> Welcome:
         membership = self.membership
         assert self._node is not None
         contacts = [contact for contact in self._node.overlay.contacts() if not contact.address.host.startswith("~")]
@@ -304,9 +304,9 @@ class Team:
         secrets = tuple(membership.accepted(self._wall()))
         return Welcome(shown, secrets, tuple(picked))
 
-    def _keep(self, membership: Membership) -> None:
+    def _store_membership(self, membership: Membership) -> None:
         try:
             self._kept.keep(membership)
         except BadKeyFile as error:
-            self._log.error("what the team changed is not kept for the next start: {error}", error=error)
+            self._log.error("the changed membership could not be stored for the next start: {error}", error=error)
             self._kept.membership = membership

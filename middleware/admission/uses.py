@@ -1,7 +1,7 @@
-"""Uses: how often an invitation may be used, as tuples in the team's own space: each is taken at most once.
+"""Use counters of invitations: each use is a tuple in the team's tuple space, which can be taken at most once.
 
-So it does not matter how many bootstrap nodes there are, nor who dies or is cut off meanwhile; and a bootstrap node
-that sees too few of the team cannot tell, and says so.
+This holds for any number of bootstrap nodes, crashes and partitions.  A bootstrap node that reaches too few members
+cannot decide, and reports that.
 """
 
 from __future__ import annotations
@@ -21,27 +21,27 @@ SPACE = "admission"
 
 
 class Uses:
-    """The uses of all invitations, seen from one node."""
+    """The use counters of all invitations, accessed from one node."""
 
     def __init__(self, node: EntangledNode, clock: IReactorTime, rng: random.Random) -> None:
         self._space = TupleSpace(node, clock, rng, SPACE)
 
     def issue(self, invite: Invite) -> Deferred[list[None]]:
-        """Make ``invite`` usable as often as it says; fires when a majority knows, fails with a ``WeatherError``."""
+        """Put the uses of ``invite``; fires when a majority stored them, fails with a ``WeatherError``."""
         name = invitation_id(invite.public)
         puts = [self._space.put((name, number)) for number in range(invite.uses)]
-        return gatherResults(puts, consumeErrors=True).addErrback(_first)
+        return gatherResults(puts, consumeErrors=True).addErrback(_unwrap_first_error)
 
     def take(self, invite: Invite) -> Deferred[bool]:
-        """Use ``invite`` once; whether that was possible.  Fails with a ``WeatherError`` where nobody can tell."""
+        """Take one use of ``invite``; fires with whether one was left, fails with a ``WeatherError`` if undecidable."""
         taken = self._space.get_if_exists((invitation_id(invite.public), int))
         return taken.addCallback(lambda found: found is not None)
 
     def stop(self) -> None:
-        """End what is under way."""
+        """Cancel pending operations."""
         self._space.stop()
 
 
-def _first(failure: Failure) -> Failure:
-    """What went wrong itself: a ``FirstError`` is no line for a person."""
+def _unwrap_first_error(failure: Failure) -> Failure:
+    """Return the original failure instead of the ``FirstError`` around it."""
     return failure.value.subFailure if isinstance(failure.value, FirstError) else failure

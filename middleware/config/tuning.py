@@ -1,7 +1,7 @@
-"""Tuning: the settings of a node that can be changed while it runs; what was changed is kept in its store.
+"""Settings that can be changed while the node runs; changes are stored in the node's store.
 
-The device itself checks each change, by the rule of the settings file.  Nothing writes that file: what is kept goes
-before it, at each start.
+The device checks each change by the rules of the settings file.  The file is never written; stored changes override it
+at each start.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from middleware.node import SwarmNode
 
 SETTINGS, TUNE = "device.settings", "device.tune"
 WRONG = "setting"
-"""The code of a refusal whose text is ``KEY: problem; remedy``."""
+"""Code of a refusal with the text ``KEY: problem; remedy``."""
 NOTE = "tuning"
 
 
 @dataclass(frozen=True)
 class Knob:
-    """One setting: ``check`` returns what it is to be, or raises ``Invalid``; ``turn`` makes it so.
+    """One changeable setting: ``check`` converts a value or raises ``Invalid``; ``turn`` applies it.
 
-    ``least`` and ``most`` bound a number, or the characters of a text; both are for people.
+    ``least`` and ``most`` are the bounds of a number, or of the length of a text, for display.
     """
 
     key: str
@@ -47,27 +47,27 @@ class Knob:
 
 
 class Tuning:
-    """The knobs of one node; what was turned is kept in ``store``."""
+    """The changeable settings of one node; changes are kept in ``store``."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
         self._knobs: dict[str, Knob] = {}
-        self._kept = _kept(store)
+        self._stored = _load_stored(store)
 
     def add(self, knob: Knob) -> None:
-        """Have one more knob, and turn it to where it was left in an earlier life."""
+        """Add a setting, and apply its stored value."""
         self._knobs[knob.key] = knob
-        if knob.key in self._kept:
-            with suppress(Invalid):  # it was lawful when it was kept; the file's value holds
-                knob.turn(knob.check(self._kept[knob.key]))
+        if knob.key in self._stored:
+            with suppress(Invalid):  # valid when it was stored; otherwise the file's value applies
+                knob.turn(knob.check(self._stored[knob.key]))
 
     def told(self) -> list[list[object]]:
-        """Each knob as ``[key, value, about, unit, least, most]``."""
+        """Return each setting as ``[key, value, about, unit, least, most]``."""
         return [[k.key, k.read(), k.about, k.unit, k.least, k.most] for k in self._knobs.values()]
 
     def change(self, changes: Mapping[Any, Any]) -> list[list[object]]:
-        """Turn some, all or none; raises ``Refused`` with the code ``WRONG``."""
-        checked = {key: self._checked(key, value) for key, value in changes.items()}
+        """Apply all changes or none; raises ``Refused`` with the code ``WRONG``."""
+        checked = {key: self._check_change(key, value) for key, value in changes.items()}
         before = {key: self._knobs[key].read() for key in checked}
         for key, value in checked.items():
             try:
@@ -75,31 +75,31 @@ class Tuning:
             except Invalid as wrong:
                 for other, old in before.items():
                     self._knobs[other].turn(old)
-                raise _refused(key, wrong) from None
-        self._kept.update(changes)
-        self._store.note(NOTE, bytes(msgpack.packb(self._kept)))
+                raise _make_refusal(key, wrong) from None
+        self._stored.update(changes)
+        self._store.note(NOTE, bytes(msgpack.packb(self._stored)))
         return self.told()
 
-    def _checked(self, key: object, value: object) -> Any:
+    def _check_change(self, key: object, value: object) -> Any:
         if not isinstance(key, str) or key not in self._knobs:
-            remedy = f"the nearest is {nearest_of(str(key), self._knobs)}" if self._knobs else "let be"
-            raise _refused(key, Invalid("", "cannot be changed on this device", remedy))
+            remedy = f"the nearest is {nearest_of(str(key), self._knobs)}" if self._knobs else "leave it unchanged"
+            raise _make_refusal(key, Invalid("", "cannot be changed on this device", remedy))
         try:
             return self._knobs[key].check(value)
         except Invalid as wrong:
-            raise _refused(key, wrong) from None
+            raise _make_refusal(key, wrong) from None
 
     def answer_settings(self, peer: Contact) -> list[list[object]]:
-        """Say what can be changed."""
+        """Answer a request for the settings."""
         return self.told()
 
     def answer_tune(self, peer: Contact, changes: dict[str, object]) -> list[list[object]]:
-        """Change it."""
+        """Answer a request to change settings."""
         return self.change(changes)
 
 
 def answer_tuning(node: SwarmNode, settings: Settings, body: Capabilities | None = None) -> Tuning:
-    """Have ``node`` tell and change what of ``settings`` can be changed; ``body`` is what its robot can do."""
+    """Expose the changeable settings of ``node``; ``body`` are the capabilities of its robot."""
     tuning = Tuning(node.store)
 
     def check(key: str) -> Callable[[Any], Any]:
@@ -122,25 +122,25 @@ def answer_tuning(node: SwarmNode, settings: Settings, body: Capabilities | None
     tuning.add(
         Knob("description", about, lambda: node.presence.device.description, describe, check("description"), most=200)
     )
-    about = "How long the others believe in the device without a sign of it"
+    about = "Time until other nodes consider a silent device lost"
     lease = node.entangled
     tuning.add(
         Knob("presence_lease", about, lambda: lease.lease, lease.set_lease, check("presence_lease"), "s", 0.1, 60.0)
     )
-    about = "What the device can do beyond what its driver says"
+    about = "Capabilities of the device in addition to its driver's"
     tuning.add(Knob("capabilities", about, lambda: extra, enable, check("capabilities")))
     node.entangled.endpoint.expose(SETTINGS, tuning.answer_settings, changes=True, idempotent=True)
     node.entangled.endpoint.expose(TUNE, tuning.answer_tune, changes=True, idempotent=True)
     return tuning
 
 
-def _refused(key: object, wrong: Invalid) -> Refused:
+def _make_refusal(key: object, wrong: Invalid) -> Refused:
     return Refused(f"{str(key)[:64]}: {wrong.problem}; {wrong.remedy}", WRONG)
 
 
-def _kept(store: Store) -> dict[str, Any]:
+def _load_stored(store: Store) -> dict[str, Any]:
     try:
         kept = msgpack.unpackb(store.noted(NOTE) or b"\x80")
-    except Exception:  # a rotten file may hold anything
+    except Exception:  # damaged file
         return {}
     return kept if isinstance(kept, dict) else {}

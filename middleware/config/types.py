@@ -1,4 +1,4 @@
-"""Setting: the types of a node's settings, each with its constraints."""
+"""Types of a node's settings with their constraints."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def _read_address(text: str) -> Address:
     host, _, number = text.rpartition(":")
     host = host.removeprefix("[").removesuffix("]")
     if not re.fullmatch(r"[A-Za-z0-9._:-]{1,45}", host) or not re.fullmatch(r"[0-9]{1,5}", number):
-        raise ValueError(f"{show_value(text)} is no address")
+        raise ValueError(f"{show_value(text)} is not an address")
     if not 0 < int(number) <= 65535:
         raise ValueError(f"the port of {show_value(text)} is not from 1 to 65535")
     return Address(host, int(number))
@@ -66,7 +66,7 @@ class Part(Struct, forbid_unknown_fields=True):
     options: dict[str, Any] = {}
 
 
-# Patterns end with $(?!\n): $ alone also matches before a last line break, and JSON schemas do not know \Z.
+# Patterns end with $(?!\n): $ alone also matches before a final newline, and JSON Schema does not have \Z.
 Word = Annotated[str, Meta(max_length=40), LINE]
 Sentence = Annotated[str, Meta(max_length=200), LINE]
 File = Annotated[str, Meta(min_length=1, max_length=4000), LINE]

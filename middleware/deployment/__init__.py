@@ -1,1 +1,1 @@
-"""Deployment: an operator's signed strategies and behaviours for a team that runs (thesis, section 4.3.4)."""
+"""Deployment of strategies and behaviours that an operator signed to a running team (thesis, section 4.3.4)."""

@@ -1,8 +1,9 @@
-"""Confinement: a process gives up its rights before it runs pushed code; this cannot be undone.
+"""Confinement of the process that runs pushed code: irreversibly drop its privileges before the code runs.
 
-On Linux: no new file, socket, process or thread (seccomp, an allow list of system calls), no network (an
-empty network namespace), no capabilities, no rights of root, an empty root folder if that is allowed, an end with the
-parent, and limits of memory and processor time.  On other systems only the limits.  ``confine`` says what holds.
+On Linux the process has no new files, sockets, processes or threads (seccomp with an allow list of system calls), no
+network (an empty network namespace), no capabilities, no root privileges, an empty root folder if permitted, SIGKILL
+when its parent ends, and limits of memory and processor time.  On other systems only the limits apply.  ``confine``
+returns which of these are in effect.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from contextlib import suppress
 MEMORY = 256 * 1024 * 1024
 """Bytes of address space in addition to the libraries."""
 CPU_S = 3600
-"""Seconds of processor time of one process; then it is ended, and started again when it is needed."""
+"""Seconds of processor time per process; then it is killed, and restarted at the next request."""
 NOBODY = 65534
 
 _CLONE_NEWNET, _CLONE_NEWUSER, _CLONE_NEWIPC = 0x40000000, 0x10000000, 0x08000000
@@ -37,9 +38,9 @@ CALLS = (
     *("futex", "set_robust_list", "rseq", "sched_yield", "getpid", "getrandom"),
     *("clock_gettime", "gettimeofday", "nanosleep", "clock_nanosleep", "exit", "exit_group"),
 )
-"""System calls that a module may make, on the files that are open; all others fail with EPERM."""
+"""System calls that a module may make, on files that are already open; all others fail with EPERM."""
 _NUMBERS: dict[str, tuple[int, int, tuple[int, ...]]] = {
-    # machine: architecture for seccomp, number of the call seccomp, numbers of CALLS in their order
+    # machine: architecture for seccomp, number of the system call seccomp, numbers of CALLS in their order
     "x86_64": (
         0xC000003E,
         317,
@@ -56,11 +57,11 @@ _NUMBERS: dict[str, tuple[int, int, tuple[int, ...]]] = {
 
 
 def confine(parent: int) -> list[str]:
-    """Give up all that can be given up; returns the names of what holds.
+    """Drop all privileges that the system permits to drop; returns the names of the limits in effect.
 
-    ``parent`` is the process with which this one ends.  Whatever the system does not allow is left out.
+    ``parent`` is the id of the process with which this one ends.
     """
-    held = ["limits"] if _limit() else []
+    held = ["limits"] if _set_limits() else []
     if not sys.platform.startswith("linux"):
         return held
     libc = ctypes.CDLL(None, use_errno=True)
@@ -72,8 +73,8 @@ def confine(parent: int) -> list[str]:
         ("no capabilities", lambda: _drop_capabilities(libc)),
         ("no new rights", lambda: libc.prctl(_PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0) == 0),
         ("no tracing", lambda: libc.prctl(_PR_SET_DUMPABLE, 0, 0, 0, 0) == 0),
-        ("ends with node", lambda: _die_with(libc, parent)),
-        ("seccomp", lambda: _filter(libc, platform.machine())),
+        ("ends with node", lambda: _end_with_parent(libc, parent)),
+        ("seccomp", lambda: _install_filter(libc, platform.machine())),
     ]
     for name, step in steps:
         with suppress(OSError, ValueError, AttributeError):
@@ -83,7 +84,7 @@ def confine(parent: int) -> list[str]:
 
 
 def filter_program(machine: str) -> bytes:
-    """The seccomp program for a machine, as ``struct sock_filter``; raises ``ValueError`` for one it is not known."""
+    """Return the seccomp program for ``machine``, as ``struct sock_filter``; raises ``ValueError`` if it is unknown."""
     if machine not in _NUMBERS:
         raise ValueError(f"no system call numbers for {machine}")
     architecture, _, numbers = _NUMBERS[machine]
@@ -99,7 +100,7 @@ def filter_program(machine: str) -> bytes:
     return b"".join(struct.pack("=HBBI", *line) for line in lines)
 
 
-def _limit() -> bool:
+def _set_limits() -> bool:
     used = 0
     with suppress(OSError, ValueError, IndexError), open("/proc/self/statm", encoding="ascii") as file:
         used = int(file.read().split()[0]) * resource.getpagesize()
@@ -142,7 +143,7 @@ def _drop_capabilities(libc: ctypes.CDLL) -> bool:
     return bool(libc.capset(header, bytes(24)) == 0)
 
 
-def _die_with(libc: ctypes.CDLL, parent: int) -> bool:
+def _end_with_parent(libc: ctypes.CDLL, parent: int) -> bool:
     if libc.prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL), 0, 0, 0) != 0:
         return False
     if os.getppid() != parent:
@@ -150,10 +151,10 @@ def _die_with(libc: ctypes.CDLL, parent: int) -> bool:
     return True
 
 
-def _filter(libc: ctypes.CDLL, machine: str) -> bool:
+def _install_filter(libc: ctypes.CDLL, machine: str) -> bool:
     program = ctypes.create_string_buffer(filter_program(machine))
     size = (len(program) - 1) // 8
-    # struct sock_fprog: a count, and behind padding the address of the lines.
+    # struct sock_fprog: a count and, after padding, the address of the instructions.
     pointer = struct.pack("@HP", size, ctypes.addressof(program))
     _, call, _ = _NUMBERS[machine]
     return bool(libc.syscall(call, _SECCOMP_SET_MODE_FILTER, _SECCOMP_FILTER_FLAG_TSYNC, pointer) == 0)

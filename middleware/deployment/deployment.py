@@ -1,9 +1,9 @@
-"""Deployment: one node's acceptance of what its operators push; off where the owner has not allowed it.
+"""Acceptance of pushed modules by one node; disabled unless the device's owner allows it.
 
-In this order: is the module listed, is its author's key, is the author an operator of the team now, is the signature
-good, is it newer than the held version, has the source the signed digest, does it load and conform.  Each module runs
-in a separate process (``runner``), and none of it before all this is checked.  The author is judged again every second:
-the modules of one that is an operator no longer stop.
+The node checks in this order: the module's name is listed, its author's key is listed, the author is an operator of the
+team now, the signature is valid, the version is newer than the current one, the source has the signed digest, the
+module loads and conforms.  Each module runs in a separate process (``runner``), after all checks have passed.
+The author's role is checked again every second: the modules of a former operator stop.
 """
 
 from __future__ import annotations
@@ -29,27 +29,27 @@ from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import Record, hashed_key, unpacked
 
 RETRY = 2.0
-"""Seconds after which a source that nobody could send is asked for again."""
+"""Seconds until a source is requested again that no node could send."""
 WATCHING_S = 1.0
-"""Seconds between two looks at the authors and the processes."""
+"""Seconds between two checks of authors and processes."""
 STARTING_S = 0.05
-"""Seconds between two looks at a process that starts."""
+"""Seconds between two checks of a process that is starting."""
 IDLE_S = 60.0
-"""Seconds after which the process of the version before is ended, if it was not asked."""
+"""Seconds after which the process of the previous version is ended if it is not used."""
 EDITIONS = 2
-"""Editions of one module on the shelf: the one that runs, and the one before."""
+"""Editions of one module that are stored: the running one and the previous one."""
 MAX_JUDGED = 256
-"""Manifests that are remembered as judged; more forget the first, which is then judged, and told of, again."""
+"""Maximum number of manifests that are remembered as checked; a dropped one is checked and reported again."""
 MAX_NAME = 16
 CONFINED = "seccomp"
-"""The limit without which the device says that a module is not confined."""
+"""The limit without which the device reports a module as not confined."""
 
 Later = Callable[..., object]
 
 
 @dataclass(frozen=True)
 class Author:
-    """The member with a key: its ``roles`` now, None in an open team."""
+    """The author of a module: its name, and its ``roles`` now, None in an open team."""
 
     name: str
     roles: frozenset[str] | None
@@ -63,11 +63,11 @@ class _Candidate:
 
 
 class Deployment:
-    """The modules of one node.
+    """The pushed modules of one node.
 
-    ``modules`` maps (kind, name) to what makes the strategy or behaviour; agents look there.  ``later(seconds, call)``
-    is the node's own, so that it ends with the node.  ``author_of`` tells who holds a key, ``spawn`` starts a process,
-    ``seconds`` is the monotonic clock.
+    ``modules`` maps (kind, name) to the factory of the strategy or behaviour; agents look it up there.
+    ``later(seconds, call)`` is the node's timer, which ends with the node.  ``author_of`` returns the holder of a key,
+    ``spawn`` starts a process, ``seconds`` is the monotonic clock.
     """
 
     _log = Logger()
@@ -97,24 +97,24 @@ class Deployment:
         self._wanted: dict[str, tuple[Manifest, Record]] = {}
         self._running: dict[str, tuple[Runner, Record]] = {}
         self._starting: dict[str, tuple[Runner, Record]] = {}
-        self._before: dict[str, tuple[Runner, Record]] = {}
-        self._refused: dict[str, str] = {}
+        self._previous: dict[str, tuple[Runner, Record]] = {}
+        self._refusals: dict[str, str] = {}
         self._reported: dict[str, str] = {}
         self._records: dict[tuple[bytes, str], Record] = {}
-        self._unfit: dict[tuple[bytes, str], int] = {}
+        self._unauthorized: dict[tuple[bytes, str], int] = {}
 
     @property
     def held(self) -> Mapping[str, Manifest]:
-        """The manifests of the modules that run here, by name."""
+        """The manifests of the modules that run on this node, by name."""
         return {name: runner.manifest for name, (runner, _) in self._running.items()}
 
     def open(self) -> None:
-        """Load what was accepted in an earlier life, if it would be accepted now."""
+        """Load the stored modules that the node would accept now."""
         found: dict[str, list[_Candidate]] = {}
         for name, content in self._shelf.everything():
-            pair = _unshelved(content)
+            pair = _parse_stored(content)
             if pair is None:
-                self._say(f"deployed file {name} is damaged and left out")
+                self._publish_message(f"deployed file {name} is damaged and ignored")
                 continue
             record, source = pair
             manifest = manifest_of(record)
@@ -124,23 +124,23 @@ class Deployment:
             else:
                 found.setdefault(manifest.name, []).append(_Candidate(manifest, record, source))
         for name in sorted(found):
-            # The newest that loads; the one before it is there for the day on which the newest does not.
+            # The newest one that loads; the previous one is used if the newest does not load.
             self._start(sorted(found[name], key=lambda each: each.manifest.rank, reverse=True), is_new=False)
         self._report()
         self._later(WATCHING_S, self._watch)
 
     def follow(self) -> None:
-        """Watch what is pushed; to be called once the node has joined."""
-        self._entangled.watch(manifests_key(), self._pushed)
+        """Watch for pushed modules; call this once the node has joined."""
+        self._entangled.watch(manifests_key(), self._on_manifests)
 
     def stop(self) -> None:
-        """End all processes."""
-        for runner, _ in (*self._running.values(), *self._starting.values(), *self._before.values()):
+        """End all module processes."""
+        for runner, _ in (*self._running.values(), *self._starting.values(), *self._previous.values()):
             runner.stop("the node has left")
 
-    # -- what is pushed ---------------------------------------------------------------------------------------------
+    # -- received manifests -----------------------------------------------------------------------------------------
 
-    def _pushed(self, records: list[Record]) -> None:
+    def _on_manifests(self, records: list[Record]) -> None:
         for record in sorted(records, key=lambda each: (each.name, each.owner)):
             slot = (record.owner, record.name)
             known = self._records.get(slot)
@@ -154,35 +154,35 @@ class Deployment:
 
     def _judge(self, record: Record) -> None:
         manifest = manifest_of(record)
-        standing = self._author_objection(record) if self._is_listed(record) else ""
+        objection = self._author_objection(record) if self._is_listed(record) else ""
         slot = (record.owner, record.name)
-        if standing:
-            self._unfit[slot] = record.sequence
+        if objection:
+            self._unauthorized[slot] = record.sequence
         else:
-            self._unfit.pop(slot, None)
-        reason = self._objection(record, manifest) or self._staleness(manifest)
+            self._unauthorized.pop(slot, None)
+        reason = self._objection(record, manifest) or self._rank_objection(manifest)
         if manifest is None or reason:
             self._refuse(record, manifest, reason)
         elif manifest != self.held.get(manifest.name):
             wanted = self._wanted.get(manifest.name)
             if wanted is None or manifest.rank > wanted[0].rank or self._objection(wanted[1], wanted[0]):
                 self._wanted[manifest.name] = (manifest, record)
-                self._ask(manifest, record)
+                self._request_source(manifest, record)
 
     def _is_listed(self, record: Record) -> bool:
         return record.name in self._allowed.modules and record.owner.hex() in self._allowed.operators
 
     def _objection(self, record: Record, manifest: Manifest | None) -> str:
-        """Why nothing of this record may run here; empty where it may."""
+        """Return the reason why this record may not run on this node; empty if it may."""
         if record.name not in self._allowed.modules:
             return "is not among this node's modules"
         if record.owner.hex() not in self._allowed.operators:
             return f"comes from {record.owner.hex()[:8]}, no operator of this node"
         if not record.is_genuine():
             return "is not signed by its operator"
-        standing = self._author_objection(record)
-        if standing:
-            return standing
+        objection = self._author_objection(record)
+        if objection:
+            return objection
         if manifest is None:
             return "has a manifest that cannot be read"
         if manifest.size > MAX_SOURCE:
@@ -190,14 +190,14 @@ class Deployment:
         return ""
 
     def _author_objection(self, record: Record) -> str:
-        """Why its author may push nothing now; empty if it may."""
+        """Return the reason why the author may not push modules now; empty if it may."""
         author = self._author_of(record.owner)
         if author.roles is None or OPERATOR in author.roles:
             return ""
         return f"comes from {record.owner.hex()[:8]}, which is no operator of the team now"
 
-    def _staleness(self, manifest: Manifest | None) -> str:
-        """Why what is held here stays; empty where it does not, or is the very same."""
+    def _rank_objection(self, manifest: Manifest | None) -> str:
+        """Return the reason why the current version stays; empty if ``manifest`` is newer or identical."""
         held = None if manifest is None else self.held.get(manifest.name)
         if manifest is None or held is None or manifest == held:
             return ""
@@ -210,38 +210,38 @@ class Deployment:
             return f"version {manifest.version} is older than the {held.version} held{taken_back}"
         return ""
 
-    def _ask(self, manifest: Manifest, record: Record) -> None:
+    def _request_source(self, manifest: Manifest, record: Record) -> None:
         if self._wanted.get(manifest.name) != (manifest, record):
             return
         try:
             asked: Deferred[list[Record]] = self._entangled.get(hashed_key(source_key(manifest.digest)))
         except NotRunning:
             return
-        asked.addCallback(self._sent, manifest, record)
-        asked.addErrback(self._unsent, manifest, record)
+        asked.addCallback(self._on_source, manifest, record)
+        asked.addErrback(self._on_source_error, manifest, record)
 
-    def _sent(self, records: list[Record], manifest: Manifest, record: Record) -> None:
+    def _on_source(self, records: list[Record], manifest: Manifest, record: Record) -> None:
         sources = [each.value for each in records if each.value is not None and len(each.value) == manifest.size]
         source = next((each for each in sources if digest_of(each) == manifest.digest), None)
         if self._wanted.get(manifest.name) != (manifest, record):
             return
         if source is None:
-            self._log.info("nobody has the source of {name} {label} yet", name=manifest.name, label=manifest.label)
-            self._later(RETRY, self._ask, manifest, record)
+            self._log.info("no node has the source of {name} {label} yet", name=manifest.name, label=manifest.label)
+            self._later(RETRY, self._request_source, manifest, record)
             return
         del self._wanted[manifest.name]
         self._start([_Candidate(manifest, record, source)], is_new=True)
         self._report()
 
-    def _unsent(self, failure: Any, manifest: Manifest, record: Record) -> None:
+    def _on_source_error(self, failure: Any, manifest: Manifest, record: Record) -> None:
         failure.trap(EntangledError)
         if failure.check(NotRunning) is None:
-            self._later(RETRY, self._ask, manifest, record)
+            self._later(RETRY, self._request_source, manifest, record)
 
     # -- processes --------------------------------------------------------------------------------------------------
 
     def _start(self, candidates: list[_Candidate], is_new: bool) -> None:
-        """Start a process for the first that loads; what runs is used until another is ready."""
+        """Start a process for the first candidate that loads; the running version is used until another is ready."""
         if not candidates:
             return
         manifest, record = candidates[0].manifest, candidates[0].record
@@ -253,22 +253,22 @@ class Deployment:
         )
         self._starting[manifest.name] = (runner, record)
         runner.start()
-        self._settle(runner, candidates, is_new)
+        self._check_start(runner, candidates, is_new)
 
-    def _settle(self, runner: Runner, candidates: list[_Candidate], is_new: bool) -> None:
-        """See what came of a start."""
+    def _check_start(self, runner: Runner, candidates: list[_Candidate], is_new: bool) -> None:
+        """Check the result of a start."""
         name = runner.manifest.name
         if self._starting.get(name, (None,))[0] is not runner:
             return
         runner.look()
         if runner.state is State.STARTING:
-            self._later(STARTING_S, self._settle, runner, candidates, is_new)
+            self._later(STARTING_S, self._check_start, runner, candidates, is_new)
             return
         del self._starting[name]
         if runner.state is State.READY:
             self._adopt(runner, candidates[0])
             if is_new:
-                self._keep(candidates[0])
+                self._store(candidates[0])
         else:
             runner.stop(runner.why)
             self._refuse(candidates[0].record, runner.manifest, runner.why)
@@ -276,78 +276,78 @@ class Deployment:
         self._report()
 
     def _adopt(self, runner: Runner, candidate: _Candidate) -> None:
-        """Use this version from now on; tasks under way continue with the previous one."""
+        """Use this version from now on; running tasks continue with the previous one."""
         manifest = runner.manifest
         before = self._running.get(manifest.name)
         if before is not None:
-            older = self._before.get(manifest.name)
+            older = self._previous.get(manifest.name)
             if older is not None:
                 older[0].stop("two newer ones were pushed")
-            self._before[manifest.name] = before
+            self._previous[manifest.name] = before
         self._running[manifest.name] = (runner, candidate.record)
         is_strategy = manifest.kind == STRATEGY
         self.modules[manifest.kind, manifest.name] = (
-            (lambda: PushedStrategy(runner)) if is_strategy else runner.create  # what tasks of that name get
+            (lambda: PushedStrategy(runner)) if is_strategy else runner.create  # factory for new tasks
         )
-        self._refused.pop(manifest.name, None)
+        self._refusals.pop(manifest.name, None)
         if CONFINED not in runner.limits:
             held = ", ".join(runner.limits) or "none"
-            self._log.warn("{name} runs without seccomp; its limits: {held}", name=manifest.name, held=held)
-        self._say(f"runs {manifest.kind} {manifest.name} {manifest.label}")
+            self._log.warn("{name} runs without seccomp; limits in effect: {held}", name=manifest.name, held=held)
+        self._publish_message(f"runs {manifest.kind} {manifest.name} {manifest.label}")
 
     def _watch(self) -> None:
-        """Stop what may run no longer, look after the processes, and judge again who was no operator."""
+        """Stop modules that may no longer run, supervise processes, and check again authors that were not operators."""
         self._later(WATCHING_S, self._watch)
         now = self._seconds()
         for runner, record in (*self._running.values(), *self._starting.values()):
             reason = self._objection(record, runner.manifest)
             if reason:
-                self._expel(runner, record, reason)
+                self._stop_module(runner, record, reason)
             else:
                 runner.look()
-        for name, (runner, record) in list(self._before.items()):
+        for name, (runner, record) in list(self._previous.items()):
             runner.look()
             is_idle = not runner.instances and now - runner.asked_at > IDLE_S
             reason = self._objection(record, runner.manifest) or ("a newer one was pushed" if is_idle else "")
             if reason or runner.state is State.OUT:
                 runner.stop(reason)
-                del self._before[name]
-        for slot, sequence in list(self._unfit.items()):
+                del self._previous[name]
+        for slot, sequence in list(self._unauthorized.items()):
             known = self._records.get(slot)
             if known is None or known.sequence != sequence:
-                del self._unfit[slot]
+                del self._unauthorized[slot]
             elif not self._author_objection(known):
                 self._judge(known)
         self._report()
 
-    def _expel(self, runner: Runner, record: Record, reason: str) -> None:
-        """End a module whose author may push no longer, and judge the modules of other authors again."""
+    def _stop_module(self, runner: Runner, record: Record, reason: str) -> None:
+        """Stop a module whose author may no longer push, and judge the modules of other authors again."""
         manifest = runner.manifest
         runner.stop(reason)
         self._starting.pop(manifest.name, None)
         if self._running.get(manifest.name, (None,))[0] is runner:
             del self._running[manifest.name]
             self.modules.pop((manifest.kind, manifest.name), None)
-            before = self._before.pop(manifest.name, None)
+            before = self._previous.pop(manifest.name, None)
             if before is not None:
                 before[0].stop(reason)
         for known in [each for each in self._records.values() if each.name == manifest.name]:
             self._judge(known)
         self._refuse(record, manifest, reason)
 
-    # -- what is told -----------------------------------------------------------------------------------------------
+    # -- storage and reports ----------------------------------------------------------------------------------------
 
-    def _keep(self, candidate: _Candidate) -> None:
+    def _store(self, candidate: _Candidate) -> None:
         manifest = candidate.manifest
         content = bytes(msgpack.packb([candidate.record.packed(), candidate.source]))
         try:
-            self._shelf.keep(_file(manifest), content)
+            self._shelf.keep(_file_name(manifest), content)
         except OSError as error:
-            self._say(f"{manifest.name} {manifest.version} is not on file: {error.strerror or error}")
+            self._publish_message(f"cannot store {manifest.name} {manifest.version}: {error.strerror or error}")
             return
         kept = []
         for name, data in self._shelf.everything():
-            pair = _unshelved(data)
+            pair = _parse_stored(data)
             other = None if pair is None else manifest_of(pair[0])
             if other is not None and other.name == manifest.name:
                 kept.append((other.rank, name))
@@ -359,53 +359,53 @@ class Deployment:
         shown = "".join(c for c in record.name[:32] if c.isprintable())
         self._log.warn("refused: {name}{version} {reason}", name=shown, version=version, reason=reason)
         if record.name in self._allowed.modules:
-            self._refused[record.name] = f"{self._told(record, manifest)} refused"
-        self._say(f"refuses {shown}{version}: {reason}")
+            self._refusals[record.name] = f"{self._describe(record, manifest)} refused"
+        self._publish_message(f"refuses {shown}{version}: {reason}")
 
     def _report(self) -> None:
-        told = {}
+        described = {}
         for name in self._allowed.modules:
             words = []
             if name in self._running:
                 runner, record = self._running[name]
-                words.append(f"{self._told(record, runner.manifest)} {_state(runner)}")
+                words.append(f"{self._describe(record, runner.manifest)} {_describe_state(runner)}")
             if name in self._starting:
-                words.append(f"{self._told(self._starting[name][1], self._starting[name][0].manifest)} is started")
+                words.append(f"{self._describe(self._starting[name][1], self._starting[name][0].manifest)} is started")
             elif name in self._wanted:
-                words.append(f"{self._told(self._wanted[name][1], self._wanted[name][0])} waits for its source")
-            if name in self._refused:
-                words.append(self._refused[name])
+                words.append(f"{self._describe(self._wanted[name][1], self._wanted[name][0])} waits for its source")
+            if name in self._refusals:
+                words.append(self._refusals[name])
             if words:
-                told[name] = ", ".join(words)
-        if told != self._reported:
-            self._reported = told
-            self._presence.change(deployed=told)
+                described[name] = ", ".join(words)
+        if described != self._reported:
+            self._reported = described
+            self._presence.change(deployed=described)
 
-    def _told(self, record: Record, manifest: Manifest | None) -> str:
-        """Version, digest and author of a module, for people."""
+    def _describe(self, record: Record, manifest: Manifest | None) -> str:
+        """Return version, digest and author of a module for display."""
         label = "" if manifest is None else f"{manifest.label} "
         name = "".join(c for c in self._author_of(record.owner).name[:MAX_NAME] if c.isprintable())
         return f"{label}by {name} {record.owner.hex()[:8]}".replace("  ", " ")
 
-    def _say(self, text: str) -> None:
+    def _publish_message(self, text: str) -> None:
         self._presence.say(self._wall(), text)
 
 
-def _state(runner: Runner) -> str:
+def _describe_state(runner: Runner) -> str:
     if runner.state is State.READY:
         return "runs" if CONFINED in runner.limits else "runs, not confined"
     return "was ended" if runner.state in (State.LOST, State.OUT) else "is started"
 
 
-def _file(manifest: Manifest) -> str:
+def _file_name(manifest: Manifest) -> str:
     return f"{manifest.name}-{manifest.digest[:16]}"
 
 
-def _unshelved(content: bytes) -> tuple[Record, bytes] | None:
-    """The record and the source in a file of the shelf, or None where it is not whole."""
+def _parse_stored(content: bytes) -> tuple[Record, bytes] | None:
+    """Return the record and the source in a stored file, or None if it is damaged."""
     try:
         fields = msgpack.unpackb(content)
-    except Exception:  # a rotten file may hold anything
+    except Exception:  # damaged file
         return None
     if not isinstance(fields, list) or len(fields) != 2 or not isinstance(fields[1], bytes):
         return None

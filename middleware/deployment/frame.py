@@ -1,8 +1,8 @@
-"""The messages between a node and the process that runs a pushed module, and the channel that carries them; pure.
+"""Messages and channel between a node and the process of a pushed module.  Pure.
 
-A question is ``[number, verb, arguments]``, its answer ``[number, is_well, content]``, each in msgpack behind its
-length in four bytes.  The node trusts nothing in an answer: its size is limited before it is read, and its number has
-to belong to an open question.
+A request is ``[number, verb, arguments]`` and its reply ``[number, is_well, content]``, in msgpack with a 4-byte length
+prefix.  The node does not trust replies: it limits their size before parsing, and the number must be that of a pending
+request.
 """
 
 from __future__ import annotations
@@ -14,53 +14,53 @@ from typing import Any, Protocol
 import msgpack
 
 LOAD, MAKE, CALL, DROP = "load", "make", "call", "drop"
-"""Verbs: load the module; make an instance; call a method of one; drop it."""
+"""Verbs: load the module; create an instance; call a method of an instance; delete it."""
 FIRST = 0
-"""The instance of a strategy: strategies are pure, so one serves all tasks."""
+"""The instance of a strategy: strategies are pure, so one instance serves all tasks."""
 MAX_QUESTION = 4 * 1024 * 1024
-"""Bytes of a question: an observation with a picture, or a module's source."""
+"""Maximum size of a request in bytes: an observation with a picture, or a module's source."""
 MAX_ANSWER = 64 * 1024
 _LENGTH = struct.Struct("!I")
 
 
 class BadFrame(ValueError):
-    """Bytes that are no message, or too large a one."""
+    """The bytes are not a valid message, or exceed the size limit."""
 
 
 def pack(content: object) -> bytes:
-    """A message with its length; raises ``BadFrame`` if ``content`` is no plain value."""
+    """Pack a message with its length prefix; raises ``BadFrame`` if ``content`` is not a plain value."""
     try:
         packed = bytes(msgpack.packb(content))
     except Exception as error:  # msgpack raises many things
-        raise BadFrame(f"is no plain value: {error}") from error
+        raise BadFrame(f"is not a plain value: {error}") from error
     return _LENGTH.pack(len(packed)) + packed
 
 
 def unpack_question(message: bytes) -> tuple[int, str, list[Any]]:
-    """A question; raises ``BadFrame``."""
-    number, verb, arguments = _three(message)
+    """Parse a request; raises ``BadFrame``."""
+    number, verb, arguments = _parse_message(message)
     if not isinstance(verb, str) or not isinstance(arguments, list):
-        raise BadFrame("is no question")
+        raise BadFrame("is not a valid request")
     return number, verb, arguments
 
 
 def unpack_answer(message: bytes) -> tuple[int, bool, Any]:
-    """An answer; raises ``BadFrame``."""
-    number, is_well, content = _three(message)
+    """Parse a reply; raises ``BadFrame``."""
+    number, is_well, content = _parse_message(message)
     if not isinstance(is_well, bool):
-        raise BadFrame("is no answer")
+        raise BadFrame("is not a valid reply")
     return number, is_well, content
 
 
 class Splitter:
-    """Splits a stream into messages of at most ``limit`` bytes."""
+    """Split a byte stream into messages of at most ``limit`` bytes."""
 
     def __init__(self, limit: int) -> None:
         self._limit = limit
         self._rest = b""
 
     def feed(self, data: bytes) -> list[bytes]:
-        """The messages that are whole now, without their lengths; raises ``BadFrame`` for one that is too large."""
+        """Return the messages that are complete now, without prefixes; raises ``BadFrame`` if one is too large."""
         self._rest += data
         found = []
         while len(self._rest) >= _LENGTH.size:
@@ -75,36 +75,36 @@ class Splitter:
         return found
 
 
-def _three(message: bytes) -> tuple[int, Any, Any]:
+def _parse_message(message: bytes) -> tuple[int, Any, Any]:
     try:
         fields = msgpack.unpackb(message, use_list=True)
     except Exception as error:  # msgpack raises many things
-        raise BadFrame(f"cannot be read: {error}") from error
+        raise BadFrame(f"is not msgpack: {error}") from error
     if not isinstance(fields, list) or len(fields) != 3 or type(fields[0]) is not int:
-        raise BadFrame("has not three fields with a number first")
+        raise BadFrame("does not have three fields with a number first")
     return fields[0], fields[1], fields[2]
 
 
 class Gone(Exception):
-    """The process has ended, or said what no answer can be; the text says which."""
+    """The process has ended or sent an invalid reply; the text says which."""
 
 
 class Channel(Protocol):
-    """The two pipes of a running process, as the node sees them; ``receive`` and ``send`` raise ``Gone``."""
+    """The node's end of the two pipes of a process; ``receive`` and ``send`` raise ``Gone``."""
 
     def send(self, message: bytes) -> None:
-        """Send a message; the next ``receive`` sends the rest that the pipe does not take now."""
+        """Send a message; the next ``receive`` sends the part that does not fit into the pipe now."""
 
     @property
     def is_behind(self) -> bool:
-        """Whether something is left to be sent."""
+        """Whether a part of a message is not sent yet."""
 
     def receive(self, within_s: float) -> list[bytes]:
-        """The received messages; if there is none yet, wait for one at most ``within_s`` seconds."""
+        """Return the received messages; if there is none, wait for one for at most ``within_s`` seconds."""
 
     def end(self) -> None:
-        """End the process at once; may be called again."""
+        """Kill the process; may be called again."""
 
 
 Spawn = Callable[[], Channel]
-"""Starts a process that has no module yet."""
+"""Starts a process without a module."""

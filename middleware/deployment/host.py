@@ -1,7 +1,7 @@
-"""Host: the side of the module, in its own process: it loads one module and answers the node's questions.
+"""Module side of the channel, in the module's process: load one module and answer the node's requests.
 
-``confine`` is called with the module's source before any of the source runs; it gives up the rights of the
-process and says which limits hold from then on.  Each kind of module is served by a ``Kind``.
+``confine`` is called with the module's source before the source runs; it drops the privileges of the process and
+returns the limits in effect.  Each kind of module is handled by a ``Kind``.
 """
 
 from __future__ import annotations
@@ -37,31 +37,31 @@ Confine = Callable[[bytes], Sequence[str]]
 
 
 class Kind(Protocol):
-    """How modules of one kind are made and asked, in plain values."""
+    """Create and call modules of one kind, with plain values as arguments and results."""
 
     def make(self, make: Make, arguments: list[Any]) -> object:
-        """One instance."""
+        """Create an instance."""
 
     def facts(self, thing: object) -> dict[str, Any]:
-        """The facts that the node needs about an instance."""
+        """Return the facts that the node needs about an instance."""
 
     def call(self, thing: object, method: str, arguments: list[Any]) -> object:
-        """The answer of an instance."""
+        """Call ``method`` of an instance."""
 
 
 class StrategyKind:
-    """Strategies."""
+    """Handle strategies."""
 
     def make(self, make: Make, arguments: list[Any]) -> object:
-        """The strategy."""
+        """Create the strategy."""
         return make()
 
     def facts(self, thing: object) -> dict[str, Any]:
-        """The fields of a report that it reads, apart from the cost."""
+        """Return the fields of a report that the strategy reads, apart from the cost."""
         return {"reads": list(reads_of(thing))}
 
     def call(self, thing: object, method: str, arguments: list[Any]) -> object:
-        """Its answer."""
+        """Call ``method`` of the strategy."""
         return answer_of(thing, method, arguments)
 
 
@@ -73,10 +73,10 @@ class Host:
         self._confine = confine
         self._kind: Kind | None = None
         self._make: Make | None = None
-        self._things: dict[int, object] = {}
+        self._instances: dict[int, object] = {}
 
     def answer(self, question: bytes) -> bytes:
-        """The answer to one question, with its length; whatever the module raises becomes a refusal."""
+        """Return the packed reply to one request; an exception of the module becomes an error reply."""
         number = 0
         try:
             number, verb, arguments = frame.unpack_question(question)
@@ -89,12 +89,12 @@ class Host:
             packed = frame.pack([number, True, verbs[verb](*arguments)])
             if len(packed) <= MAX_ANSWER:
                 return packed
-            why = f"its answer has {len(packed)} bytes, more than {MAX_ANSWER}"
+            why = f"its reply has {len(packed)} bytes, more than {MAX_ANSWER}"
         except Undeployable as error:
             why = error.problem
         except BadFrame as error:
-            why = f"its answer {error}"
-        except BaseException as error:  # a pushed module may raise anything
+            why = f"its reply {error}"
+        except BaseException as error:  # a pushed module can raise anything
             why = "".join(traceback.format_exception_only(error)).strip()
         return frame.pack([number, False, why[:MAX_REASON].encode(errors="replace").decode()])
 
@@ -104,28 +104,28 @@ class Host:
         self._make = loaded(Manifest(name, kind, version, digest, size), source)
         facts: dict[str, Any] = {"limits": limits}
         if kind == STRATEGY:
-            thing = self._things[FIRST] = self._kind.make(self._make, [])
+            thing = self._instances[FIRST] = self._kind.make(self._make, [])
             facts |= self._kind.facts(thing)
         return facts
 
     def _create(self, place: int, arguments: list[Any]) -> object:
         assert self._kind is not None and self._make is not None
-        if len(self._things) >= MAX_INSTANCES:
-            raise Undeployable(str(place), f"there are {MAX_INSTANCES} of it already")
-        thing = self._things[place] = self._kind.make(self._make, arguments)
+        if len(self._instances) >= MAX_INSTANCES:
+            raise Undeployable(str(place), f"already has {MAX_INSTANCES} instances")
+        thing = self._instances[place] = self._kind.make(self._make, arguments)
         return self._kind.facts(thing)
 
     def _call(self, place: int, method: str, arguments: list[Any]) -> object:
         assert self._kind is not None
-        return self._kind.call(self._things[place], method, arguments)
+        return self._kind.call(self._instances[place], method, arguments)
 
     def _drop(self, place: int) -> object:
-        self._things.pop(place, None)
+        self._instances.pop(place, None)
         return None
 
 
 class MemoryChannel:
-    """The channel of a module that runs in this process, through the same messages; for simulators and tests."""
+    """The channel of a module in this process, with the same messages; for simulators and tests."""
 
     is_behind = False
 
@@ -136,22 +136,22 @@ class MemoryChannel:
         self._ready: list[bytes] = []
 
     def send(self, message: bytes) -> None:
-        """Have the question answered at once."""
+        """Answer the request immediately."""
         if self._host is None:
             raise Gone("its process has ended")
         try:
             for question in self._questions.feed(message):
                 self._ready += self._answers.feed(self._host.answer(question))
         except BadFrame as error:
-            raise Gone(f"its answer {error}") from error
+            raise Gone(f"its reply {error}") from error
 
     def receive(self, within_s: float) -> list[bytes]:
-        """The answers since the last time."""
+        """Return the replies since the last call."""
         if self._host is None:
             raise Gone("its process has ended")
         ready, self._ready = self._ready, []
         return ready
 
     def end(self) -> None:
-        """Forget the module."""
+        """Discard the module."""
         self._host = None

@@ -1,4 +1,4 @@
-"""Process: the channel to a module's process, over two pipes that never block the node."""
+"""The channel to a module's process, over two pipes in non-blocking mode."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ PIPE_BYTES = 1024 * 1024
 """Requested size of the pipe to the process, so that a picture fits into it."""
 READ_BYTES = 64 * 1024
 MAX_READ = 1024 * 1024
-"""Bytes that are read at a time at most."""
+"""Maximum number of bytes per read."""
 ENVIRONMENT = {
-    # Sets have the same order on every machine; libraries start no threads.
+    # A fixed hash seed gives sets the same order on every machine; libraries start no threads.
     "PYTHONHASHSEED": "0",
     "OPENBLAS_NUM_THREADS": "1",
     "OMP_NUM_THREADS": "1",
@@ -32,7 +32,7 @@ SANDBOX = "swarmnode.sandbox"
 
 
 class ProcessChannel:
-    """A process that runs ``python -m program``, with none of this process's files, environment or folders."""
+    """A process that runs ``python -m program``, without this process's files, environment and working folder."""
 
     def __init__(self, program: str = SANDBOX) -> None:
         self._folder = tempfile.mkdtemp(prefix="swarm-module-")
@@ -55,30 +55,30 @@ class ProcessChannel:
         self._in, self._out = self._process.stdin.fileno(), self._process.stdout.fileno()
         for pipe in (self._in, self._out):
             os.set_blocking(pipe, False)
-        with suppress(OSError, AttributeError):  # not every system can
+        with suppress(OSError, AttributeError):  # not supported by every system
             fcntl.fcntl(self._in, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
         self._rest = b""
         self._answers = Splitter(MAX_ANSWER)
 
     @property
     def is_behind(self) -> bool:
-        """Whether something is left to be sent."""
+        """Whether a part of a message is not sent yet."""
         return bool(self._rest)
 
     @property
     def pid(self) -> int:
-        """The number of the process."""
+        """The process id."""
         return 0 if self._process is None else self._process.pid
 
     def send(self, message: bytes) -> None:
         """Send a message, or as much of it as the pipe takes."""
         if len(self._rest) + len(message) > 2 * MAX_QUESTION:
-            raise Gone("it takes nothing in")
+            raise Gone("it does not read its requests")
         self._rest += message
         self._flush()
 
     def receive(self, within_s: float) -> list[bytes]:
-        """The received messages; if there is none yet, wait for one at most ``within_s`` seconds."""
+        """Return the received messages; if there is none, wait for one for at most ``within_s`` seconds."""
         end = time.monotonic() + within_s
         found: list[bytes] = []
         while True:
@@ -94,7 +94,7 @@ class ProcessChannel:
             poll.poll(left * 1000.0)
 
     def end(self) -> None:
-        """Kill the process, with all that it may have started."""
+        """Kill the process."""
         process, self._process = self._process, None
         if process is None:
             return
@@ -130,5 +130,5 @@ class ProcessChannel:
             try:
                 found += self._answers.feed(data)
             except BadFrame as error:
-                raise Gone(f"its answer {error}") from error
+                raise Gone(f"its reply {error}") from error
         return found

@@ -1,4 +1,4 @@
-"""Shelf: where a node keeps the modules that it accepted, each in one file that is whole or not there."""
+"""Storage of accepted modules: one file for each, written atomically."""
 
 from __future__ import annotations
 
@@ -11,42 +11,42 @@ ENDING, UNFINISHED = ".module", ".unfinished"
 
 
 class Shelf(Protocol):
-    """What every shelf does; names are file names without an ending."""
+    """The interface of module storage; names are file names without the suffix."""
 
     def keep(self, name: str, content: bytes) -> None:
-        """Have ``content`` under ``name`` from now on; raises ``OSError``, and then what was there still is."""
+        """Store ``content`` under ``name``; raises ``OSError``, and then the old content is unchanged."""
 
     def everything(self) -> list[tuple[str, bytes]]:
-        """All that is kept, in the order of the names; what cannot be read is left out."""
+        """Return all stored modules, sorted by name, except unreadable ones."""
 
     def drop(self, name: str) -> None:
-        """Keep ``name`` no longer; nothing is raised."""
+        """Delete ``name``; never raises."""
 
 
 class MemoryShelf:
-    """A shelf that lives as long as the program."""
+    """Module storage in memory."""
 
     def __init__(self) -> None:
         self.contents: dict[str, bytes] = {}
 
     def keep(self, name: str, content: bytes) -> None:
-        """Have ``content`` under ``name`` from now on."""
+        """Store ``content`` under ``name``."""
         self.contents[name] = content
 
     def everything(self) -> list[tuple[str, bytes]]:
-        """All that is kept."""
+        """Return all stored modules."""
         return sorted(self.contents.items())
 
     def drop(self, name: str) -> None:
-        """Keep ``name`` no longer."""
+        """Delete ``name``."""
         self.contents.pop(name, None)
 
 
 class FileShelf:
-    """A folder, made when first something is kept; for its owner's eyes only.
+    """Module storage in a folder, created at the first ``keep`` with access for its owner only.
 
-    A file is written beside its place, forced to the disk, and then moved there: a loss of power leaves the old file
-    or the new one.  ``move`` is ``os.replace``.
+    A file is written under a temporary name, synced to disk, and then renamed, so after a power failure either the old
+    or the new file exists.  ``move`` is ``os.replace``.
     """
 
     def __init__(self, folder: Path, move: Callable[[Path, Path], object] = os.replace) -> None:
@@ -54,7 +54,7 @@ class FileShelf:
         self._move = move
 
     def keep(self, name: str, content: bytes) -> None:
-        """Have ``content`` under ``name`` from now on; raises ``OSError``."""
+        """Store ``content`` under ``name``; raises ``OSError``."""
         self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         beside = self._folder / f"{name}{UNFINISHED}"
         with beside.open("wb") as file:
@@ -69,7 +69,7 @@ class FileShelf:
             os.close(handle)
 
     def everything(self) -> list[tuple[str, bytes]]:
-        """All that is kept; what was never finished is removed."""
+        """Return all stored modules, and remove unfinished files."""
         found = []
         for path in sorted(self._folder.glob(f"*{UNFINISHED}")):
             path.unlink(missing_ok=True)
@@ -81,7 +81,7 @@ class FileShelf:
         return found
 
     def drop(self, name: str) -> None:
-        """Keep ``name`` no longer."""
+        """Delete ``name``."""
         try:
             (self._folder / f"{name}{ENDING}").unlink(missing_ok=True)
         except OSError:

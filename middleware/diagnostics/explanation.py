@@ -1,6 +1,6 @@
-"""Explanation: what the agents' verdicts on one task say together; pure.
+"""Comparison of the agents' decision records for one task.  Pure.
 
-Who agrees, and who differs from the others in what: the winner, the rule or its version, the reports that it knew.
+It lists the agents that agree, and for each other agent the difference: winner, rule or version, known reports.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from middleware.consensus.strategy import agreement
 from middleware.consensus.verdict import MANY, Reported, Verdict
 
 TOLD = 3
-"""Reports in which two agents differ that are named one by one."""
+"""Maximum number of differing reports that are listed individually."""
 
 
 @dataclass(frozen=True)
 class Difference:
-    """Who differs from the others, and in what."""
+    """The difference between one agent and the majority."""
 
     name: str
     what: str
@@ -26,12 +26,13 @@ class Difference:
 
 @dataclass(frozen=True)
 class Ruling:
-    """What one epoch came to: the agents' verdicts side by side.
+    """The result of one epoch: the agents' decision records compared.
 
-    ``winner`` is the uuid named by most (the lowest where two are), ``chosen`` its name; ``agree`` names those that
-    named it, ``of`` counts the participants, or those who are to tell where there are many.  ``differ`` has whoever
-    named another, used another rule or knew other reports than most of those that agree; the rest is what these wrote.
-    ``token`` is the winner's, 0 where it told of none; ``agreed`` is what they agreed on by number, place or vote.
+    ``winner`` is the uuid that most agents named (the lowest on a tie), ``chosen`` its name.  ``agree`` are the names
+    of the agents that named it, ``of`` is the number of participants, or in large groups of the agents that have to
+    publish their decision.  ``differ`` lists agents with another winner, another rule or other reports than most agents
+    in ``agree``; the remaining fields are from the records of that majority.  ``token`` is the winner's fencing token,
+    0 if unknown; ``agreed`` is the result of a decision by number, place or vote.
     """
 
     epoch: int
@@ -54,43 +55,43 @@ class Ruling:
 
 @dataclass(frozen=True)
 class Explanation:
-    """Why who went: the rulings of a task, the newest epoch first."""
+    """The explanation of a task's assignments: its rulings, newest epoch first."""
 
     task: str
     epochs: tuple[Ruling, ...] = ()
 
 
 def explained(verdicts: Iterable[Verdict]) -> Explanation:
-    """What ``verdicts`` of one task explain together; their order does not matter."""
+    """Compare the decision records of one task, in any order."""
     epochs: dict[int, dict[str, Verdict]] = {}
     task = ""
     for verdict in sorted(verdicts, key=lambda v: (v.epoch, v.agent, v.packed())):
         task = verdict.task
         epochs.setdefault(verdict.epoch, {})[verdict.agent] = verdict
-    rulings = [_ruling(epoch, list(epochs[epoch].values())) for epoch in sorted(epochs, reverse=True)]
+    rulings = [_make_ruling(epoch, list(epochs[epoch].values())) for epoch in sorted(epochs, reverse=True)]
     return Explanation(task, tuple(rulings))
 
 
 def as_text(explanation: Explanation) -> str:
-    """The explanation for a person, the newest epoch first; empty where nothing was decided yet."""
-    return "".join(_paragraph(ruling) for ruling in explanation.epochs)
+    """Return the explanation as text, newest epoch first; empty if there is no decision yet."""
+    return "".join(_format_ruling(ruling) for ruling in explanation.epochs)
 
 
-# -- inside -------------------------------------------------------------------------------------------------------
+# -- implementation -----------------------------------------------------------------------------------------------
 
 
-def _ruling(epoch: int, verdicts: Sequence[Verdict]) -> Ruling:
+def _make_ruling(epoch: int, verdicts: Sequence[Verdict]) -> Ruling:
     votes = Counter(v.winner for v in verdicts)
     winner = min(votes, key=lambda uuid: (-votes[uuid], not uuid, uuid))
     agreeing = [v for v in verdicts if v.winner == winner]
-    grounds = Counter(_grounds(v) for v in agreeing)
+    grounds = Counter(_basis(v) for v in agreeing)
     most = min(grounds, key=lambda ground: (-grounds[ground], ground))
-    reference = next(v for v in agreeing if _grounds(v) == most)
+    reference = next(v for v in agreeing if _basis(v) == most)
     names = {r.agent: r.name for v in verdicts for r in v.reports} | {v.agent: v.name for v in verdicts}
-    differ = [Difference(v.name, what) for v in verdicts if (what := _differences(v, reference, names))]
-    spoke = {v.agent for v in verdicts}
-    mute = [r.name for r in reference.reports if r.agent not in spoke]
-    differ += [Difference(name, "has told no decision") for name in mute]
+    differ = [Difference(v.name, what) for v in verdicts if (what := _describe_differences(v, reference, names))]
+    deciders = {v.agent for v in verdicts}
+    missing = [r.name for r in reference.reports if r.agent not in deciders]
+    differ += [Difference(name, "has no decision record") for name in missing]
     return Ruling(
         epoch,
         winner,
@@ -111,46 +112,46 @@ def _ruling(epoch: int, verdicts: Sequence[Verdict]) -> Ruling:
     )
 
 
-def _grounds(verdict: Verdict) -> tuple[str, str, str]:
+def _basis(verdict: Verdict) -> tuple[str, str, str]:
     return (verdict.rule, verdict.version, verdict.digest)
 
 
-def _differences(verdict: Verdict, reference: Verdict, names: Mapping[str, str]) -> str:
-    """In what a verdict differs from that of the majority; empty where it does not."""
-    told = []
+def _describe_differences(verdict: Verdict, reference: Verdict, names: Mapping[str, str]) -> str:
+    """Return the differences between a decision record and the majority's; empty if there are none."""
+    differences = []
     if verdict.winner != reference.winner:
-        told.append(f"names {_name(verdict.winner, names)}")
+        differences.append(f"names {_name(verdict.winner, names)}")
     if (verdict.rule, verdict.version) != (reference.rule, reference.version):
-        told.append(f"decided by {_rule(verdict)}, not {_rule(reference)}")
+        differences.append(f"decided by {_rule(verdict)}, not {_rule(reference)}")
     agreed = agreement(verdict.value, verdict.choice)
     if agreed != agreement(reference.value, reference.choice):
-        told.append(f"agreed on {agreed or 'nothing'}")
+        differences.append(f"agreed on {agreed or 'nothing'}")
     if verdict.digest != reference.digest:
-        told.append(_other_reports(verdict, reference))
-    return "; ".join(told)
+        differences.append(_describe_other_reports(verdict, reference))
+    return "; ".join(differences)
 
 
-def _other_reports(verdict: Verdict, reference: Verdict) -> str:
+def _describe_other_reports(verdict: Verdict, reference: Verdict) -> str:
     are_whole = all(len(v.reports) == v.reported for v in (verdict, reference))
-    knew, known = ({r.agent: r for r in v.reports} for v in (verdict, reference))
-    told = []
-    for agent in sorted({**knew, **known}, key=lambda agent: ({**known, **knew}[agent].name, agent)):
-        if agent not in knew:
-            told.append(f"no report of {known[agent].name}")
-        elif agent not in known:
-            told.append(f"a report of {knew[agent].name}")
-        elif knew[agent].cost != known[agent].cost:
-            told.append(f"{knew[agent].name} at {knew[agent].cost:.2f}, not {known[agent].cost:.2f}")
-        elif knew[agent].more != known[agent].more:
-            told.append(f"{knew[agent].name} with {knew[agent].more or 'nothing more'}")
-    if not are_whole or not told:
+    own, other = ({r.agent: r for r in v.reports} for v in (verdict, reference))
+    differences = []
+    for agent in sorted({**own, **other}, key=lambda agent: ({**other, **own}[agent].name, agent)):
+        if agent not in own:
+            differences.append(f"no report of {other[agent].name}")
+        elif agent not in other:
+            differences.append(f"a report of {own[agent].name}")
+        elif own[agent].cost != other[agent].cost:
+            differences.append(f"{own[agent].name} at {own[agent].cost:.2f}, not {other[agent].cost:.2f}")
+        elif own[agent].more != other[agent].more:
+            differences.append(f"{own[agent].name} with {own[agent].more or 'nothing more'}")
+    if not are_whole or not differences:
         return "knew other reports"
-    more = [f"{len(told) - TOLD} more"] if len(told) > TOLD else []
-    return f"knew {', '.join([*told[:TOLD], *more])}"
+    more = [f"{len(differences) - TOLD} more"] if len(differences) > TOLD else []
+    return f"knew {', '.join([*differences[:TOLD], *more])}"
 
 
-def _paragraph(ruling: Ruling) -> str:
-    """One ruling as lines."""
+def _format_ruling(ruling: Ruling) -> str:
+    """Return one ruling as lines of text."""
     token = f", token {ruling.token}" if ruling.token else ""
     lines = [f"epoch {ruling.epoch}: {ruling.chosen}, {len(ruling.agree)} of {ruling.of} agree{token}"]
     lines.append(

@@ -1,6 +1,6 @@
-"""Survey: what a node answers when it is asked what it stores, whom it knows, and how well it reaches them.
+"""Diagnostics of a node for other nodes: store contents, contacts, traffic and link quality.
 
-But for the ways to its peers nothing is measured for the answer: it is what the node has seen anyway.
+Only the paths to peers are measured on request; everything else is data that the node has anyway.
 """
 
 from __future__ import annotations
@@ -21,28 +21,28 @@ from middleware.tasks.task import TASKS, group_key, tasks_of
 
 INVENTORY, NETWORK, LINKS = "device.inventory", "device.network", "device.links"
 NEWEST = 16
-"""Records that are listed one by one."""
+"""Maximum number of records that are listed."""
 MAX_CONTACTS = 64
-"""Contacts that are told, those heard last."""
+"""Maximum number of contacts that are listed, most recently heard first."""
 MAX_TOLD = 16
-"""Refusals that are told, the newest."""
+"""Maximum number of refusals that are listed, newest first."""
 MAX_MEMBERS = 256
 ENDING_S = 14 * 86_400.0
-"""Seconds before its end from which a certificate is told to be about to expire."""
+"""Seconds before its end from which a certificate is reported as about to expire."""
 HALT = hashed_key("halt")
 
 
 def answer_survey(node: SwarmNode) -> None:
-    """Have ``node`` answer ``device.inventory``, ``device.network`` and ``device.links``."""
+    """Expose ``device.inventory``, ``device.network`` and ``device.links`` at ``node``."""
     node.entangled.endpoint.expose(INVENTORY, lambda peer: inventory(node))
     node.entangled.endpoint.expose(NETWORK, lambda peer: network(node))
     node.entangled.endpoint.expose(LINKS, lambda peer: links(node))
 
 
 def inventory(node: SwarmNode) -> dict[str, Any]:
-    """What the store of ``node`` holds: how much of each kind, and its newest records one by one.
+    """Return the contents of the store of ``node``: counts by kind, and the newest records.
 
-    ``newest`` are [kind, name, bytes, lifetime]; ``deleted`` counts the slots that say only that they are empty.
+    ``newest`` are [kind, name, bytes, lifetime]; ``deleted`` is the number of tombstones.
     """
     store = node.store
     kinds = _kinds(node)
@@ -61,14 +61,14 @@ def inventory(node: SwarmNode) -> dict[str, Any]:
 
 
 def network(node: SwarmNode) -> dict[str, Any]:
-    """Whom ``node`` knows, how far they are and when they were heard; its traffic; and its newest lookups.
+    """Return the contacts of ``node`` with round-trip time and time since the last datagram, traffic, and lookups.
 
-    ``rtt_ms`` is None where nobody was timed yet, ``heard_s`` where nothing was heard.
+    ``rtt_ms`` is None before the first measurement, ``heard_s`` before the first datagram.
     """
     overlay, endpoint = node.entangled.overlay, node.entangled.endpoint
     traffic = endpoint.traffic
 
-    def told(contact: Contact) -> dict[str, Any]:
+    def describe(contact: Contact) -> dict[str, Any]:
         round_trip, silence = endpoint.round_trip(contact), overlay.silence(contact)
         return {
             "uuid": contact.node_id.hex(),
@@ -78,7 +78,7 @@ def network(node: SwarmNode) -> dict[str, Any]:
 
     contacts = sorted(overlay.contacts(), key=lambda contact: (overlay.silence(contact), contact.node_id))
     return {
-        "contacts": [told(contact) for contact in contacts[:MAX_CONTACTS]],
+        "contacts": [describe(contact) for contact in contacts[:MAX_CONTACTS]],
         "known": len(contacts),
         "sent": traffic.get("sent", 0),
         "received": traffic.get("received", 0),
@@ -97,9 +97,9 @@ def network(node: SwarmNode) -> dict[str, Any]:
 
 
 def links(node: SwarmNode) -> dict[str, Any]:
-    """The ways from ``node`` to its peers, as ``Gauge.links`` gives them, and whom it met lately that was not let in.
+    """Return the links from ``node`` to its peers, as ``Gauge.links`` does, and the recent refusals.
 
-    Each refusal has ``who`` (a name of the team, or the beginning of a key, or nothing), ``at``, ``side`` as in
+    Each refusal has ``who`` (a name of the team, or the beginning of a key, or empty), ``at``, ``side`` as in
     ``Rebuff``, ``code``, ``reason``, ``ago`` (seconds since the last time) and ``count``.
     """
     now = node.clock.seconds()
@@ -108,7 +108,7 @@ def links(node: SwarmNode) -> dict[str, Any]:
         "links": node.gauge.links(),
         "refusals": [
             {
-                "who": _named(node, each.who),
+                "who": _name_of(node, each.who),
                 "at": each.address,
                 "side": each.side,
                 "code": each.code,
@@ -122,11 +122,11 @@ def links(node: SwarmNode) -> dict[str, Any]:
 
 
 def team(node: SwarmNode) -> dict[str, Any]:
-    """What team ``node`` is in; moments are unix seconds.
+    """Return the team of ``node``; times are Unix timestamps.
 
-    An ``open`` one says in ``unprotected`` what that does not protect.  A ``closed`` one has a ``name``, a
-    ``fingerprint`` as ``swarm doctor`` shows it, and ``members`` with their roles, until when they are certified and
-    whether bootstrap nodes renew that, those first whose certificates end within ``ENDING_S``; ``me`` is this node.
+    For an open team, ``unprotected`` describes the missing protection.  A closed team has a ``name``, a ``fingerprint``
+    as in ``swarm doctor``, and ``members`` with their roles, end of certificate and whether it is renewable, those
+    first that end within ``ENDING_S``; ``me`` is this node.
     """
     closed = node.team
     if closed is None:
@@ -156,7 +156,7 @@ def team(node: SwarmNode) -> dict[str, Any]:
     }
 
 
-def _named(node: SwarmNode, public: bytes) -> str:
+def _name_of(node: SwarmNode, public: bytes) -> str:
     member = node.team.door.member(public) if node.team is not None and public else None
     return public.hex()[:16] if member is None else member.name
 
@@ -166,7 +166,7 @@ def _ms(seconds: float) -> float:
 
 
 def _kinds(node: SwarmNode) -> dict[bytes, str]:
-    # Imported by the first who is asked: a node that never is is spared the memory.
+    # Imported on the first request, to save memory.
     from middleware.consensus.verdict import verdicts_key
 
     tasks = tasks_of(node.store.get(TASKS))

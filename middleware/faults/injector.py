@@ -28,11 +28,11 @@ from middleware.node import SwarmNode
 from middleware.tasks.task import Task
 
 MakeTask = Callable[[str, str, float], Task]
-"""A predefined task by its name, a new task id, and the wall clock."""
+"""Creates a predefined task from its name, a new task id, and the wall clock."""
 LEVEL = "power.level"
 AFTER_ANSWERS = 0.5
-"""Seconds from the answer to the fault: a node that is cut off or dead could not confirm the order.  Where datagrams
-get lost, it may have to send its answer several times."""
+"""Seconds from the reply to the fault: a node that is isolated or dead could not confirm the order.  With packet loss,
+the reply may have to be sent several times."""
 
 
 class State(Enum):
@@ -44,7 +44,7 @@ class State(Enum):
 
 
 class Event(Enum):
-    """What happens to an ordered fault."""
+    """An event of an ordered fault."""
 
     BEGIN = "begin"
     END = "end"
@@ -57,7 +57,7 @@ TRANSITIONS: Mapping[tuple[State, Event], State] = {
     (State.ACTIVE, Event.END): State.OVER,
     (State.OVER, Event.END): State.OVER,
 }
-"""The end of a fault that was replaced comes too, and changes nothing.  Every other pair is a programming error."""
+"""The end of a replaced fault occurs as well, and has no effect.  Every other pair is a programming error."""
 
 
 class Process(Protocol):
@@ -67,7 +67,7 @@ class Process(Protocol):
         """End the node as a power failure does."""
 
     def freeze(self, seconds: float) -> None:
-        """Stop the node for so long, then let it continue."""
+        """Stop the node for ``seconds``, then let it continue."""
 
 
 @dataclass(eq=False)
@@ -77,20 +77,20 @@ class _Order:
     state: State = State.ORDERED
 
     def advance(self, event: Event) -> bool:
-        """Go on to the next state; whether it is another one."""
+        """Go to the next state; returns whether the state has changed."""
         before, self.state = self.state, TRANSITIONS[self.state, event]
         return self.state is not before
 
 
 class SkewedClock:
-    """A wall clock that is ``ahead`` by so many seconds."""
+    """A wall clock that is ``ahead`` seconds fast."""
 
     def __init__(self, wall: Callable[[], float]) -> None:
         self.ahead = 0.0
         self._wall = wall
 
     def __call__(self) -> float:
-        """The seconds that it shows."""
+        """Return the time of this clock."""
         return self._wall() + self.ahead
 
 
@@ -126,8 +126,9 @@ class LowBattery:
 class FaultInjector:
     """Faults of one node.
 
-    The node must use ``wall`` as its wall clock, open its port through ``open_network``, and its agent the driver from
-    ``wrap_driver``.  Without a ``process`` the node can be neither killed nor frozen, without a driver not discharged.
+    The node must use ``wall`` as its wall clock, and open its port through ``open_network``; its agent must use the
+    driver from ``wrap_driver``.  Without a ``process`` the node cannot be killed or frozen, without a driver its
+    battery cannot read low.
     """
 
     _log = Logger()
@@ -150,7 +151,7 @@ class FaultInjector:
         self._active: dict[str, _Order] = {}
 
     def open_network(self) -> Network:
-        """Make the node's network, which can be made to fail."""
+        """Create the node's network with fault injection."""
         rng = random.Random(self._rng.getrandbits(64))
         self._network = FaultyNetwork(self._make_network(), self._clock, rng)
         return self._network
@@ -172,7 +173,7 @@ class FaultInjector:
             except BadFault as error:
                 raise Refused(str(error)) from error
             if fault.kind not in self.kinds():
-                raise Refused(f"kind: this device cannot suffer {fault.kind}; choose one of {', '.join(self.kinds())}")
+                raise Refused(f"kind: this device cannot have {fault.kind}; choose one of {', '.join(self.kinds())}")
             node.later(AFTER_ANSWERS, self._begin, node, _Order(fault))
             return AFTER_ANSWERS
 
@@ -194,15 +195,15 @@ class FaultInjector:
         expose(ASSIGN, assign, changes=True)
 
     def kinds(self) -> list[str]:
-        """The kinds of faults that this node can have."""
+        """Return the kinds of faults that this node supports."""
         lacks = {*(() if self._process else ("kill", "freeze")), *(() if self._battery else ("battery",))}
         return [kind for kind in KINDS if kind not in lacks]
 
-    # -- inside -----------------------------------------------------------------------------------------------------
+    # -- implementation ---------------------------------------------------------------------------------------------
 
     def _begin(self, node: SwarmNode, order: _Order) -> None:
         fault, name = order.fault, node.presence.device.name
-        self._log.warn("{name} suffers {kind} for {s:g} s, on purpose", name=name, kind=fault.kind, s=fault.seconds)
+        self._log.warn("fault injected: {name}, {kind} for {s:g} s", name=name, kind=fault.kind, s=fault.seconds)
         if fault.kind == "kill" and self._process is not None:
             return self._process.kill()
         order.advance(Event.BEGIN)
@@ -222,7 +223,7 @@ class FaultInjector:
             self._apply()
 
     def _apply(self) -> None:
-        """Let the active faults take effect, and no others."""
+        """Apply the active faults, and no others."""
 
         def amount(kind: str, otherwise: float = 0.0) -> float:
             return self._active[kind].fault.amount if kind in self._active else otherwise

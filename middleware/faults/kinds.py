@@ -36,14 +36,14 @@ class Kind:
 
 
 KINDS: Mapping[str, Kind] = {
-    "kill": Kind("its process ends at once (SIGKILL); who watches over it starts it again", is_lost=True),
-    "freeze": Kind("its process stands still (SIGSTOP), and then goes on", is_lost=True),
-    "radio": Kind("nothing passes between it and the others", is_lost=True),
-    "one-way": Kind("it hears the others, and they do not hear it", is_lost=True),
-    "delay": Kind("whatever it sends or hears comes late", False, 0.3, 0.0, 5.0, "s", "late by"),
-    "loss": Kind("a share of what it sends or hears is lost", False, 0.2, 0.0, 1.0, "of 1", "share lost"),
-    "skew": Kind("its wall clock is wrong; nothing may come of it", False, 3600.0, -1e6, 1e6, "s", "ahead by"),
-    "battery": Kind("its battery reads low; below 0.05 it gives its task back", True, 0.03, 0.0, 1.0, "of 1", "charge"),
+    "kill": Kind("its process is killed (SIGKILL); a supervisor restarts it", is_lost=True),
+    "freeze": Kind("its process stops (SIGSTOP), and continues at the end", is_lost=True),
+    "radio": Kind("no datagram passes in either direction", is_lost=True),
+    "one-way": Kind("it receives datagrams, but cannot send any", is_lost=True),
+    "delay": Kind("all its datagrams are delayed in both directions", False, 0.3, 0.0, 5.0, "s", "late by"),
+    "loss": Kind("a share of its datagrams is lost in both directions", False, 0.2, 0.0, 1.0, "of 1", "share lost"),
+    "skew": Kind("its wall clock is wrong, which must have no effect", False, 3600.0, -1e6, 1e6, "s", "ahead by"),
+    "battery": Kind("its battery reads low; below 0.05 it gives up its task", True, 0.03, 0.0, 1.0, "of 1", "charge"),
 }
 
 
@@ -61,12 +61,12 @@ def parse_fault(kind: object, seconds: object = None, amount: object = None) -> 
     if not isinstance(kind, str) or kind not in KINDS:
         raise BadFault("kind", f"there is no fault {str(kind)[:40]!r}", f"choose one of {', '.join(KINDS)}")
     rule = KINDS[kind]
-    lasts = _number("seconds", USUAL_S if seconds is None else seconds, MIN_S, MAX_S, "s")
+    lasts = _check_number("seconds", USUAL_S if seconds is None else seconds, MIN_S, MAX_S, "s")
     if not rule.unit:
         if amount is not None and amount != 0:
             raise BadFault("amount", f"a fault of the kind {kind} has none", "leave it out")
         return Fault(kind, lasts)
-    much = _number("amount", rule.amount if amount is None else amount, rule.least, rule.most, rule.unit)
+    much = _check_number("amount", rule.amount if amount is None else amount, rule.least, rule.most, rule.unit)
     return Fault(kind, lasts, much)
 
 
@@ -75,7 +75,7 @@ def begins_in(answer: object) -> float:
     return float(answer) if is_number(answer) and 0.0 < answer <= MOST_AHEAD_S else 0.0  # type: ignore[operator,arg-type]
 
 
-def _number(field: str, value: object, least: float, most: float, unit: str) -> float:
+def _check_number(field: str, value: object, least: float, most: float, unit: str) -> float:
     if not is_number(value) or not least <= value <= most:  # type: ignore[operator]
-        raise BadFault(field, f"{str(value)[:40]} is no lawful number", f"give {least:g} to {most:g} {unit}")
+        raise BadFault(field, f"{str(value)[:40]} is out of range", f"give {least:g} to {most:g} {unit}")
     return float(value)  # type: ignore[arg-type]

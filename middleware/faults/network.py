@@ -1,7 +1,7 @@
-"""Faults of one node's datagrams: loss, delay, duplicates, and silence in one direction or both.
+"""Faults of one node's datagrams: loss, delay, duplicates, and loss of one direction or both.
 
-``FaultyNetwork`` wraps any other ``Network``.  It does at the port of a real node the same as the switchboard does
-between simulated ones.  Initially it changes nothing.
+``FaultyNetwork`` wraps any other ``Network``.  It does to a real node's port what the switchboard does between
+simulated nodes.  Initially there are no faults.
 """
 
 from __future__ import annotations
@@ -42,40 +42,40 @@ class FaultyNetwork:
 
     @property
     def detours(self) -> list[Address]:
-        """The ways around of the network."""
+        """The alternate paths of the network."""
         return detours_of(self._network)
 
     def listen(self, receiver: Receiver) -> None:
-        """Open the port and hand on what gets through; raises ``PortInUse`` where another holds it."""
-        self._network.listen(self._came)
+        """Open the port, and call ``receiver`` with datagrams that pass; raises ``PortInUse`` if it is in use."""
+        self._network.listen(self._on_datagram)
         self._receiver = receiver
 
     def send(self, datagram: bytes, to: Address) -> None:
-        """Send what gets through."""
+        """Send a datagram, unless a fault drops it."""
         if not self.is_mute:
-            self._pass_on(self._sent, datagram, to)
+            self._forward(self._deliver_sent, datagram, to)
 
     def close(self) -> None:
-        """Close the port, what is on its way is lost; may be called twice."""
+        """Close the port; datagrams in transit are lost.  May be called twice."""
         self._receiver = None
         self._network.close()
 
-    def _came(self, datagram: bytes, source: Address) -> None:
+    def _on_datagram(self, datagram: bytes, source: Address) -> None:
         if not self.is_deaf:
-            self._pass_on(self._heard, datagram, source)
+            self._forward(self._deliver_received, datagram, source)
 
-    def _pass_on(self, go_on: Receiver, datagram: bytes, address: Address) -> None:
-        """Pass a datagram on as the weather has it: now, late, twice or not at all."""
+    def _forward(self, deliver: Receiver, datagram: bytes, address: Address) -> None:
+        """Forward a datagram according to the weather: now, late, twice or not at all."""
         for delay in (0.0,) if self.weather is CALM else self.weather.delays(self._rng):
             if delay > 0.0:
-                self._clock.callLater(delay, go_on, datagram, address)
+                self._clock.callLater(delay, deliver, datagram, address)
             else:
-                go_on(datagram, address)
+                deliver(datagram, address)
 
-    def _sent(self, datagram: bytes, to: Address) -> None:
+    def _deliver_sent(self, datagram: bytes, to: Address) -> None:
         if self._receiver is not None and not self.is_mute:
             self._network.send(datagram, to)
 
-    def _heard(self, datagram: bytes, source: Address) -> None:
+    def _deliver_received(self, datagram: bytes, source: Address) -> None:
         if self._receiver is not None and not self.is_deaf:
             self._receiver(datagram, source)

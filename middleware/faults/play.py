@@ -17,41 +17,41 @@ from middleware.faults.takeover import TARGET_S, Takeover, acting
 
 LOOK_S = 0.05
 PATIENCE_S = 60.0
-"""Seconds for which one waits until somebody acts, or a device is there."""
+"""Seconds to wait for an executing device, or for the device with a given name."""
 SETTLED_S = 6.0
-"""Seconds after a fault that nobody takes over from, in which the others may end the task."""
+"""Seconds after a fault without a takeover within which the remaining devices can end the task."""
 BODILESS = {"bootstrap", "web"}
 
 
 class NobodyThere(Exception):
-    """The device that is to fail is not there; ``str()`` is one line for a person."""
+    """The device for a fault is not present; ``str()`` is one line for display."""
 
 
 class Stage(Protocol):
-    """Where faults are caused; ``seconds`` is its clock."""
+    """A team for fault scenarios; ``seconds`` is its clock."""
 
     def seconds(self) -> float:
-        """The time."""
+        """Return the time in seconds."""
 
     def wait(self, seconds: float) -> None:
-        """Let so much time pass."""
+        """Wait for ``seconds``."""
 
     def devices(self) -> list[Device]:
-        """Who is there, in the order of joining."""
+        """Return the present devices, in the order of joining."""
 
     def assign(self, task: str) -> str:
-        """Publish a task of the catalogue; returns its id."""
+        """Publish a predefined task; returns its id."""
 
     def cause(self, device: Device, fault: Fault) -> float:
-        """Let the device suffer the fault, and return when it has agreed: the seconds until it begins."""
+        """Inject the fault into the device; returns the seconds until it begins, when the device has confirmed."""
 
     def is_over(self, task_id: str) -> bool:
-        """Whether the task has ended."""
+        """Return whether the task has ended."""
 
 
 @dataclass
 class Loss:
-    """One fault of a device, and the clock beside it; ``is_ended``: its task ended before another took over."""
+    """One fault of a device and its takeover; ``is_ended``: the task ended before a takeover."""
 
     device: str
     fault: Fault
@@ -61,12 +61,12 @@ class Loss:
 
     @property
     def is_lost(self) -> bool:
-        """Whether who suffers this cannot go on with a task."""
+        """Whether a device with this fault cannot continue its task."""
         return KINDS[self.fault.kind].is_lost
 
     @property
     def held(self) -> bool:
-        """Whether another took over in time, where one had to."""
+        """Whether another device took over in time, if that was necessary."""
         if self.clock.seconds is not None:
             return self.clock.seconds <= TARGET_S
         must = self.is_lost and self.fault.seconds > TARGET_S
@@ -75,33 +75,33 @@ class Loss:
     def __str__(self) -> str:
         what = f"{self.device}: {self.fault.kind}"
         if not self.clock.task:
-            return f"{what}, was at no task"
+            return f"{what}, executed no task"
         if self.clock.seconds is not None:
             late = "" if self.held else f", later than {TARGET_S:g} s"
             return f"{what}, {self.to} took over {self.clock.task} after {self.clock.seconds:.2f} s{late}"
         if self.is_ended:
             return f"{what}, {self.clock.task} ended before another took over"
-        return f"{what}, nobody took over {self.clock.task}" if not self.held else f"{what}, nobody had to take over"
+        return f"{what}, no device took over {self.clock.task}" if not self.held else f"{what}, no takeover needed"
 
 
 def play(scenario: Scenario, seed: int, stage: Stage, say: Callable[[str], None]) -> list[Loss]:
-    """Carry the scenario out, say each loss when it is settled; raises ``NobodyThere``."""
-    dice = random.Random(seed)
+    """Run the scenario, and report each loss when it is settled; raises ``NobodyThere``."""
+    rng = random.Random(seed)
     losses: list[Loss] = []
     if scenario.task:
         say(f"assigned {scenario.task} as {stage.assign(scenario.task)}")
     began = stage.seconds()
     for step in scenario.steps:
         while stage.seconds() < began + step.at:
-            _look(stage, losses, say)
-        device = _device(stage, step.device, dice, losses, say)
+            _update(stage, losses, say)
+        device = _wait_for_device(stage, step.device, rng, losses, say)
         task = acting(stage.devices()).get(device.uuid, "")
         now = stage.cause(device, step.fault) + stage.seconds()
         lasts = "" if step.fault.kind == "kill" else f" for {step.fault.seconds:g} s"
         say(f"{device.name}: {step.fault.kind}{lasts}")
         losses.append(Loss(device.name, step.fault, Takeover(device.uuid, task, now, now + step.fault.seconds)))
     while any(_is_open(loss, stage.seconds()) for loss in losses):
-        _look(stage, losses, say)
+        _update(stage, losses, say)
     for loss in losses:
         if loss.clock.seconds is None:
             loss.is_ended = bool(loss.clock.task) and stage.is_over(loss.clock.task)
@@ -114,11 +114,11 @@ def _is_open(loss: Loss, now: float) -> bool:
 
 
 def _is_hopeless(loss: Loss, now: float) -> bool:
-    # A killed process has no end of its fault to wait for, and a long one need not be sat out.
+    # A killed process has no end of its fault, and the end of a long fault is not awaited.
     return now > loss.clock.began + max(SETTLED_S, min(loss.fault.seconds, 3 * SETTLED_S))
 
 
-def _look(stage: Stage, losses: Iterable[Loss], say: Callable[[str], None]) -> None:
+def _update(stage: Stage, losses: Iterable[Loss], say: Callable[[str], None]) -> None:
     stage.wait(LOOK_S)
     devices = stage.devices()
     acts, names = acting(devices), {device.uuid: device.name for device in devices}
@@ -128,26 +128,26 @@ def _look(stage: Stage, losses: Iterable[Loss], say: Callable[[str], None]) -> N
             say(str(loss))
 
 
-def _device(
-    stage: Stage, wanted: str, dice: random.Random, losses: Iterable[Loss], say: Callable[[str], None]
+def _wait_for_device(
+    stage: Stage, wanted: str, rng: random.Random, losses: Iterable[Loss], say: Callable[[str], None]
 ) -> Device:
     end = stage.seconds() + PATIENCE_S
     while stage.seconds() <= end:
-        if found := _meant(stage, wanted, losses):
-            return dice.choice(found) if wanted == ANY else found[0]
-        _look(stage, losses, say)
-    names = ", ".join(device.name for device in stage.devices()) or "nobody"
-    what = "acts" if wanted == WHO_ACTS else "could be any" if wanted == ANY else f"is called {wanted}"
-    raise NobodyThere(f"no device {what} for {PATIENCE_S:g} s; there are {names}")
+        if found := _matching_devices(stage, wanted, losses):
+            return rng.choice(found) if wanted == ANY else found[0]
+        _update(stage, losses, say)
+    names = ", ".join(device.name for device in stage.devices()) or "none"
+    what = "executes a task" if wanted == WHO_ACTS else "can be chosen" if wanted == ANY else f"has the name {wanted}"
+    raise NobodyThere(f"no device {what} within {PATIENCE_S:g} s; present devices: {names}")
 
 
-def _meant(stage: Stage, wanted: str, losses: Iterable[Loss]) -> list[Device]:
+def _matching_devices(stage: Stage, wanted: str, losses: Iterable[Loss]) -> list[Device]:
     here = stage.devices()
     if wanted == ANY:
         return sorted((each for each in here if not BODILESS & set(each.roles)), key=lambda device: device.name)
     if wanted != WHO_ACTS:
         return [device for device in here if device.name == wanted]
-    # Who is cut off still says that it acts: the next one is meant.
+    # An isolated device still reports that it executes the task; skip it.
     lost = {loss.clock.lost for loss in losses if loss.is_lost and stage.seconds() < loss.clock.until}
     acts = acting(here)
     return [device for device in here if device.uuid in acts and device.uuid not in lost]

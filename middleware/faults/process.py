@@ -18,6 +18,6 @@ class OwnProcess:
         """Stop by SIGSTOP; a child started before sends SIGCONT, since a stopped process has no timers."""
         wake = f"sleep {seconds:.3f}; kill -CONT {os.getpid()}"
         quiet = subprocess.DEVNULL
-        # The child has a session of its own, so that a signal which stops this process group does not stop it.
+        # The child has a separate session, so a signal to this process group does not stop it.
         subprocess.Popen(["/bin/sh", "-c", wake], stdin=quiet, stdout=quiet, stderr=quiet, start_new_session=True)
         os.kill(os.getpid(), signal.SIGSTOP)

@@ -31,7 +31,7 @@ class _FaultTable:
 
 @dataclass(frozen=True)
 class _File:
-    """The whole file."""
+    """The content of the file."""
 
     fault: Annotated[list[Any], Meta(min_length=1, max_length=MAX_FAULTS, description="1 to 100 tables [[fault]]")]
     seed: Annotated[int, Meta(ge=0)] = 1
@@ -40,7 +40,7 @@ class _File:
 
 @dataclass(frozen=True)
 class Step:
-    """One fault: ``at`` seconds after the beginning, of the device of that name, of who acts then, or of any."""
+    """One fault: at ``at`` seconds, of the device with that name, of the executing device, or of a random one."""
 
     at: float
     device: str
@@ -49,9 +49,9 @@ class Step:
 
 @dataclass(frozen=True)
 class Scenario:
-    """A task of the catalogue that is assigned first (none where empty), and the faults in the order of their time.
+    """A predefined task that is assigned first (none if empty), and the faults in order of time.
 
-    ``seed`` decides who "any" is.
+    ``seed`` selects the devices for "any".
     """
 
     task: str
@@ -60,28 +60,28 @@ class Scenario:
 
 
 def loaded(path: Path) -> Scenario:
-    """The scenario in a file; raises ``BadSetting`` with what is to be mended."""
+    """Load a scenario file; raises ``BadSetting``."""
     try:
         return scenario_of(tomllib.loads(path.read_text(encoding="utf-8")), str(path))
     except OSError as error:
         problem = f"cannot be read: {error.strerror or error}"
         raise BadSetting(str(path), "", problem, "name a scenario, such as examples/scenarios/takeover.toml") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise BadSetting(str(path), "", f"is not TOML: {error}", "mend that line") from error
+        raise BadSetting(str(path), "", f"is not TOML: {error}", "fix that line") from error
 
 
 def scenario_of(content: Mapping[str, Any], origin: str) -> Scenario:
-    """The scenario that a file's content means; raises ``BadSetting``."""
+    """Parse the content of a scenario file; raises ``BadSetting``."""
     try:
         file = convert_table(content, _File)
     except Invalid as error:
         key = "[[fault]]" if error.key == "fault" else error.key
         raise BadSetting(origin, key, error.problem, error.remedy) from None
-    steps = [_step(fault, origin, f"[[fault]] {number}") for number, fault in enumerate(file.fault, start=1)]
+    steps = [_parse_step(fault, origin, f"[[fault]] {number}") for number, fault in enumerate(file.fault, start=1)]
     return Scenario(file.task, tuple(sorted(steps, key=lambda step: step.at)), file.seed)
 
 
-def _step(content: Any, origin: str, where: str) -> Step:
+def _parse_step(content: Any, origin: str, where: str) -> Step:
     try:
         table = convert_table(content, _FaultTable)
         return Step(table.at, table.device, parse_fault(table.kind, table.seconds, table.amount))

@@ -35,7 +35,7 @@ class Takeover:
     to: str = ""
 
     def look(self, acts: Mapping[str, str], now: float) -> bool:
-        """Note the executing devices (uuid to task) at ``now``; True if the takeover is seen with this call."""
+        """Record the executing devices (uuid to task) at ``now``; returns True if this call detects the takeover."""
         if not self.is_open(now):
             return False
         others = sorted(uuid for uuid, task in acts.items() if task == self.task and uuid != self.lost)
@@ -44,5 +44,5 @@ class Takeover:
         return bool(others)
 
     def is_open(self, now: float) -> bool:
-        """Whether a takeover can still be seen."""
+        """Return whether a takeover can still be observed."""
         return bool(self.task) and self.seconds is None and now < self.until + WATCHED_S

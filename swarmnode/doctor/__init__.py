@@ -1,1 +1,1 @@
-"""Doctor: what keeps a node from its team, judged from what was measured."""
+"""``swarm doctor``: diagnose the connection of a node to its team from measurements."""

@@ -1,4 +1,4 @@
-"""Command: ``swarm doctor``, which names what keeps a node from its team, with the reason and the remedy."""
+"""``swarm doctor``: print what prevents a node from reaching its team, with reason and remedy."""
 
 from __future__ import annotations
 
@@ -27,81 +27,83 @@ Measure = Callable[[Settings, bool, Health | None], Facts]
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command line."""
+    """Return the parser of the command line."""
     doctor = argparse.ArgumentParser(
-        prog="swarm doctor", description="Name what keeps a node from its team, and what to do about it."
+        prog="swarm doctor",
+        description="Diagnose why a node does not reach its team, and print the remedies.",
+        epilog="Example: swarm doctor dog1.toml",
     )
-    doctor.add_argument("settings", nargs="?", metavar="SETTINGS", help="the node's TOML file; none: a running node")
-    doctor.add_argument("--node", metavar="NAME", help="which running node of this machine, where several run")
-    doctor.add_argument("--json", action="store_true", help="answer in JSON, on one line")
+    doctor.add_argument("settings", nargs="?", metavar="SETTINGS", help="settings file (default: a running node)")
+    doctor.add_argument("--node", metavar="NAME", help="running node on this machine, if several run")
+    doctor.add_argument("--json", action="store_true", help="print JSON, on one line")
     return doctor
 
 
 def main(
     words: Sequence[str] | None = None, out: TextIO | None = None, ask: Ask = asked, measure: Measure = measured
 ) -> int:
-    """Run the command; returns 0 where nothing is wrong, 1 where something is, 2 where the command or a file is."""
+    """Run the command; returns 0 if there is no problem, 1 if there is one, 2 if the command or a file is wrong."""
     out = out or sys.stdout
-    wishes = parser().parse_args(words)
+    options = parser().parse_args(words)
     try:
-        settings = resolved(Settings.load(wishes.settings)) if wishes.settings else None
-        name = wishes.node or (settings.node.name if settings is not None else None)
-        answers = _running(name, ask)
+        settings = resolved(Settings.load(options.settings)) if options.settings else None
+        name = options.node or (settings.node.name if settings is not None else None)
+        answers = _ask_node(name, ask)
         if settings is None:
             if answers is None:
                 raise NoControl(_not_running(name))
-            facts = _of_the_node_alone(name or "", answers[0])
+            facts = _facts_of_running(name or "", answers[0])
         else:
-            facts = measure(settings, answers is not None, None if answers is None else _health(answers[0]))
+            facts = measure(settings, answers is not None, None if answers is None else _parse_health(answers[0]))
     except (SwarmError, NoControl) as problem:
         sys.stderr.write(printable(f"swarm doctor: {problem}") + "\n")
         return WRONG
     findings = diagnosed(facts)
-    links = [] if answers is None else [_link(each) for each in answers[1]]
-    out.write(_as_json(findings, links) if wishes.json else _as_text(findings, links, answers is not None))
+    links = [] if answers is None else [_parse_link(each) for each in answers[1]]
+    out.write(_as_json(findings, links) if options.json else _as_text(findings, links, answers is not None))
     return ILL if any(finding.weight != "note" for finding in findings) else WELL
 
 
-def _running(name: str | None, ask: Ask) -> tuple[dict[str, Any], list[dict[str, Any]]] | None:
-    """What the running node says of itself and of its links; None where it does not run."""
+def _ask_node(name: str | None, ask: Ask) -> tuple[dict[str, Any], list[dict[str, Any]]] | None:
+    """Return the health and the links of the running node; None if it does not run."""
     try:
         path = found(name)
-        said: list[Any] = []
+        answer: list[Any] = []
         for verb in ("health", "links"):
             line: dict[str, Any] = next(iter(ask(path, {"verb": verb, "with": {}})), {})
             if "answer" not in line:
                 return None
-            said.append(line["answer"])
+            answer.append(line["answer"])
     except NoControl:
         return None
-    return said[0], said[1]
+    return answer[0], answer[1]
 
 
 def _not_running(name: str | None) -> str:
-    which = f"no node {name!r} runs here" if name else "no node, or more than one, runs here"
-    return f"{which}; name its settings: swarm doctor SETTINGS, or say --node NAME"
+    which = f"node {name!r} does not run on this machine" if name else "no node, or more than one, runs on this machine"
+    return f"{which}; pass its settings file (swarm doctor SETTINGS), or --node NAME"
 
 
-def _health(said: dict[str, Any]) -> Health:
-    refusals = tuple((str(code), str(whom)) for code, whom in said.get("refusals", []))
-    figures = {key: int(said[key]) for key in ("contacts", "rows", "max_rows", "bytes", "max_bytes")}
-    return Health(**figures, trouble=str(said.get("trouble", "")), refusals=refusals)
+def _parse_health(answer: dict[str, Any]) -> Health:
+    refusals = tuple((str(code), str(peer)) for code, peer in answer.get("refusals", []))
+    figures = {key: int(answer[key]) for key in ("contacts", "rows", "max_rows", "bytes", "max_bytes")}
+    return Health(**figures, trouble=str(answer.get("trouble", "")), refusals=refusals)
 
 
-def _of_the_node_alone(name: str, said: dict[str, Any]) -> Facts:
-    host, _, port = str(said["address"]).rpartition(":")
-    return Facts(name, host, int(port), 0.0, tuple(interfaces()), is_running=True, health=_health(said))
+def _facts_of_running(name: str, answer: dict[str, Any]) -> Facts:
+    host, _, port = str(answer["address"]).rpartition(":")
+    return Facts(name, host, int(port), 0.0, tuple(interfaces()), is_running=True, health=_parse_health(answer))
 
 
-def _link(said: dict[str, Any]) -> tuple[str, str, Link]:
-    return str(said["id"]), str(said["address"]), link(said["times"], bool(said["relayed"]))
+def _parse_link(answer: dict[str, Any]) -> tuple[str, str, Link]:
+    return str(answer["id"]), str(answer["address"]), link(answer["times"], bool(answer["relayed"]))
 
 
 def _as_json(findings: Sequence[Finding], links: Sequence[tuple[str, str, Link]]) -> str:
-    told = [
+    rows = [
         {"id": node_id, "address": address, "score": each.score, **asdict(each)} for node_id, address, each in links
     ]
-    return json.dumps({"findings": [asdict(finding) for finding in findings], "links": told}) + "\n"
+    return json.dumps({"findings": [asdict(finding) for finding in findings], "links": rows}) + "\n"
 
 
 def _as_text(findings: Sequence[Finding], links: Sequence[tuple[str, str, Link]], is_running: bool) -> str:
@@ -116,5 +118,5 @@ def _as_text(findings: Sequence[Finding], links: Sequence[tuple[str, str, Link]]
         relayed = ", relayed" if each.is_relayed and each.round_trip is not None else ""
         lines.append(f"link  {node_id[:10]}  {address}  {each.score:3}/100  {figures(each)}{relayed}")
     if not findings:
-        lines.append("nothing is wrong" if is_running else "nothing is wrong that can be seen while the node is off")
+        lines.append("no problem found" if is_running else "no problem found; run it again while the node runs")
     return "".join(printable(line) + "\n" for line in lines)

@@ -1,4 +1,4 @@
-"""Diagnosis: every check over the facts of one node, and those of the machine that it runs on; pure."""
+"""The checks of ``swarm doctor`` over the facts of one node and its machine.  Pure."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from swarmnode.doctor import team, way
 from swarmnode.doctor.facts import ORDER, Facts, Finding, error, warning
 
 LEAST_FREE = 16 * 2**20
-"""Bytes of free disk below which a store may soon be unable to write."""
+"""Bytes of free disk space below which a warning is given."""
 NEARLY = 0.9
 
 
 def diagnosed(facts: Facts) -> list[Finding]:
-    """What is wrong, the gravest first, and each cause once."""
+    """Return the problems, most serious first, each cause once."""
     found = [finding for check in CHECKS for finding in check(facts)]
     if not any(finding.weight == "error" for finding in found):
         found += way.nobody(facts)
@@ -22,33 +22,33 @@ def diagnosed(facts: Facts) -> list[Finding]:
 
 
 def port(facts: Facts) -> Iterator[Finding]:
-    """Whether the node could open its port."""
+    """Check that the node can open its port."""
     if facts.port_problem and not facts.is_running:
         yield error(
             "port-in-use",
             f"UDP port {facts.port} cannot be opened.",
             facts.port_problem,
-            "End the program that holds it (ss -lunp shows it), or leave [node] port out, so that a free one is taken.",
+            "Stop the program that uses it (see ss -lunp), or remove [node] port to use any free port.",
         )
 
 
 def store(facts: Facts) -> Iterator[Finding]:
-    """Whether the store can be written, and has room."""
-    where, health = facts.storage, facts.health
-    if where is not None and where.problem:
+    """Check that the store is writable and not full."""
+    storage, health = facts.storage, facts.health
+    if storage is not None and storage.problem:
         yield error(
             "store-unwritable",
-            f"The store {where.path} cannot be written.",
-            where.problem,
-            "Mend that, or name another.",
+            f"The store {storage.path} cannot be written.",
+            storage.problem,
+            "Fix that, or set another [node] store.",
         )
     elif health is not None and health.trouble:
         yield error(
-            "store-unwritable", "The node cannot write its store.", health.trouble, "Make room, or mend the disk."
+            "store-unwritable", "The node cannot write its store.", health.trouble, "Free disk space, or fix the disk."
         )
-    elif where is not None and where.free is not None and where.free < LEAST_FREE:
-        free = f"{where.free / 2**20:.0f} MiB are free where {where.path} lies."
-        yield warning("disk-full", "The disk of the store is nearly full.", free, "Make room.")
+    elif storage is not None and storage.free is not None and storage.free < LEAST_FREE:
+        free = f"The disk of {storage.path} has {storage.free / 2**20:.0f} MiB free."
+        yield warning("disk-full", "The disk of the store is nearly full.", free, "Free disk space.")
     if health is None:
         return
     for used, most, what, key in (
@@ -66,13 +66,13 @@ def store(facts: Facts) -> Iterator[Finding]:
 
 
 def files(facts: Facts) -> Iterator[Finding]:
-    """Whether others can read the node's secrets."""
+    """Check that other users cannot read the node's secrets."""
     for path, mode in facts.open_files:
         yield error(
             "key-readable",
-            f"Others can read {path}, which holds secrets.",
+            f"Other users can read {path}, which holds secrets.",
             f"Its mode is {mode:04o}.",
-            f"chmod 600 {path}; if somebody may have read it, have its key replaced.",
+            f"Run chmod 600 {path}; if another user may have read it, replace its key.",
         )
 
 

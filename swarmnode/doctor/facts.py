@@ -1,4 +1,4 @@
-"""Facts: what was measured around one node, and what was found in it; a fact that could not be measured is None."""
+"""The measurements that ``swarm doctor`` judges; a fact that could not be measured is None."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ORDER: tuple[Weight, ...] = ("error", "warning", "note")
 
 @dataclass(frozen=True)
 class Answer:
-    """What somebody who was hailed said; ``offset`` is its clock less this one, in seconds."""
+    """The reply of a node to a discovery probe; ``offset`` is its clock minus this machine's, in seconds."""
 
     address: Address
     version: int = VERSION
@@ -27,11 +27,12 @@ class Answer:
 
 @dataclass(frozen=True)
 class Probe:
-    """One node that the settings name, asked over UDP.
+    """The result of probing one known node over UDP.
 
-    ``answer`` is its ECHO; ``is_member`` says that it answered a WHO of this team, too.  ``error`` is ``refused`` where
-    the machine said that nobody listens, ``unreachable`` where there is no way to it.  ``is_near``: it is of a subnet
-    of this machine; ``is_resolved``: its hardware answers there.  ``is_tcp``: it answers to TCP, if only by a refusal.
+    ``answer`` is its reply to a probe for any node; ``is_member`` means that it also replied to a probe for this team.
+    ``error`` is ``refused`` if the machine reported a closed port, ``unreachable`` if there is no route.  ``is_near``:
+    it is in a subnet of this machine; ``is_resolved``: its hardware address was resolved.  ``is_tcp``: it replies to
+    TCP, possibly by a refusal.
     """
 
     address: Address
@@ -44,13 +45,13 @@ class Probe:
 
     @property
     def is_heard(self) -> bool:
-        """Whether anything came back over UDP."""
+        """Whether any UDP reply was received."""
         return self.answer is not None or self.is_member
 
 
 @dataclass(frozen=True)
 class Lan:
-    """The group of the LAN: who answered a HAIL to it, and whether this machine heard its own."""
+    """Discovery on the LAN: the replies to a multicast probe, and whether this machine received its own probe."""
 
     answers: tuple[Answer, ...] = ()
     is_sent: bool = False
@@ -59,7 +60,7 @@ class Lan:
 
 @dataclass(frozen=True)
 class Certificate:
-    """What the node's membership says; the moments are unix seconds.  ``problem``: why it cannot be read."""
+    """The dates of the node's certificate, as Unix timestamps; ``problem``: the reason why it cannot be read."""
 
     not_before: float = 0.0
     not_after: float = float("inf")
@@ -68,7 +69,7 @@ class Certificate:
 
 @dataclass(frozen=True)
 class Storage:
-    """The store's file: whether it can be written, and the free bytes of its disk."""
+    """The file of the store: the reason why it is not writable, and the free bytes of its disk."""
 
     path: str
     problem: str = ""
@@ -77,7 +78,7 @@ class Storage:
 
 @dataclass(frozen=True)
 class Health:
-    """What the running node says of itself; ``refusals`` are the names of those that it met, with whom."""
+    """Self-report of the running node; ``refusals`` are pairs of a refusal and the peer that sent it."""
 
     contacts: int
     rows: int = 0
@@ -90,7 +91,7 @@ class Health:
 
 @dataclass(frozen=True)
 class Facts:
-    """Everything about one node and its surroundings; ``wall`` is this machine's clock, in unix seconds."""
+    """All facts about one node and its environment; ``wall`` is this machine's clock, as a Unix timestamp."""
 
     name: str
     host: str
@@ -103,17 +104,17 @@ class Facts:
     is_running: bool = False
     fingerprint: bytes = bytes(8)
     way_out: str = ""
-    """From which of its addresses this machine reaches the known nodes."""
+    """The address from which this machine reaches the known nodes."""
     is_gateway_resolved: bool | None = None
     certificate: Certificate | None = None
     storage: Storage | None = None
     open_files: tuple[tuple[str, int], ...] = ()
-    """Files with secrets that others than their owner can read, with their modes."""
+    """Files with secrets that other users can read, with their modes."""
     health: Health | None = None
 
     @property
     def answers(self) -> tuple[Answer, ...]:
-        """All who said anything, the known nodes first; each address once."""
+        """All replies, known nodes first, each address once."""
         found = [probe.answer for probe in self.known if probe.answer is not None]
         found += [] if self.lan is None else list(self.lan.answers)
         return tuple({answer.address: answer for answer in reversed(found)}.values())[::-1]
@@ -125,12 +126,12 @@ class Facts:
 
     @property
     def others(self) -> tuple[Answer, ...]:
-        """Those on the LAN that are not on this machine."""
+        """The replies on the LAN from other machines."""
         return () if self.lan is None else tuple(a for a in self.lan.answers if a.address.host not in self.own)
 
 
 def is_local(host: str) -> bool:
-    """Whether ``host`` is heard on one machine alone."""
+    """Return whether ``host`` is a loopback address."""
     try:
         return ip_address(host.partition("%")[0]).is_loopback
     except ValueError:
@@ -139,9 +140,9 @@ def is_local(host: str) -> bool:
 
 @dataclass(frozen=True)
 class Finding:
-    """``cause`` is a name for programs, such as ``udp-blocked``; the rest are sentences for people.
+    """A problem or a note; ``cause`` is a code such as ``udp-blocked``, the other fields are sentences for display.
 
-    An ``error`` keeps the node from its team, a ``warning`` will or may, a ``note`` is good to know.
+    An ``error`` prevents the node from reaching its team, a ``warning`` may do so, a ``note`` is information.
     """
 
     weight: Weight
@@ -152,15 +153,15 @@ class Finding:
 
 
 def error(cause: str, what: str, why: str, remedy: str) -> Finding:
-    """What keeps the node from its team."""
+    """Return a problem that prevents the node from reaching its team."""
     return Finding("error", cause, what, why, remedy)
 
 
 def warning(cause: str, what: str, why: str, remedy: str) -> Finding:
-    """What may keep it, or will."""
+    """Return a problem that may prevent the node from reaching its team."""
     return Finding("warning", cause, what, why, remedy)
 
 
 def note(cause: str, what: str, why: str, remedy: str) -> Finding:
-    """What is good to know."""
+    """Return information without a problem."""
     return Finding("note", cause, what, why, remedy)

@@ -1,7 +1,7 @@
-"""Measure: the facts of one node and its surroundings, taken from this machine by sockets of the doctor's own.
+"""Measurements for ``swarm doctor``, taken from this machine with separate sockets.
 
-Whoever is asked needs no more than to run: a HAIL is answered to anybody, a WHO to a member.  All of it takes about two
-seconds.
+A node replies to a discovery probe (HAIL) of any sender, and to a team probe (WHO) of a member.  All measurements take
+about two seconds.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _IP_RECVERR, _IP_PKTINFO, _IP_MULTICAST_ALL = 11, 8, 49
 
 @dataclass
 class Team:
-    """What the doctor knows of the team: the secrets that seal a WHO, how it shows itself, whom to enter through."""
+    """The team of the node: secrets for team probes, fingerprint, certificate, and bootstrap nodes."""
 
     secrets: Sequence[bytes]
     fingerprint: bytes = bytes(8)
@@ -53,7 +53,7 @@ class Team:
 
 
 @dataclass
-class _Heard:
+class _Replies:
     calls: set[bytes] = field(default_factory=set)
     on_lan: dict[Address, Answer] = field(default_factory=dict)
     answers: dict[Address, Answer] = field(default_factory=dict)
@@ -69,51 +69,51 @@ def measured(
     health: Health | None = None,
     wall: Callable[[], float] = time.time,
 ) -> Facts:
-    """The facts of the node with these settings, whose host names were looked up."""
+    """Measure the facts of the node with these settings; host names must be resolved already."""
     node = settings.node
     team = team_of(settings)
     found = tuple(interfaces())
     named = dict.fromkeys([*node.known_nodes, *team.known])
-    known = [each for each in named if _is_figures(each) and not _is_self(each, node.host, node.port, found)]
+    known = [each for each in named if _is_numeric(each) and not _is_self(each, node.host, node.port, found)]
     known = known[:MAX_KNOWN]
     port_problem = ""
     if node.port and not is_free(socket.SOCK_DGRAM, "" if is_any(node.host) else node.host, node.port):
-        port_problem = f"Another program listens at {node.host}:{node.port}."
-    where = chosen(list(found), node.host) if node.lan and not is_local(node.host) else []
-    heard = _asked(node.host, known, team.secrets, where, wall)
-    gateway = _gateway()
+        port_problem = f"Another program uses {node.host}:{node.port}."
+    lan_interfaces = chosen(list(found), node.host) if node.lan and not is_local(node.host) else []
+    replies = _probe_all(node.host, known, team.secrets, lan_interfaces, wall)
+    gateway = _find_router()
     return Facts(
         node.name,
         node.host,
         node.port,
         wall(),
         interfaces=found,
-        known=tuple(_probe(address, heard, found) for address in known),
-        lan=Lan(tuple(heard.on_lan.values()), heard.is_sent, heard.is_own_heard) if where else None,
+        known=tuple(_make_probe(address, replies, found) for address in known),
+        lan=Lan(tuple(replies.on_lan.values()), replies.is_sent, replies.is_own_heard) if lan_interfaces else None,
         port_problem=port_problem if settings.is_given("node", "port") else "",
         is_running=is_running,
         fingerprint=team.fingerprint,
-        way_out=_way_out([each.host for each in known if not is_local(each.host)]),
+        way_out=_source_address([each.host for each in known if not is_local(each.host)]),
         is_gateway_resolved=_is_resolved(gateway) if gateway else None,
         certificate=team.certificate,
-        storage=_storage(node.store),
-        open_files=tuple(_open(_secret_files(settings))),
+        storage=_check_storage(node.store),
+        open_files=tuple(_readable_by_others(_secret_files(settings))),
         health=health,
     )
 
 
 def team_of(settings: Settings) -> Team:
-    """The team that the settings name."""
+    """Return the team that the settings name."""
     path = settings.node.membership
     if not path:
         return Team([settings.node.team_secret])
-    # What reads it is needed by members of closed teams only.
+    # Imported on demand: only needed for closed teams.
     from middleware.admission.membership import MembershipFile
 
     try:
         kept = MembershipFile(Path(path)).membership
         member = kept.member
-    except Exception as error:  # whatever is wrong with the file is what the doctor is asked for
+    except Exception as error:  # any error in the file is a result of the diagnosis
         return Team([], certificate=Certificate(problem=str(error)))
     mark = hashlib.blake2s(kept.operator, digest_size=8, person=b"team").digest()
     secrets = [secret for _, secret, _ in kept.secrets]
@@ -121,54 +121,54 @@ def team_of(settings: Settings) -> Team:
 
 
 def on_lan() -> list[Answer]:
-    """Who answers a HAIL to all on the LAN, of whatever team; it takes ``TRIES`` times ``EACH_S`` seconds.
+    """Return the replies to a discovery probe on the LAN, of any team; takes ``TRIES`` times ``EACH_S`` seconds.
 
-    So one who is of no team yet finds whom to ask.  Of a large team only some answer, others at the next call.
+    A newcomer without a team finds bootstrap nodes by this.  In a large team only some nodes reply to each call.
     """
-    return list(_asked("*", [], [], chosen(interfaces(), "*"), time.time).on_lan.values())
+    return list(_probe_all("*", [], [], chosen(interfaces(), "*"), time.time).on_lan.values())
 
 
-# -- the net ----------------------------------------------------------------------------------------------------------
+# -- network ----------------------------------------------------------------------------------------------------------
 
 
-def _asked(
+def _probe_all(
     host: str,
     known: Sequence[Address],
     secrets: Sequence[bytes],
-    where: Sequence[Interface],
+    lan_interfaces: Sequence[Interface],
     wall: Callable[[], float],
-) -> _Heard:
-    """Hail and greet everybody by one socket, so that several see the same port; call on the LAN of ``where``."""
-    heard = _Heard()
+) -> _Replies:
+    """Probe all known nodes from one socket, so they report the same port; also probe the LAN by ``lan_interfaces``."""
+    replies = _Replies()
     rng = random.SystemRandom()
     keys = [derived_key(secret, b"greet") for secret in secrets]
     tokens = {rng.randbytes(16): address for address in known}
-    sockets = _sockets(host, known)
-    ear = _ear(where) if where else None
+    sockets = _open_sockets(host, known)
+    multicast = _open_multicast_socket(lan_interfaces) if lan_interfaces else None
     try:
         for _ in range(TRIES):
             for token, address in tokens.items():
-                _send(sockets, hail(token), address, heard)
-                if address not in heard.members:
+                _send(sockets, hail(token), address, replies)
+                if address not in replies.members:
                     for key in keys:
-                        _send(sockets, who(key, token, rng), address, heard)
-            if where:
+                        _send(sockets, who(key, token, rng), address, replies)
+            if lan_interfaces:
                 call = rng.randbytes(16)
-                heard.calls.add(call)
-                _call(sockets, hail(call), where, heard)
-            _listen([*sockets.values(), *([] if ear is None else [ear])], ear, keys, heard, wall)
-            if known and not where and heard.members >= set(known) and heard.answers.keys() >= set(known):
+                replies.calls.add(call)
+                _send_multicast(sockets, hail(call), lan_interfaces, replies)
+            _listen([*sockets.values(), *([] if multicast is None else [multicast])], multicast, keys, replies, wall)
+            if known and not lan_interfaces and replies.members >= set(known) and replies.answers.keys() >= set(known):
                 break
     finally:
-        for each in [*sockets.values(), ear]:
+        for each in [*sockets.values(), multicast]:
             if each is not None:
                 each.close()
-    return heard
+    return replies
 
 
-def _sockets(host: str, known: Iterable[Address]) -> dict[int, socket.socket]:
-    """One socket of each family that is needed, at the node's address and any port."""
-    made: dict[int, socket.socket] = {}
+def _open_sockets(host: str, known: Iterable[Address]) -> dict[int, socket.socket]:
+    """Open one socket per required address family, at the node's address and any port."""
+    by_family: dict[int, socket.socket] = {}
     families = {socket.AF_INET6 if ":" in address.host else socket.AF_INET for address in known} | {socket.AF_INET}
     for family in families:
         try:
@@ -181,119 +181,121 @@ def _sockets(host: str, known: Iterable[Address]) -> dict[int, socket.socket]:
             try:
                 opened.bind((own, 0))
             except OSError:
-                opened.bind(("", 0))  # an address that is not of this machine is found out elsewhere
+                opened.bind(("", 0))  # another check reports an address that is not of this machine
         except OSError:
             continue
-        made[family] = opened
-    return made
+        by_family[family] = opened
+    return by_family
 
 
-def _ear(where: Sequence[Interface]) -> socket.socket | None:
-    """What hears the group of the LAN, as a node does."""
-    ear = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+def _open_multicast_socket(lan_interfaces: Sequence[Interface]) -> socket.socket | None:
+    """Open a socket in the multicast group of the LAN, as a node does."""
+    multicast = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
-        ear.setblocking(False)
-        ear.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        ear.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)
-        ear.bind(GROUP)
-        for interface in where:
+        multicast.setblocking(False)
+        multicast.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        multicast.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)
+        multicast.bind(GROUP)
+        for interface in lan_interfaces:
             with suppress(OSError):
                 request = struct.pack("4s4si", socket.inet_aton(GROUP.host), bytes(4), interface.index)
-                ear.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, request)
+                multicast.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, request)
     except OSError:
-        ear.close()
+        multicast.close()
         return None
-    return ear
+    return multicast
 
 
-def _send(sockets: dict[int, socket.socket], datagram: bytes, to: Address, heard: _Heard) -> None:
+def _send(sockets: dict[int, socket.socket], datagram: bytes, to: Address, replies: _Replies) -> None:
     by = sockets.get(socket.AF_INET6 if ":" in to.host else socket.AF_INET)
     if by is None:
-        heard.errors[to] = "unreachable"
+        replies.errors[to] = "unreachable"
         return
-    for _ in range(2):  # an error of an earlier datagram comes out at the next one
+    for _ in range(2):  # an error of an earlier datagram is raised by the next call
         try:
             by.sendto(datagram, to)
             return
         except OSError as error:
             if error.errno in (errno.ENETUNREACH, errno.EPERM, errno.EACCES, errno.EINVAL):
-                heard.errors[to] = "unreachable"
+                replies.errors[to] = "unreachable"
 
 
-def _call(sockets: dict[int, socket.socket], datagram: bytes, where: Sequence[Interface], heard: _Heard) -> None:
+def _send_multicast(
+    sockets: dict[int, socket.socket], datagram: bytes, lan_interfaces: Sequence[Interface], replies: _Replies
+) -> None:
     by = sockets.get(socket.AF_INET)
     if by is None:
         return
-    for interface in where:
+    for interface in lan_interfaces:
         for address in [each for each in interface.addresses if ":" not in each]:
-            way = struct.pack("i4s4s", interface.index, socket.inet_aton(address), bytes(4))
+            packet_info = struct.pack("i4s4s", interface.index, socket.inet_aton(address), bytes(4))
             with suppress(OSError):
-                by.sendmsg([datagram], [(socket.IPPROTO_IP, _IP_PKTINFO, way)], 0, GROUP)
-                heard.is_sent = True
+                by.sendmsg([datagram], [(socket.IPPROTO_IP, _IP_PKTINFO, packet_info)], 0, GROUP)
+                replies.is_sent = True
 
 
 def _listen(
     sockets: Sequence[socket.socket],
-    ear: socket.socket | None,
+    multicast: socket.socket | None,
     keys: Sequence[bytes],
-    heard: _Heard,
+    replies: _Replies,
     wall: Callable[[], float],
 ) -> None:
     until = time.monotonic() + EACH_S
-    ours = {each.getsockname()[1] for each in sockets if each is not ear}
+    ours = {each.getsockname()[1] for each in sockets if each is not multicast}
     while (left := until - time.monotonic()) > 0:
         for ready in select.select(sockets, [], [], left)[0]:
-            _refusals(ready, heard)
+            _read_errors(ready, replies)
             try:
                 datagram, source = ready.recvfrom(2048)
             except OSError:
                 continue
-            if ready is ear:
-                heard.is_own_heard = heard.is_own_heard or source[1] in ours
+            if ready is multicast:
+                replies.is_own_heard = replies.is_own_heard or source[1] in ours
             elif datagram[:1] == bytes([ECHO]):
-                _echo(datagram, Address(source[0], source[1]), heard, wall())
+                _on_echo(datagram, Address(source[0], source[1]), replies, wall())
             else:
-                _here(datagram, Address(source[0], source[1]), keys, heard)
+                _on_here(datagram, Address(source[0], source[1]), keys, replies)
 
 
-def _echo(datagram: bytes, source: Address, heard: _Heard, now: float) -> None:
+def _on_echo(datagram: bytes, source: Address, replies: _Replies, now: float) -> None:
     try:
         echo = echo_of(datagram)
     except Malformed:
         return
     offset = echo.wall - now if echo.wall else None
-    told = heard.on_lan if echo.token in heard.calls else heard.answers
-    told.setdefault(source, Answer(source, echo.version, echo.fingerprint, offset, echo.seen))
+    answers = replies.on_lan if echo.token in replies.calls else replies.answers
+    answers.setdefault(source, Answer(source, echo.version, echo.fingerprint, offset, echo.seen))
 
 
-def _here(datagram: bytes, source: Address, keys: Sequence[bytes], heard: _Heard) -> None:
+def _on_here(datagram: bytes, source: Address, keys: Sequence[bytes], replies: _Replies) -> None:
     for key in keys:
         with suppress(Forged):
             opened_greeting(key, datagram)
-            heard.members.add(source)
+            replies.members.add(source)
             return
 
 
-def _refusals(ready: socket.socket, heard: _Heard) -> None:
-    """Read what machines on the way said of datagrams that could not arrive."""
+def _read_errors(ready: socket.socket, replies: _Replies) -> None:
+    """Read the ICMP errors for datagrams that could not be delivered."""
     while ready.family == socket.AF_INET:
         try:
-            _, said, _, to = ready.recvmsg(2048, 512, socket.MSG_ERRQUEUE)
+            _, messages, _, to = ready.recvmsg(2048, 512, socket.MSG_ERRQUEUE)
         except OSError:
             return
-        for level, kind, data in said:
+        for level, kind, data in messages:
             if level == socket.IPPROTO_IP and kind == _IP_RECVERR and len(data) >= 4:
                 number = struct.unpack_from("I", data)[0]
                 refused = number == errno.ECONNREFUSED
-                heard.errors[Address(to[0], to[1])] = "refused" if refused else "unreachable"
+                replies.errors[Address(to[0], to[1])] = "refused" if refused else "unreachable"
 
 
-def _probe(address: Address, heard: _Heard, found: Sequence[Interface]) -> Probe:
+def _make_probe(address: Address, replies: _Replies, found: Sequence[Interface]) -> Probe:
     probe = Probe(
         address,
-        heard.answers.get(address),
-        address in heard.members,
-        heard.errors.get(address, ""),
+        replies.answers.get(address),
+        address in replies.members,
+        replies.errors.get(address, ""),
         _is_near(address.host, found),
     )
     if probe.is_heard:
@@ -305,7 +307,7 @@ def _probe(address: Address, heard: _Heard, found: Sequence[Interface]) -> Probe
 
 
 def _answers_tcp(address: Address) -> bool:
-    """Whether the machine there answers to TCP, if only that the port is closed."""
+    """Return whether the machine replies to TCP, possibly by a refusal."""
     for port in (address.port, TUNNEL):
         try:
             socket.create_connection((address.host, port), TCP_S).close()
@@ -320,8 +322,8 @@ def _answers_tcp(address: Address) -> bool:
 # -- the machine ------------------------------------------------------------------------------------------------------
 
 
-def _is_figures(address: Address) -> bool:
-    """Whether it is an address that datagrams go to; tunnels and relays have others."""
+def _is_numeric(address: Address) -> bool:
+    """Return whether the address is numeric; tunnels and relays have virtual addresses."""
     try:
         return ip_address(address.host.partition("%")[0]).version > 0
     except ValueError:
@@ -333,53 +335,53 @@ def _is_self(address: Address, host: str, port: int, found: Sequence[Interface])
     return bool(port) and address.port == port and address.host in mine
 
 
-def _way_out(hosts: Sequence[str]) -> str:
-    """The address from which this machine would send to the first of them."""
+def _source_address(hosts: Sequence[str]) -> str:
+    """Return the source address for datagrams to the first host."""
     for host in hosts[:1]:
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        with suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as way:
-            way.connect((host, 9))  # sends nothing
-            return str(way.getsockname()[0])
+        with suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as probe:
+            probe.connect((host, 9))  # sends nothing
+            return str(probe.getsockname()[0])
     return ""
 
 
 def _is_near(host: str, found: Sequence[Interface]) -> bool:
-    """Whether ``host`` is of a subnet of this machine (IPv4: by the routing table, IPv6: of the same /64)."""
+    """Return whether ``host`` is in a subnet of this machine (IPv4: by the routing table, IPv6: same /64)."""
     address = ip_address(host.partition("%")[0])
     if address.version == 6:
         mine = [ip_address(each) for i in found for each in i.addresses if ":" in each and not i.is_loopback]
         return any(int(address) >> 64 == int(own) >> 64 for own in mine)
-    routes = [(network, mask) for network, gateway, mask in _routes() if not gateway and mask]
+    routes = [(network, mask) for network, gateway, mask in _read_routes() if not gateway and mask]
     return any(int(address) & mask == network for network, mask in routes)
 
 
-def _gateway() -> str:
-    """The router that everything else goes through; empty where there is none."""
-    for network, gateway, mask in _routes():
+def _find_router() -> str:
+    """Return the default router, or an empty string."""
+    for network, gateway, mask in _read_routes():
         if gateway and not network and not mask:
             return str(ip_address(gateway))
     return ""
 
 
-def _routes() -> list[tuple[int, int, int]]:
-    """(network, gateway, mask) of each route of IPv4."""
+def _read_routes() -> list[tuple[int, int, int]]:
+    """Return (network, gateway, mask) of each IPv4 route."""
     try:
         lines = Path("/proc/net/route").read_text(encoding="ascii").splitlines()[1:]
     except (OSError, ValueError):
         return []
     rows = [line.split() for line in lines]
-    return [(_number(row[1]), _number(row[2]), _number(row[7])) for row in rows if len(row) > 7]
+    return [(_parse_address(row[1]), _parse_address(row[2]), _parse_address(row[7])) for row in rows if len(row) > 7]
 
 
-def _number(digits: str) -> int:
-    """An address as the kernel prints it: four bytes in the order of this machine."""
+def _parse_address(digits: str) -> int:
+    """Convert an address as the kernel prints it: four bytes in native byte order."""
     return int.from_bytes(int(digits, 16).to_bytes(4, sys.byteorder))
 
 
 def _is_resolved(host: str) -> bool | None:
-    """Whether the hardware of a neighbour answered when it was asked for its address; None where nobody asked."""
+    """Return whether the hardware address of a neighbour was resolved; None if that is unknown."""
     with suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
-        asking.sendto(b"", (host, 9))  # has the system ask now, if it has not yet
+        asking.sendto(b"", (host, 9))  # triggers the resolution
         time.sleep(0.05)
     try:
         lines = Path("/proc/net/arp").read_text(encoding="ascii").splitlines()[1:]
@@ -390,20 +392,20 @@ def _is_resolved(host: str) -> bool | None:
     return bool(flags[0] & 0x2) if flags else False
 
 
-def _storage(path: str) -> Storage | None:
+def _check_storage(path: str) -> Storage | None:
     if path == IN_MEMORY:
         return None
-    where = Path(path)
-    folder = where.parent
+    file = Path(path)
+    folder = file.parent
     problem = ""
-    if where.is_dir():
+    if file.is_dir():
         problem = "It is a folder."
-    elif where.exists():
-        problem = "" if os.access(where, os.R_OK | os.W_OK) else "This user may not write it."
+    elif file.exists():
+        problem = "" if os.access(file, os.R_OK | os.W_OK) else "This user has no permission to write it."
     elif not folder.is_dir():
-        problem = f"There is no folder {folder}."
+        problem = f"The folder {folder} does not exist."
     if not problem and not os.access(folder, os.W_OK | os.X_OK):
-        problem = f"This user may not write in {folder}."
+        problem = f"This user has no permission to write in {folder}."
     try:
         free = shutil.disk_usage(folder).free
         probe = os.statvfs(folder)
@@ -423,7 +425,7 @@ def _secret_files(settings: Settings) -> list[str]:
     return [path for path in paths if path and path != IN_MEMORY]
 
 
-def _open(paths: Iterable[str]) -> Iterable[tuple[str, int]]:
+def _readable_by_others(paths: Iterable[str]) -> Iterable[tuple[str, int]]:
     for path in paths:
         with suppress(OSError):
             mode = stat.S_IMODE(os.stat(path).st_mode)

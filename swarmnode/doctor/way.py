@@ -1,4 +1,4 @@
-"""Way: what lies between the node and the others: interfaces, firewalls, access points, routers."""
+"""Checks of ``swarm doctor`` on the network path: interfaces, firewalls, access points, routers."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ from swarmnode.doctor.facts import Facts, Finding, Probe, error, is_local, note,
 
 
 def interface(facts: Facts) -> Iterator[Finding]:
-    """Whether the node listens at an interface by which the others can be met."""
+    """Check that the node listens on an interface that reaches the other nodes."""
     far = [probe for probe in facts.known if not is_local(probe.address.host)]
     outside = [each for each in facts.interfaces if not each.is_loopback and each.addresses]
     if is_local(facts.host):
         if far:
             yield error(
                 "wrong-interface",
-                "The node listens at an address of this machine alone.",
+                "The node accepts only connections from this machine.",
                 f"[node] host is {facts.host}, and {far[0].address} is on another machine.",
-                f"Set [node] host to {_offer(facts)}.",
+                f"Set [node] host to {_suggest_address(facts)}.",
             )
         return
     if not outside:
         yield error(
             "offline",
             "This machine has no network.",
-            "No interface but the loopback is up and has an address.",
+            "Only the loopback interface is up and has an address.",
             "Join a network, or plug in the cable.",
         )
         return
@@ -35,80 +35,80 @@ def interface(facts: Facts) -> Iterator[Finding]:
     if not at:
         yield error(
             "wrong-interface",
-            "The node's address is not one of this machine.",
-            f"[node] host is {facts.host}; this machine has {_all(facts)}.",
-            f"Set [node] host to {_offer(facts)}.",
+            "The node's address is not an address of this machine.",
+            f"[node] host is {facts.host}; this machine has {_list_addresses(facts)}.",
+            f"Set [node] host to {_suggest_address(facts)}.",
         )
     elif not at[0].is_running:
         yield error(
             "wrong-interface",
             f"The interface {at[0].name} is not connected.",
-            f"[node] host {facts.host} is its address, and it has no carrier.",
-            f"Connect it, or set [node] host to {_offer(facts, at[0].name)}.",
+            f"[node] host {facts.host} is its address, but it has no carrier.",
+            f"Connect it, or set [node] host to {_suggest_address(facts, at[0].name)}.",
         )
     elif facts.way_out and facts.way_out != facts.host and not any(probe.is_heard for probe in facts.known):
         yield error(
             "wrong-interface",
-            "The known nodes are reached by another interface than the one that the node listens at.",
-            f"[node] host is {facts.host} ({at[0].name}), and this machine reaches them from {facts.way_out}.",
+            "The known nodes are reached through another interface than the node's.",
+            f"[node] host is {facts.host} ({at[0].name}), but this machine reaches them from {facts.way_out}.",
             f"Set [node] host to {facts.way_out}.",
         )
 
 
 def known(facts: Facts) -> Iterator[Finding]:
-    """Why known nodes do not answer, each cause once."""
+    """Report the causes for which known nodes do not reply, each once."""
     silent = [probe for probe in facts.known if not probe.is_heard]
     for probe in [each for each in silent if each.error == "refused"]:
         yield warning(
             "nobody-listens",
-            f"Nobody listens at {probe.address}.",
-            "The machine is there and says that the port is closed.",
-            "Start that node, or mend its address in [node] known_nodes.",
+            f"No node listens at {probe.address}.",
+            "The machine replies that the port is closed.",
+            "Start that node, or fix its address in [node] known_nodes.",
         )
-    yield from _isolated(facts, silent)
+    yield from _check_neighbours(facts, silent)
     far = [probe for probe in silent if not probe.is_near and not probe.error and not is_local(probe.address.host)]
     heard_far = any(probe.is_heard and not probe.is_near for probe in facts.known)
     spoken = [probe for probe in far if probe.is_tcp]
     if spoken and not heard_far:
         yield error(
             "udp-blocked",
-            "Something between here and the known nodes blocks UDP.",
-            f"{spoken[0].address.host} answers to TCP, and to no datagram.",
-            f"Open UDP {facts.port or '(all)'} outwards, or give [node] tunnels a node that serves them on 443.",
+            "UDP is blocked between this machine and the known nodes.",
+            f"{spoken[0].address.host} replies to TCP, but not to UDP.",
+            f"Allow outgoing UDP from port {facts.port or '(all)'}, or set [node] tunnels to a node with one on 443.",
         )
 
 
-def _isolated(facts: Facts, silent: list[Probe]) -> Iterator[Finding]:
-    """Neighbours on the same subnet that say nothing."""
+def _check_neighbours(facts: Facts, silent: list[Probe]) -> Iterator[Finding]:
+    """Report silent nodes on the same subnet."""
     near = [probe for probe in silent if probe.is_near and probe.error != "refused"]
     hidden = [probe for probe in near if probe.is_resolved is False]
     others = [probe for probe in facts.known if probe.is_heard and probe.is_near]
     if hidden and not others and not facts.others and facts.is_gateway_resolved:
         yield error(
             "client-isolation",
-            "This network keeps its clients from each other, or those nodes are off.",
-            f"The router answers, and {hidden[0].address.host} does not even on the same subnet.",
+            "This network isolates its clients from each other, or those nodes are off.",
+            f"The router replies, but {hidden[0].address.host} on the same subnet does not.",
             "Switch off client isolation (AP isolation, guest mode) at the access point, or use another network; "
-            "or give all nodes a known node on the internet, which relays.",
+            "or give all nodes a known node on the internet, which acts as a relay.",
         )
     elif hidden:
         yield warning(
             "off",
             f"{hidden[0].address.host} is not on this network now.",
-            "It is of the same subnet, and its hardware does not answer.",
-            "Switch it on, or mend its address in [node] known_nodes.",
+            "It is in the same subnet, but its hardware does not reply.",
+            "Switch it on, or fix its address in [node] known_nodes.",
         )
     for probe in [each for each in near if each.is_resolved]:
         yield error(
             "peer-firewall",
-            f"The machine {probe.address.host} lets no datagram in at port {probe.address.port}.",
-            "Its hardware answers on this subnet, and it says neither yes nor that the port is closed.",
-            f"Open UDP {probe.address.port} in its firewall.",
+            f"The machine {probe.address.host} drops datagrams to port {probe.address.port}.",
+            "Its hardware replies on this subnet, but there is neither a reply nor a closed-port error.",
+            f"Allow incoming UDP {probe.address.port} in its firewall.",
         )
 
 
 def multicast(facts: Facts) -> Iterator[Finding]:
-    """Whether nodes can find each other on the LAN."""
+    """Check that nodes can discover each other on the LAN."""
     lan = facts.lan
     if lan is None:
         return
@@ -117,29 +117,29 @@ def multicast(facts: Facts) -> Iterator[Finding]:
     if not lan.is_sent:
         yield warning(
             "multicast-blocked",
-            "This machine cannot send to the group of the LAN.",
-            "The system refused it on every interface.",
-            "Open UDP 8483 to 239.192.83.87 in its firewall, or name the others in [node] known_nodes.",
+            "This machine cannot send multicast datagrams.",
+            "The system rejected them on every interface.",
+            "Allow UDP 8483 to 239.192.83.87 in its firewall, or set [node] known_nodes.",
         )
     elif not lan.is_own_heard:
         yield warning(
             "multicast-blocked",
-            "This machine does not let datagrams of the LAN's group in.",
-            "Its own call to the group did not come back to it.",
-            "Open UDP 8483 in its firewall, or name the others in [node] known_nodes.",
+            "This machine does not receive multicast datagrams.",
+            "It did not receive its own multicast probe.",
+            "Allow incoming UDP 8483 in its firewall, or set [node] known_nodes.",
         )
     elif near and not facts.others:
         yield warning(
             "multicast-blocked",
-            "This network does not carry multicast.",
-            f"{near[0].address} answers when it is asked by its address, and nobody answers a call to all.",
+            "This network does not forward multicast.",
+            f"{near[0].address} replies to a direct probe, but no node replies to a multicast probe.",
             "Switch on multicast (IGMP snooping off, or with a querier) at the switch or access point; "
-            "until then [node] known_nodes is needed.",
+            "until then set [node] known_nodes.",
         )
 
 
 def nat(facts: Facts) -> Iterator[Finding]:
-    """What a router does with the node's port, from how it is seen from several places."""
+    """Report the kind of router between this machine and the others, from the addresses that they see."""
     seen = [answer.seen for answer in facts.answers if answer.seen is not None]
     seen = [each for each in seen if not is_local(each.host) and each.host not in facts.own]
     if not seen:
@@ -148,9 +148,9 @@ def nat(facts: Facts) -> Iterator[Finding]:
     if len(hosts) == 1 and len(ports) > 1:
         yield warning(
             "nat-symmetric",
-            "The router gives each peer another port (symmetric NAT).",
-            f"The same port of this machine was seen as {', '.join(sorted(f'{h}:{p}' for h, p in ports))}.",
-            "Others behind such routers are reached by relay only; forward a UDP port to this machine, and set "
+            "The router assigns a different port for each peer (symmetric NAT).",
+            f"Other nodes see one port of this machine as {', '.join(sorted(f'{h}:{p}' for h, p in ports))}.",
+            "Nodes behind such routers can reach this one by relay only; forward a UDP port to this machine, and set "
             "[node] port to it.",
         )
     elif len(seen) > 1:
@@ -158,19 +158,19 @@ def nat(facts: Facts) -> Iterator[Finding]:
             "nat-cone",
             "The router keeps one port for all peers, so nodes behind other routers can be reached directly.",
             f"{len(seen)} nodes see this machine at {seen[0]}.",
-            "Nothing.",
+            "None.",
         )
     else:
         yield note(
             "nat",
-            "This machine is behind a router that translates addresses.",
-            f"It is seen at {seen[0]}.",
-            "Nothing; a second known node would tell what kind of router it is.",
+            "This machine is behind a router with address translation (NAT).",
+            f"Other nodes see it at {seen[0]}.",
+            "None; with a second known node the kind of router can be determined.",
         )
 
 
 def nobody(facts: Facts) -> Iterator[Finding]:
-    """Whether there is anybody to enter the network through; asked when nothing else explains it."""
+    """Report that no bootstrap node is reachable, if no other problem explains it."""
     if facts.answers or any(probe.is_heard for probe in facts.known) or (facts.health and facts.health.contacts):
         return
     explained = [probe for probe in facts.known if probe.error or probe.is_resolved is False]
@@ -179,24 +179,24 @@ def nobody(facts: Facts) -> Iterator[Finding]:
     if facts.known:
         yield error(
             "no-bootstrap",
-            "None of the known nodes answers.",
-            f"Asked were {', '.join(str(probe.address) for probe in facts.known)}.",
-            "Start one of them, or mend [node] known_nodes.",
+            "None of the known nodes replies.",
+            f"Probed: {', '.join(str(probe.address) for probe in facts.known)}.",
+            "Start one of them, or fix [node] known_nodes.",
         )
     else:
         yield warning(
             "no-bootstrap",
-            "Nobody else is found.",
-            "[node] known_nodes is empty, and nobody answers on the LAN.",
-            "Start another node on this LAN, or name one in [node] known_nodes; the first of a team is alone.",
+            "No other node was found.",
+            "[node] known_nodes is empty, and no node replies on the LAN.",
+            "Start another node on this LAN, or set [node] known_nodes; the first node of a team is alone.",
         )
 
 
-def _all(facts: Facts) -> str:
+def _list_addresses(facts: Facts) -> str:
     return ", ".join(f"{' '.join(i.addresses)} ({i.name})" for i in facts.interfaces if i.addresses) or "none"
 
 
-def _offer(facts: Facts, but: str = "") -> str:
+def _suggest_address(facts: Facts, but: str = "") -> str:
     if facts.way_out and not is_local(facts.way_out):
         return facts.way_out
     usable = [i for i in facts.interfaces if not i.is_loopback and i.addresses and i.is_running and i.name != but]

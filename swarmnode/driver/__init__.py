@@ -1,1 +1,1 @@
-"""``swarm driver``: find a robot and try it in a terminal, before it joins a team."""
+"""``swarm driver``: find a robot and test it in a terminal, before it joins a team."""

@@ -1,6 +1,6 @@
-"""Catalogue: the kinds of robot that there are drivers for, and the serial devices at which one may hang.
+"""Kinds of robots with drivers, and serial devices of this machine.
 
-Nothing is opened, and no network is asked.
+No device is opened, and no network is accessed.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ PATTERNS = ("/dev/ttyUSB*", "/dev/ttyACM*", "/dev/cu.usb*")
 
 @dataclass(frozen=True)
 class Entry:
-    """One kind; ``is_ready`` where nothing has to be installed first, ``problem`` where it cannot be loaded."""
+    """One kind of robot; ``is_ready``: nothing has to be installed; ``problem``: the reason why it cannot be loaded."""
 
     kind: str
     about: str
@@ -30,27 +30,27 @@ class Entry:
 
 
 def catalogue(is_there: Callable[[str], bool] = lambda library: find_spec(library) is not None) -> list[Entry]:
-    """Every kind there is; a broken one of another distribution is told as such, and the others are as they are."""
-    built_in, foreign = built_in_kinds(), places()
+    """Return every kind of robot; a broken driver of another distribution is listed with its problem."""
+    built_in, installed = built_in_kinds(), places()
     return [
-        _built_in(kind, is_there) if kind in built_in else _foreign(kind, foreign[kind])
+        _make_built_in_entry(kind, is_there) if kind in built_in else _make_installed_entry(kind, installed[kind])
         for kind in kinds()
-        if kind in built_in or kind in foreign
+        if kind in built_in or kind in installed
     ]
 
 
 def catalogue_lines(entries: list[Entry]) -> list[str]:
-    """The catalogue for a person."""
+    """Return the catalogue as lines of text."""
     width = max((len(entry.kind) for entry in entries), default=0)
-    told = []
+    lines = []
     for entry in entries:
-        told.append(f"{entry.kind:{width}}  {entry.problem or entry.about}")
+        lines.append(f"{entry.kind:{width}}  {entry.problem or entry.about}")
         if entry.needs:
-            told.append(f"{'':{width}}  {entry.needs}")
-    return told
+            lines.append(f"{'':{width}}  {entry.needs}")
+    return lines
 
 
-def _built_in(kind: str, is_there: Callable[[str], bool]) -> Entry:
+def _make_built_in_entry(kind: str, is_there: Callable[[str], bool]) -> Entry:
     package = import_module(f"drivers.{kind}")
     about = (package.__doc__ or "").strip().split("\n")[0].partition(": ")[0].rstrip(".")
     manifest = manifest_of(kind)
@@ -61,18 +61,18 @@ def _built_in(kind: str, is_there: Callable[[str], bool]) -> Entry:
     )
 
 
-def _foreign(kind: str, place: str) -> Entry:
+def _make_installed_entry(kind: str, place: str) -> Entry:
     try:
-        made: object = getattr(maker(kind, place), "args", (kind, None))[1]
+        factory: object = getattr(maker(kind, place), "args", (kind, None))[1]
     except UsageError as error:
         return Entry(kind, "", "", False, f"broken: {error}")
-    about = (getattr(made, "__doc__", None) or "").strip().split("\n")[0].rstrip(".")
+    about = (getattr(factory, "__doc__", None) or "").strip().split("\n")[0].rstrip(".")
     return Entry(kind, f"{about or 'a driver of another distribution'} ({place})")
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A serial device; ``about`` is what its plug says of itself."""
+    """A serial device; ``about`` is the description by its plug."""
 
     device: str
     about: str
@@ -82,13 +82,13 @@ class Candidate:
 def candidates(
     ports: Callable[[], Iterable[tuple[str, str]]] | None = None, may: Callable[[str], bool] | None = None
 ) -> list[Candidate]:
-    """The serial devices that there are, with pyserial's knowledge of them where that is installed."""
+    """Return the serial devices, with their descriptions if pyserial is installed."""
     may = may or (lambda device: os.access(device, os.R_OK | os.W_OK))
     return [Candidate(device, about, may(device)) for device, about in sorted((ports or serial_ports)())]
 
 
 def serial_ports() -> list[tuple[str, str]]:
-    """Each serial device and what it is; the ports that a board merely could have are left out."""
+    """Return each serial device with its description, without unused ports of the board."""
     try:
         from serial.tools.list_ports import comports
     except ImportError:
@@ -97,24 +97,24 @@ def serial_ports() -> list[tuple[str, str]]:
 
 
 def candidate_lines(found: list[Candidate]) -> list[str]:
-    """What was found, and how to go on."""
+    """Return the devices found, with the next command for each, as lines of text."""
     if not found:
         return [
             "no serial device is plugged in",
-            "a robot in the network is asked only where it is named, as in:",
+            "a robot in the network has to be named, for example:",
             "  swarm driver probe --kind aibo --option host=192.168.0.51",
         ]
-    told = []
+    lines = []
     for each in found:
-        told.append(f"{each.device}  {each.about}".rstrip())
+        lines.append(f"{each.device}  {each.about}".rstrip())
         if not each.is_allowed:
-            told.append("  no permission; add this user to the device's group (often dialout), and sign in anew")
-        told += [f"  swarm driver probe --kind {kind} --option port={each.device}" for kind in cable_kinds()]
-    return told
+            lines.append("  no permission; add this user to the device's group (often dialout), and sign in again")
+        lines += [f"  swarm driver probe --kind {kind} --option port={each.device}" for kind in cable_kinds()]
+    return lines
 
 
 def cable_kinds() -> list[str]:
-    """Return the kinds that hang on a cable; nothing tells from outside which of them a device is."""
+    """Return the kinds of robots with a cable; a serial device does not show which kind it is."""
     return [kind for kind in built_in_kinds() if manifest_of(kind).is_on_cable]
 
 

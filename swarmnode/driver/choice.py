@@ -1,4 +1,4 @@
-"""Choice: which robot is meant, by the words of a command line or by the settings of its node."""
+"""Selection of a robot by command line arguments or by the settings of its node."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from drivers.registry import describe, driver_for, manifest_of
 
 @dataclass(frozen=True)
 class Choice:
-    """One robot: its kind, its options, what it is called, and the parts on its back."""
+    """One robot: kind, options, name and additional sensors."""
 
     kind: str
     options: Mapping[str, object] = field(default_factory=dict)
@@ -25,11 +25,11 @@ class Choice:
     parts: Sequence[Any] = ()
 
     def driver(self, clock: Any, connector: Any) -> Any:
-        """A driver of it that is not connected; raises ``UsageError``."""
+        """Return a driver that is not connected; raises ``UsageError``."""
         return driver_for(self.kind, self.options, self.name, clock, connector, self.parts)
 
     def description(self) -> Description:
-        """What it is; raises ``UsageError``."""
+        """Return the description of the robot; raises ``UsageError``."""
         try:
             return describe(self.kind, self.options, self.name, self.parts)
         except UsageError:
@@ -40,53 +40,53 @@ class Choice:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """How the command line names a robot."""
-    parser.add_argument("--kind", help="the kind of robot: one of `swarm driver list`, or module:Class")
+    """Add the arguments that select a robot."""
+    parser.add_argument("--kind", help="kind of robot: one of `swarm driver list`, or module:Class")
     parser.add_argument(
-        "--option", action="append", default=[], metavar="KEY=VALUE", help="an option of its driver; again for each"
+        "--option", action="append", default=[], metavar="KEY=VALUE", help="option of its driver; can be repeated"
     )
-    parser.add_argument("--config", metavar="FILE", help="the settings of its node, instead: its [driver]")
-    parser.add_argument("--name", help="what it is called; of a yard, which dog")
+    parser.add_argument("--config", metavar="FILE", help="settings file of its node, instead of --kind")
+    parser.add_argument("--name", help="name of the robot; in a simulator it selects the robot")
 
 
-def chosen(wishes: argparse.Namespace) -> Choice | None:
-    """The robot that is meant, None where none is named; raises ``UsageError`` or ``BadSetting``."""
-    if wishes.config and wishes.kind:
-        raise UsageError("name the robot by --kind or by --config, not by both")
-    if wishes.config:
-        return _configured(wishes.config, wishes)
-    if wishes.kind:
-        return _named(wishes.kind, wishes)
-    if wishes.option:
-        raise UsageError("--option says nothing without --kind; `swarm driver list` shows the kinds")
+def chosen(arguments: argparse.Namespace) -> Choice | None:
+    """Return the selected robot, None if none is named; raises ``UsageError`` or ``BadSetting``."""
+    if arguments.config and arguments.kind:
+        raise UsageError("use either --kind or --config, not both")
+    if arguments.config:
+        return _choose_by_settings(arguments.config, arguments)
+    if arguments.kind:
+        return _choose_by_kind(arguments.kind, arguments)
+    if arguments.option:
+        raise UsageError("--option needs --kind; `swarm driver list` shows the kinds")
     return None
 
 
-def meant(word: str, wishes: argparse.Namespace) -> Choice:
-    """The robot that one word means: a settings file, or a kind; raises as ``chosen`` does."""
+def meant(word: str, arguments: argparse.Namespace) -> Choice:
+    """Return the robot for a settings file or a kind; raises as ``chosen`` does."""
     if word.endswith(".toml") or os.path.isfile(word):
-        return _configured(word, wishes)
-    return _named(word, wishes)
+        return _choose_by_settings(word, arguments)
+    return _choose_by_kind(word, arguments)
 
 
 def options_of(words: Sequence[str]) -> dict[str, Any]:
-    """``KEY=VALUE`` words as a table: a value is TOML where it can be read so, else text; ``ports.walk=1`` nests."""
+    """Parse ``KEY=VALUE`` arguments: a value is TOML if possible, otherwise text; ``ports.walk=1`` nests."""
     table: dict[str, Any] = {}
     for word in words:
         key, equals, text = word.partition("=")
         names = key.split(".")
         if not equals or not all(names):
-            raise UsageError(f"--option is KEY=VALUE, as in --option host=192.168.0.51, not {word!r}")
+            raise UsageError(f"--option {word}: write KEY=VALUE, for example --option host=192.168.0.51")
         inner = table
         for name in names[:-1]:
             inner = inner.setdefault(name, {})
             if not isinstance(inner, dict):
                 raise UsageError(f"--option {key} is given as a value and as a table")
-        inner[names[-1]] = _value(text)
+        inner[names[-1]] = _parse_value(text)
     return table
 
 
-def _value(text: str) -> Any:
+def _parse_value(text: str) -> Any:
     try:
         value = tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
@@ -94,24 +94,24 @@ def _value(text: str) -> Any:
     return value if isinstance(value, bool | int | float | str | list | dict) else text
 
 
-def _look_here(kind: str) -> None:
-    """A driver that is being written lies where one stands."""
+def _add_working_directory(kind: str) -> None:
+    """Make a driver module in the working directory importable."""
     if ":" in kind and os.getcwd() not in sys.path:
         sys.path.insert(0, os.getcwd())
 
 
-def _named(kind: str, wishes: argparse.Namespace) -> Choice:
-    _look_here(kind)
-    return Choice(kind, options_of(wishes.option), wishes.name or "robot")
+def _choose_by_kind(kind: str, arguments: argparse.Namespace) -> Choice:
+    _add_working_directory(kind)
+    return Choice(kind, options_of(arguments.option), arguments.name or "robot")
 
 
-def _configured(path: str, wishes: argparse.Namespace) -> Choice:
+def _choose_by_settings(path: str, arguments: argparse.Namespace) -> Choice:
     from middleware.config.settings import Settings
 
     settings = Settings.load(path)
     if not settings.driver.kind:
-        raise UsageError(f'{path} has no robot: it lacks [driver] kind = "..."')
-    _look_here(settings.driver.kind)
-    options = {**settings.driver.options, **options_of(wishes.option)}
+        raise UsageError(f'{path} has no robot: set kind = "..." in [driver]')
+    _add_working_directory(settings.driver.kind)
+    options = {**settings.driver.options, **options_of(arguments.option)}
     parts = settings.driver.parts
-    return Choice(settings.driver.kind, options, wishes.name or settings.node.name, parts)
+    return Choice(settings.driver.kind, options, arguments.name or settings.node.name, parts)

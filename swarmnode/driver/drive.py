@@ -1,4 +1,4 @@
-"""Drive: a robot by the keys of a terminal, with a line that tells how it is."""
+"""Keyboard control of a robot in a terminal, with a status line."""
 
 from __future__ import annotations
 
@@ -18,27 +18,27 @@ from swarmnode.driver.probe import PATIENCE_S
 
 TICK_S = 0.05
 LINE_S = 0.1
-"""How often the line is written anew."""
+"""Seconds between two updates of the status line."""
 
 
 class Terminal(Protocol):
-    """Where keys come from and lines go."""
+    """Source of keys and output of lines."""
 
     def start(self, pressed: Callable[[str], None]) -> None:
-        """Hand over each key at once, without echo; an empty one where there will be no more."""
+        """Call ``pressed`` with each key immediately, without echo; with an empty string at the end of input."""
 
     def line(self, text: str) -> None:
-        """Write the line anew."""
+        """Overwrite the status line."""
 
     def say(self, text: str) -> None:
-        """Write a line that stays."""
+        """Write a permanent line."""
 
     def close(self) -> None:
-        """Leave the terminal as it was."""
+        """Restore the terminal."""
 
 
 class Drive:
-    """One drive of ``driver``, from connecting until a key ends it; its motors are off again then."""
+    """One session of ``driver``, from the connection until a key ends it; then the motors are off."""
 
     def __init__(
         self, driver: Driver, clock: IReactorTime, terminal: Terminal, problems: Callable[[], list[str]]
@@ -48,7 +48,7 @@ class Drive:
         self._clock = clock
         self._terminal = terminal
         self._problems = problems
-        self._told: set[str] = set()
+        self._shown: set[str] = set()
         self._began = clock.seconds()
         self._line_at = -math.inf
         self._timer = Timer(clock)
@@ -56,9 +56,9 @@ class Drive:
         self._ended: Deferred[int] = Deferred()
 
     def start(self) -> Deferred[int]:
-        """Begin; fires with the exit code once the robot stands, its motors are off, and it is let go."""
+        """Begin; fires with the exit code when the robot stands, its motors are off, and the link is closed."""
         self._terminal.say(HELP)
-        self._terminal.say(f"a key counts for {KEY_S:g} s: hold it to go on; let go, and the robot stands")
+        self._terminal.say(f"a key has effect for {KEY_S:g} s: hold it to continue; release it to stop the robot")
         self._driver.connect().addCallbacks(self._on_connected, self._on_refused)
         self._terminal.start(self._on_key)
         if not self._is_over:
@@ -66,7 +66,7 @@ class Drive:
         return self._ended
 
     def end(self, code: int = 0) -> Deferred[int]:
-        """End: stand still, motors off, let go."""
+        """Stop the robot, switch its motors off and disconnect."""
         if not self._is_over:
             self._is_over = True
             self._timer.cancel()
@@ -115,16 +115,16 @@ class Drive:
         self._line_at = self._clock.seconds()
         problems = self._problems()
         if self._driver.observe() is None and self._clock.seconds() - self._began > PATIENCE_S:
-            problems = [*problems, f"nothing came within {PATIENCE_S:g} s; swarm driver probe says more"]
+            problems = [*problems, f"no data within {PATIENCE_S:g} s; run swarm driver probe for details"]
         for problem in problems:
-            if problem not in self._told:
-                self._told.add(problem)
+            if problem not in self._shown:
+                self._shown.add(problem)
                 self._terminal.say(f"! {problem}")
         self._terminal.line(state_line(self._driver.state, self._driver.observe(), self.pilot, self._clock.seconds()))
 
 
 def state_line(state: str, newest: Observation | None, pilot: Pilot, now: float) -> str:
-    """How the robot is, on one line: state, what it does, place, nearest range, battery, age; and what was said."""
+    """Return the status line: state, motion, position, nearest range, battery, age of data, last message."""
     words = [f"{state:10}", " ".join(f"{key[5:]} {value + 0.0:+.2f}" for key, value in pilot.done.items())]
     if newest is not None:
         values = newest.values

@@ -1,6 +1,6 @@
-"""Ground: what a command on a robot stands on: the clock, the links, the terminal; here those of this machine.
+"""Environment of the robot commands: clock, links and terminal of this machine.
 
-Its links, and the log of drivers, tell what keeps a robot from being reached.
+Links and the log of drivers report why a robot is not reachable.
 """
 
 from __future__ import annotations
@@ -17,38 +17,38 @@ from zope.interface import implementer
 from swarmnode.driver.drive import Terminal
 
 SERIAL = re.compile(r".*[/\\].*|COM\d+", re.DOTALL)
-"""A serial device is a path, or a port of Windows; all else is an address in a network."""
+"""A serial device is a path or a Windows port; everything else is a network address."""
 
 
 class Ground(Protocol):
-    """Where a command meets the world."""
+    """The environment of a command."""
 
     @property
     def clock(self) -> Any:
-        """The reactor, or a clock in its place."""
+        """The reactor, or a replacement for it."""
 
     def connector(self, is_moving: bool) -> tuple[Any, Callable[[], list[str]]]:
-        """What opens the links of a driver (None: whatever it opens by itself), and what is wrong with them."""
+        """Return the connector for a driver (None: the driver's default), and a function for the link problems."""
 
     def terminal(self) -> Terminal:
-        """The terminal; raises ``UsageError`` where there is none."""
+        """Return the terminal; raises ``UsageError`` if there is none."""
 
     def run(self, work: Callable[[], Deferred[Any]], end: Callable[[], Any]) -> Any:
-        """Run until ``work`` has fired, and return its value; ``end`` is called where somebody interrupts it."""
+        """Run until ``work`` has fired, and return its value; ``end`` is called on an interrupt."""
 
 
 class RealGround:
-    """This machine, on Twisted's reactor."""
+    """This machine, with Twisted's reactor."""
 
     @property
     def clock(self) -> Any:
         """The reactor."""
-        from twisted.internet import reactor  # importing it installs it
+        from twisted.internet import reactor  # the import installs it
 
         return reactor
 
     def connector(self, is_moving: bool) -> tuple[Any, Callable[[], list[str]]]:
-        """Links that tell why they are not open; who moves a robot gets those that its driver trusts its stop to."""
+        """Return links that report problems; a moving robot gets its driver's default links, with a supervised stop."""
         if is_moving:
             return None, list
         from drivers.link import TcpConnector
@@ -58,17 +58,17 @@ class RealGround:
         return witnessed, witnessed.problems
 
     def terminal(self) -> Terminal:
-        """The terminal that this process runs in."""
+        """Return the terminal of this process."""
         from swarmnode.driver.terminal import real_terminal
 
         return real_terminal(self.clock)
 
     def run(self, work: Callable[[], Deferred[Any]], end: Callable[[], Any]) -> Any:
-        """Run the reactor until ``work`` has fired; Ctrl-C ends it in order, so that the robot stands."""
-        reactor, told, interrupted = self.clock, list[Any](), list[bool]()
+        """Run the reactor until ``work`` has fired; on Ctrl-C the robot stops first."""
+        reactor, results, interrupted = self.clock, list[Any](), list[bool]()
 
         def finish(value: Any) -> None:
-            told.append(value)
+            results.append(value)
             if not interrupted:
                 reactor.stop()
 
@@ -76,8 +76,8 @@ class RealGround:
             maybeDeferred(work).addBoth(finish)
 
         def on_shutdown() -> Any:
-            # The reactor waits for what this returns: the robot stands and is let go before the process ends.
-            if told:
+            # The reactor waits for the result: the robot stops and is disconnected before the process ends.
+            if results:
                 return None
             interrupted.append(True)
             return end()
@@ -85,14 +85,14 @@ class RealGround:
         reactor.addSystemEventTrigger("before", "shutdown", on_shutdown)
         reactor.callWhenRunning(begin)
         reactor.run()
-        value = told[0] if told else 1
+        value = results[0] if results else 1
         if isinstance(value, Failure):
             value.raiseException()
         return value
 
 
 class WitnessedConnector:
-    """Opens real links, over TCP or serial devices, and remembers each line for what it says is wrong."""
+    """Opens real links over TCP or serial devices, and records the problem of each."""
 
     def __init__(self, tcp: Any, serial: Any) -> None:
         self._tcp = tcp
@@ -100,29 +100,29 @@ class WitnessedConnector:
         self._lines: dict[str, Any] = {}
 
     def call(self, host: str, port: int, caller: Any) -> Any:
-        """Keep ``caller`` connected, as the connector below does."""
+        """Keep ``caller`` connected, as the wrapped connector does."""
         is_serial = SERIAL.fullmatch(host) is not None
         line = (self._serial if is_serial else self._tcp).call(host, port, caller)
-        # Only the newest to each place: a robot that is asked over HTTP has a line for each request.
+        # Keep only the newest link to each place: a robot with an HTTP interface has one for each request.
         self._lines[host if is_serial else f"{host}:{port}"] = line
         return line
 
     def problems(self) -> list[str]:
-        """Each line that is not open now, and why."""
-        told = {where: str(getattr(line, "problem", "")) for where, line in self._lines.items()}
-        return [f"{where}: {problem}" for where, problem in told.items() if problem]
+        """Return each link that is not open now, with the reason."""
+        results = {place: str(getattr(line, "problem", "")) for place, line in self._lines.items()}
+        return [f"{place}: {problem}" for place, problem in results.items() if problem]
 
 
 @implementer(ILogObserver)
 class Ear:
-    """Hears what drivers warn of; each line once."""
+    """Log observer that collects the warnings of drivers, each once."""
 
     def __init__(self) -> None:
         self.heard: list[str] = []
         globalLogPublisher.addObserver(self)
 
     def __call__(self, event: LogEvent) -> None:
-        """Take an event; called by the log."""
+        """Process a log event."""
         level = event.get("log_level")
         if level is None or level < LogLevel.warn or not str(event.get("log_namespace", "")).startswith("drivers."):
             return
@@ -131,5 +131,5 @@ class Ear:
             self.heard.append(line)
 
     def close(self) -> None:
-        """Hear no more."""
+        """Stop observing."""
         globalLogPublisher.removeObserver(self)

@@ -1,4 +1,4 @@
-"""Monitor: the readings of a robot as they come, and its newest picture in a file."""
+"""Continuous display of a robot's readings; the newest picture is saved to a file."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from swarmnode.driver.probe import PATIENCE_S
 from swarmnode.driver.sheet import plain, shown
 
 SHOW_S = 1.0
-"""How often the readings are shown, and a picture saved."""
+"""Seconds between two displays, and between two saved pictures."""
 
 
 class Monitor:
-    """Shows the readings of ``driver`` through ``show`` until it is ended, or ``seconds`` after the first came.
+    """Show the readings of ``driver`` through ``show`` until stopped, or for ``seconds`` after the first.
 
-    The motors stay as they are: nothing is commanded.
+    Nothing is commanded: the motors keep their state.
     """
 
     def __init__(
@@ -47,7 +47,7 @@ class Monitor:
         self._picture = picture
         self._is_json = is_json
         self._problems = problems
-        self._told: set[str] = set()
+        self._shown: set[str] = set()
         self._saved = -1
         self._began = clock.seconds()
         self._first_at: float | None = None
@@ -56,14 +56,14 @@ class Monitor:
         self._ended: Deferred[int] = Deferred()
 
     def start(self) -> Deferred[int]:
-        """Begin; fires with the exit code once the robot is let go."""
+        """Begin; fires with the exit code when the robot is disconnected."""
         self._driver.connect().addErrback(self._on_refused)
         if not self._is_over:
             self._on_time()
         return self._ended
 
     def end(self) -> Deferred[int]:
-        """End, and let the robot go."""
+        """Disconnect from the robot."""
         if not self._is_over:
             self._is_over = True
             self._timer.cancel()
@@ -71,7 +71,7 @@ class Monitor:
             if newest is None:
                 self.code = 1
             elif self._picture is not None and self._saved < 0 and self.code == 0:
-                self._fail("no picture came; is its camera on?")
+                self._fail("no picture received; check that its camera is on")
             leaving = self._driver.disconnect()
             leaving.addBoth(lambda _: self._ended.callback(self.code))
         return self._ended
@@ -84,11 +84,11 @@ class Monitor:
     def _on_time(self) -> None:
         now, newest = self._clock.seconds(), self._driver.observe()
         for problem in self._problems():
-            if problem not in self._told:
-                self._told.add(problem)
+            if problem not in self._shown:
+                self._shown.add(problem)
                 self._show([f"! {problem}"])
         if newest is None and now - self._began > PATIENCE_S:
-            self._fail(f"nothing came within {PATIENCE_S:g} s; swarm driver probe says more")
+            self._fail(f"no data within {PATIENCE_S:g} s; run swarm driver probe for details")
             self.end()
             return
         if newest is not None:
@@ -110,15 +110,15 @@ class Monitor:
     def _save(self, frame: Frame) -> None:
         assert self._picture is not None
         if frame.encoding != "jpeg":
-            self._fail(f"its pictures are {frame.encoding}, not JPEGs; none is saved")
+            self._fail(f"its pictures are {frame.encoding}, not JPEG; none was saved")
             self.end()
             return
-        beside = self._picture.with_name(f".{self._picture.name}.new")
+        temporary = self._picture.with_name(f".{self._picture.name}.new")
         try:
-            beside.write_bytes(frame.data)
-            os.replace(beside, self._picture)
+            temporary.write_bytes(frame.data)
+            os.replace(temporary, self._picture)
         except OSError as error:
-            self._fail(f"{self._picture} cannot be written: {error.strerror or error}")
+            self._fail(f"cannot write {self._picture}: {error.strerror or error}")
             self.end()
             return
         self._saved = frame.seq
@@ -129,7 +129,7 @@ class Monitor:
 
 
 def readings(state: str, newest: Observation, counts: dict[str, float], now: float) -> Iterator[str]:
-    """Each reading on a line, under a line about the link."""
+    """Yield a line about the link, then each reading on a line."""
     yield f"{state}, {now - newest.t_host:.2f} s old, {counts['frames']:g} frames, {counts['bad_frames']:g} bad"
     width = max(map(len, newest.values), default=0)
     for key in sorted(newest.values):
@@ -140,9 +140,9 @@ def readings(state: str, newest: Observation, counts: dict[str, float], now: flo
 
 
 def as_data(state: str, newest: Observation, now: float) -> dict[str, Any]:
-    """An observation as plain data, for JSON; a number that is none is None."""
-    told: dict[str, Any] = {"state": state, "age": now - newest.t_host, "t_robot": newest.t_robot}
-    told["values"] = plain(newest.values)
+    """Return an observation as plain data for JSON; NaN and infinities become None."""
+    data: dict[str, Any] = {"state": state, "age": now - newest.t_host, "t_robot": newest.t_robot}
+    data["values"] = plain(newest.values)
     if newest.frame is not None:
-        told["picture"] = {"seq": newest.frame.seq, "width": newest.frame.width, "height": newest.frame.height}
-    return told
+        data["picture"] = {"seq": newest.frame.seq, "width": newest.frame.width, "height": newest.frame.height}
+    return data

@@ -1,6 +1,6 @@
-"""Pilot: keys to motion, with a dead man's switch: a key counts for 0.4 s, and without one the robot stands.
+"""Keys to motion with a dead man's switch: a key has effect for 0.4 s; without a key the robot stands.
 
-Pure but for the driver that it commands; the moment is an argument.
+The time is an argument; the driver is the only side effect.
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ from drivers.errors import DriverError
 from drivers.reading import Action
 
 KEY_S = 0.4
-"""A key counts for so long; holding it repeats it more often than that."""
+"""Seconds for which a key has effect; a held key repeats more often."""
 FIRST_SHARE, LEAST_SHARE, STEP = 0.3, 0.1, 0.1
-"""Of the robot's limits: how fast it is driven at first, at least, and how much more or less a key makes it."""
+"""Speed as a share of the robot's limits: initial value, minimum, and step per key."""
 MOVES = {
     "w": ("base.vx", 1),
     "s": ("base.vx", -1),
@@ -21,15 +21,15 @@ MOVES = {
     "q": ("base.vy", 1),
     "e": ("base.vy", -1),
 }
-"""Key to axis and direction: forward, back, turn left and right, aside left and right."""
-HELP = "w s: forward, back   a d: turn   q e: aside   space: stop   + -: speed   m: motors on   x: end"
+"""Key to axis and direction: forward, back, turn left and right, sideways left and right."""
+HELP = "w s: forward, back   a d: turn   q e: sideways   space: stop   + -: speed   m: motors on   x: end"
 ENDS = ("x", "\x03", "\x04", "")
 
 
 class Pilot:
-    """Drives ``driver``; ``said`` is what it did or why it could not, for the eyes of whoever presses the keys.
+    """Drive ``driver`` by keys; ``said`` is the last message for the person at the keyboard.
 
-    Commands carry the highest token that the robot has seen: this is a person at the robot, outside of any team.
+    Commands carry the highest fencing token that the robot has obeyed: the person at the robot is outside of any team.
     """
 
     def __init__(self, driver: Driver) -> None:
@@ -41,11 +41,11 @@ class Pilot:
 
     @property
     def is_moving(self) -> bool:
-        """Whether a key counts now."""
+        """Whether a key has effect now."""
         return bool(self._held)
 
     def press(self, key: str, now: float) -> bool:
-        """Take a key; False where it ends the drive."""
+        """Process a key; returns False if it ends the session."""
         if key in ENDS:
             self.rest()
             return False
@@ -61,7 +61,7 @@ class Pilot:
         return True
 
     def tick(self, now: float) -> None:
-        """Let what was pressed too long ago count no more; the robot stands once nothing does."""
+        """Expire keys; stop the robot when no key has effect."""
         was = dict(self._held)
         self._held = {axis: held for axis, held in was.items() if held[1] > now}
         if was and not self._held:
@@ -70,7 +70,7 @@ class Pilot:
             self._act(now)
 
     def rest(self) -> None:
-        """Stand still now."""
+        """Stop the robot now."""
         self._held.clear()
         self.done = self._driver.stop()
 
@@ -78,7 +78,7 @@ class Pilot:
         axis, sign = MOVES[key]
         ends = self._driver.description.limits.get(axis)
         if ends is None:
-            self.said = f"it has no {axis}"
+            self.said = f"this robot cannot move along {axis}"
             return
         self._held[axis] = (self.share * (ends[1] if sign > 0 else ends[0]), now + KEY_S)
         self._act(now)
@@ -96,7 +96,7 @@ class Pilot:
 
     def _set_share(self, share: float) -> None:
         self.share = min(max(round(share, 2), LEAST_SHARE), 1.0)
-        self.said = f"{100 * self.share:.0f} % of its speed"
+        self.said = f"speed {100 * self.share:.0f} %"
 
 
 _AXES = {axis for axis, _ in MOVES.values()}

@@ -1,4 +1,4 @@
-"""Probe: connect to a robot for some seconds, move nothing, and say what came, or what is wrong."""
+"""Connection test of a robot: connect for some seconds without motion, and report readings and problems."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from drivers.timer import Timer
 from swarmnode.driver.sheet import plain, shown
 
 PATIENCE_S = 8.0
-"""A robot that has not been seen after so long is given up; the slowest to say what is wrong is the AIBO, after 5 s."""
+"""Seconds after which a silent robot is given up; the slowest error report is the AIBO's, after 5 s."""
 SURE_S = 3.0
-"""A robot that has not been seen after so long, and of which it is known what is wrong, is given up then."""
+"""Seconds after which a silent robot with a known problem is given up."""
 SLOW = 0.7
-"""Below this share of the rate that the description promises, a robot is slow."""
+"""Share of the specified rate below which a robot is reported as slow."""
 TOLD = (
     "mode",
     "firmware",
@@ -31,15 +31,15 @@ TOLD = (
     "power.volts",
     "power.charging",
 )
-"""What of the readings goes into the finding, where a robot has it."""
+"""Readings that are part of the finding."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """What came of a probe.
+    """The result of a probe.
 
-    ``first`` is how many seconds after the call the first observation came, None where none came; ``rate`` and
-    ``promised`` are observations a second; ``problems`` say what was wrong, and the remedy.
+    ``first`` is the time in seconds until the first observation, None without one; ``rate`` and ``promised`` are
+    observations per second; ``problems`` are sentences with the remedy.
     """
 
     kind: str
@@ -56,17 +56,17 @@ class Finding:
 
     @property
     def is_there(self) -> bool:
-        """Whether the robot was seen, and is seen still."""
+        """Whether the robot was observed and is still connected."""
         return self.first is not None and self.state in ("ready", "stopped")
 
     def as_data(self) -> dict[str, Any]:
-        """As plain data, for JSON; a number that is none is None."""
-        told = {**asdict(self), "is_there": self.is_there}
-        return told | {"readings": plain(self.readings), "counts": plain(self.counts)}
+        """Return plain data for JSON; NaN and infinities become None."""
+        data = {**asdict(self), "is_there": self.is_there}
+        return data | {"readings": plain(self.readings), "counts": plain(self.counts)}
 
 
 class Probe:
-    """One probe of ``driver``, which is disconnected at its end; ``problems`` are asked for what is wrong."""
+    """One probe of ``driver``, which is disconnected at the end; ``problems`` returns the known problems."""
 
     def __init__(
         self, driver: Driver, clock: IReactorTime, seconds: float, problems: Callable[[], Sequence[str]]
@@ -86,14 +86,14 @@ class Probe:
         self._found: Deferred[Finding] = Deferred()
 
     def start(self) -> Deferred[Finding]:
-        """Begin; fires with what was found, and does not fail."""
-        self._timer.set(SURE_S, self._on_doubt)
+        """Begin; fires with the finding, and never fails."""
+        self._timer.set(SURE_S, self._on_silence)
         self._driver.subscribe(self._on_observation)
         self._driver.connect().addCallbacks(self._on_connected, self._on_refused)
         return self._found
 
     def end(self) -> Deferred[Any]:
-        """End now, with what came so far; fires when the robot is let go."""
+        """End now with the data so far; fires when the robot is disconnected."""
         if not self._is_over:
             self._is_over = True
             self._timer.cancel()
@@ -107,7 +107,7 @@ class Probe:
         self._pictures.clear()
         self._timer.set(self._seconds, self.end)
 
-    def _on_doubt(self) -> None:
+    def _on_silence(self) -> None:
         if self._problems():
             self.end()
         else:
@@ -126,18 +126,18 @@ class Probe:
 
     def _finding(self) -> Finding:
         body, newest = self._driver.description, self._driver.observe()
-        lasted = self._clock.seconds() - self._began - (self._first or 0.0)
-        rate = self._seen / lasted if self._first is not None and lasted > 0 else 0.0
+        duration = self._clock.seconds() - self._began - (self._first or 0.0)
+        rate = self._seen / duration if self._first is not None and duration > 0 else 0.0
         promised = body.rates.get("state", max(body.rates.values(), default=0.0))
         values = {} if newest is None else newest.values
         frame = None if newest is None else newest.frame
         problems = [*([self._refusal] if self._refusal else []), *self._problems()]
         if self._first is None and not problems:
-            problems.append(f"nothing came within {PATIENCE_S:g} s; is it switched on, and do the options fit?")
+            problems.append(f"no data within {PATIENCE_S:g} s; check that it is switched on, and the options")
         if self._first is not None and rate < SLOW * promised:
-            problems.append(f"it is slow: {rate:.1f} of {promised:g} observations a second; is it far, or busy?")
+            problems.append(f"it is slow: {rate:.1f} of {promised:g} observations per second; check the radio link")
         if "camera" in body.capabilities and self._first is not None and not self._pictures:
-            problems.append("no picture came, though it has a camera")
+            problems.append("no picture received, although it has a camera; check that the camera is on")
         return Finding(
             kind=body.kind,
             first=self._first,
@@ -147,27 +147,27 @@ class Probe:
             keys=tuple(sorted(self._keys)),
             readings={key: values[key] for key in TOLD if key in values},
             picture="" if frame is None else f"{frame.width} x {frame.height} {frame.encoding}",
-            pictures=len(self._pictures) / lasted if lasted > 0 else 0.0,
+            pictures=len(self._pictures) / duration if duration > 0 else 0.0,
             counts=self._driver.diagnostics(),
             problems=tuple(dict.fromkeys(problems)),
         )
 
 
 def lines(finding: Finding) -> Iterator[str]:
-    """The finding for a person."""
+    """Return the finding as lines of text."""
     if finding.first is None:
         yield f"{finding.kind}: not reached"
     else:
-        yield f"{finding.kind}: the first observation came after {finding.first:.2f} s"
+        yield f"{finding.kind}: first observation after {finding.first:.2f} s"
         promised = f" of {finding.promised:g}" if finding.promised else ""
         yield f"  state         {finding.state}"
-        yield f"  rate          {finding.rate:.1f}{promised} a second"
+        yield f"  rate          {finding.rate:.1f}{promised} per second"
         for key, value in finding.readings.items():
             yield f"  {key:13} {shown(key, value)}"
         if finding.picture:
-            yield f"  pictures      {finding.picture}, {finding.pictures:.1f} a second"
+            yield f"  pictures      {finding.picture}, {finding.pictures:.1f} per second"
         yield f"  bad frames    {finding.counts.get('bad_frames', 0):g} of {finding.counts.get('frames', 0):g}"
         yield f"  reconnects    {finding.counts.get('reconnects', 0):g}"
-        yield f"  senses        {' '.join(finding.keys) or 'nothing but pictures'}"
+        yield f"  readings      {' '.join(finding.keys) or 'only pictures'}"
     for problem in finding.problems:
         yield f"  ! {problem}"

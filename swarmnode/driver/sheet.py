@@ -1,4 +1,4 @@
-"""Sheet: a robot and its readings as they are shown to a person: descriptions, and values with their units."""
+"""Text for descriptions of robots, and for readings with their units."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ UNITS: Sequence[tuple[tuple[str, ...], str]] = (
     (("power.amps",), "A"),
     (("power.celsius",), "C"),
 )
-"""The beginnings of keys, the first that fits, and the SI unit of what they tell."""
+"""Prefixes of keys with the SI unit of their values; the first match applies."""
 
 
 def unit_of(key: str) -> str:
-    """The unit of a key's values; empty for shares, truths and words."""
+    """Return the unit of a key's values; empty for shares, booleans and text."""
     if key.startswith("joint.") and key.endswith(".pos"):
         return "rad"
     return next((unit for starts, unit in UNITS if key.startswith(starts)), "")
 
 
 def shown(key: str, value: object) -> str:
-    """A reading in words: with its unit, an angle in degrees as well."""
+    """Return a reading as text with its unit; an angle in degrees as well."""
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, str):
@@ -47,22 +47,22 @@ def shown(key: str, value: object) -> str:
 
 
 def plain(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Readings for JSON; a number that is none is None."""
+    """Return readings for JSON; NaN and infinities become None."""
     return {
         key: None if isinstance(value, float) and not math.isfinite(value) else value for key, value in values.items()
     }
 
 
 def lines(body: Description) -> Iterator[str]:
-    """The description as a table."""
+    """Return the description as a table."""
     yield f"{body.kind}: {body.model}"
     yield f"{'radius':14}{body.radius:g} m"
     yield from _rows("capabilities", {name: _properties(about) for name, about in body.capabilities.items()})
     limits = {
         key: f"{low:+.3g} to {high:+.3g} {unit_of(key)}".rstrip() for key, (low, high) in sorted(body.limits.items())
     }
-    yield from _rows("limits", limits or {"none": "there is nothing that it can be told to do"})
-    yield from _rows("rates", {name: f"{rate:g} a second" for name, rate in body.rates.items()})
+    yield from _rows("limits", limits or {"none": "it accepts no motion commands"})
+    yield from _rows("rates", {name: f"{rate:g} per second" for name, rate in body.rates.items()})
     yield from _folded("skills", body.skills or ("none",))
 
 

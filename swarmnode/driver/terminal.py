@@ -1,4 +1,4 @@
-"""Terminal: the keys of the terminal that this process runs in, one by one, and a line that is written anew."""
+"""Single keys from the terminal of this process, and a status line."""
 
 from __future__ import annotations
 
@@ -18,21 +18,19 @@ from middleware.entangled.control.word import printable
 
 @implementer(IReadDescriptor)
 class RealTerminal:
-    """Standard input without echo and without waiting for whole lines, and standard output.
+    """Standard input in cbreak mode without echo, and standard output.
 
-    Raises ``UsageError`` where there is no terminal.
+    Raises ``UsageError`` if there is no terminal.
     """
 
     def __init__(self, reactor: Any, keys: TextIO, out: TextIO) -> None:
         if not (keys.isatty() and out.isatty()):
-            raise UsageError("there is no terminal here to press keys in; run it in one, not through a pipe")
+            raise UsageError("standard input is not a terminal; run this command in a terminal, without a pipe")
         try:
             import termios
             import tty
         except ImportError:
-            raise UsageError(
-                "this system's terminal gives no single keys; it is supported on Linux and macOS"
-            ) from None
+            raise UsageError("this system's terminal does not support single keys; use Linux or macOS") from None
         self._reactor = reactor
         self._out = out
         self._number = keys.fileno()
@@ -43,23 +41,23 @@ class RealTerminal:
         self._is_closed = False
 
     def start(self, pressed: Callable[[str], None]) -> None:
-        """Hand over each key at once; an empty one where there will be no more."""
+        """Call ``pressed`` with each key immediately; with an empty string at the end of input."""
         self._pressed = pressed
         self._reactor.addReader(self)
 
     def line(self, text: str) -> None:
-        """Write the line anew, cut to the width of the terminal so that it stays one."""
+        """Overwrite the status line, cut to the width of the terminal."""
         width = shutil.get_terminal_size().columns
         self._out.write(f"\r{printable(text)[: width - 1]}\x1b[K")
         self._out.flush()
 
     def say(self, text: str) -> None:
-        """Write a line that stays."""
+        """Write a permanent line."""
         self._out.write(f"\r{printable(text)}\x1b[K\n")
         self._out.flush()
 
     def close(self) -> None:
-        """Leave the terminal as it was; may be called twice."""
+        """Restore the terminal; may be called twice."""
         if self._is_closed:
             return
         self._is_closed = True
@@ -69,11 +67,11 @@ class RealTerminal:
         self._out.flush()
 
     def fileno(self) -> int:
-        """Of standard input."""
+        """Return the file descriptor of standard input."""
         return self._number
 
     def doRead(self) -> None:  # noqa: N802 (Twisted's)
-        """Take what was pressed; the bytes of an arrow or another long key are none of ours and do nothing."""
+        """Read keys; escape sequences, such as arrow keys, are ignored."""
         try:
             data = os.read(self._number, 64)
         except OSError:
@@ -90,10 +88,10 @@ class RealTerminal:
             self._pressed("")
 
     def logPrefix(self) -> str:  # noqa: N802 (Twisted's)
-        """What the log calls it."""
+        """Return the name in the log."""
         return "terminal"
 
 
 def real_terminal(reactor: Any) -> RealTerminal:
-    """The terminal of this process; raises ``UsageError`` where there is none."""
+    """Return the terminal of this process; raises ``UsageError`` if there is none."""
     return RealTerminal(reactor, sys.stdin, sys.stdout)

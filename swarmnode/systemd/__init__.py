@@ -1,1 +1,1 @@
-"""The node as a service of systemd: the unit, and the verb that installs it."""
+"""``swarm service``: run a node as a systemd service."""

@@ -1,7 +1,7 @@
-"""Command: ``swarm service``, a node as a service of systemd: install, show, restart and remove it.
+"""``swarm service``: install, show, restart and remove a node as a systemd service.
 
-As root the node becomes a service of the system, under a user of its own and with little it may do; else one of the
-user's own manager.  Its settings, and the files that they name, are copied into the service's own folder.
+Root installs a system service with a dynamic user and minimal permissions; another user installs a service of the
+user's manager.  For a system service the settings and the files that they name are copied to the service's folder.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ Run = Callable[[Sequence[str]], int]
 
 
 class CannotInstall(SwarmError):
-    """The service cannot be installed so; the message says why and what to do."""
+    """The service cannot be installed; the message has the reason and the remedy."""
 
 
 def run(words: Sequence[str]) -> int:
-    """Run a command of systemd; returns its exit code, 127 where there is none."""
+    """Run a systemd command; returns its exit code, 127 if it does not exist."""
     try:
         return subprocess.run(words, check=False).returncode  # noqa: S603 (ours, with no shell)
     except OSError:
@@ -37,26 +37,31 @@ def run(words: Sequence[str]) -> int:
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command line."""
-    whole = argparse.ArgumentParser(prog="swarm service", description="A node as a service of systemd.")
-    verbs = whole.add_subparsers(dest="verb", required=True, metavar="VERB")
+    """Return the parser of the command line."""
+    main_parser = argparse.ArgumentParser(
+        prog="swarm service",
+        description="Run a node as a systemd service.",
+        epilog="Example: swarm service install dog1.toml",
+    )
+    verbs = main_parser.add_subparsers(dest="verb", required=True, metavar="VERB")
     for name, purpose in (
-        ("install", "Install and start the service, or put new settings in its place."),
-        ("show", "Print the unit, and change nothing."),
+        ("install", "Install and start the service, or update its settings."),
+        ("show", "Print the unit file, without changes."),
     ):
-        verb = verbs.add_parser(name, help=purpose, description=purpose)
-        verb.add_argument("settings", metavar="SETTINGS", help="the node's TOML file")
-        verb.add_argument("--user", action="store_true", help="a service of your own, without root")
-        verb.add_argument("--memory", default=MEMORY, metavar="SIZE", help=f"what it may have; {MEMORY} where not said")
-        verb.add_argument("--no-start", action="store_true", help="leave systemd alone")
+        example = f"Example: swarm service {name} dog1.toml"
+        verb = verbs.add_parser(name, help=purpose, description=purpose, epilog=example)
+        verb.add_argument("settings", metavar="SETTINGS", help="settings file of the node")
+        verb.add_argument("--user", action="store_true", help="service of this user, without root")
+        verb.add_argument("--memory", default=MEMORY, metavar="SIZE", help=f"memory limit (default: {MEMORY})")
+        verb.add_argument("--no-start", action="store_true", help="write the files, but do not call systemd")
     for name, purpose in (
-        ("restart", "Restart it, as after an upgrade; its team goes on meanwhile."),
-        ("remove", "Stop and remove the service; what it stored stays."),
+        ("restart", "Restart the service, for example after an upgrade."),
+        ("remove", "Stop and remove the service; its data stays."),
     ):
-        verb = verbs.add_parser(name, help=purpose, description=purpose)
-        verb.add_argument("name", metavar="NAME", help="the node's name")
-        verb.add_argument("--user", action="store_true", help="a service of your own, without root")
-    return whole
+        verb = verbs.add_parser(name, help=purpose, description=purpose, epilog=f"Example: swarm service {name} dog1")
+        verb.add_argument("name", metavar="NAME", help="name of the node")
+        verb.add_argument("--user", action="store_true", help="service of this user, without root")
+    return main_parser
 
 
 def main(
@@ -68,88 +73,88 @@ def main(
     executable: str = sys.executable,
     can_enter: Callable[[Path], bool] = lambda folder: bool(folder.stat().st_mode & 0o001),
 ) -> int:
-    """Run the command; returns 0, 1 where systemd refused, 2 where the command or the settings are wrong."""
+    """Run the command; returns 0, 1 if systemd failed, 2 if the command or the settings are wrong."""
     out = out or sys.stdout
-    wishes = parser().parse_args(words)
-    is_user = wishes.user or (os.getuid() if uid is None else uid) != 0
+    options = parser().parse_args(words)
+    is_user = options.user or (os.getuid() if uid is None else uid) != 0
     try:
-        if wishes.verb in ("restart", "remove"):
-            return _Place(wishes.name, is_user, root, run, out).do(wishes.verb)
+        if options.verb in ("restart", "remove"):
+            return _Service(options.name, is_user, root, run, out).do(options.verb)
         program, interpreter = twistd(executable, is_user, can_enter), str(_interpreter(executable))
-        settings = Settings.load(str(Path(wishes.settings).absolute()))
-        unit = unit_for(settings, program, is_user, wishes.memory, interpreter)
-        if wishes.verb == "show":
+        settings = Settings.load(str(Path(options.settings).absolute()))
+        unit = unit_for(settings, program, is_user, options.memory, interpreter)
+        if options.verb == "show":
             out.write(unit.text)
             return DONE
-        return _Place(unit.name, is_user, root, run, out).install(unit, is_started=not wishes.no_start)
+        return _Service(unit.name, is_user, root, run, out).install(unit, is_started=not options.no_start)
     except (SwarmError, OSError) as problem:
         sys.stderr.write(printable(f"swarm service: {problem}") + "\n")
         return WRONG
 
 
 def twistd(executable: str, is_user: bool, can_enter: Callable[[Path], bool]) -> str:
-    """The program beside this interpreter; raises ``CannotInstall`` where the service's user could not run it."""
+    """Return ``twistd`` of this environment; raises ``CannotInstall`` if the service's user cannot run it."""
     path = Path(executable).with_name("twistd")
     if not path.exists():
-        raise CannotInstall(f"{path} is not there; install swarm-node into the environment that runs this")
+        raise CannotInstall(f"{path} does not exist; install swarm-node into this Python environment")
     folders = [] if is_user else [*path.parents, *_interpreter(executable).parents]
     for folder in folders:
         if not can_enter(folder):
-            remedy = "make an environment below /opt with the system's Python, or say --user"
+            remedy = "create an environment below /opt with the system's Python, or use --user"
             raise CannotInstall(f"other users cannot enter {folder}, which this program needs; {remedy}")
     return str(path)
 
 
 def _interpreter(executable: str) -> Path:
-    """The Python that runs: the interpreter of an environment is often a link to another one."""
+    """Return the real path of the interpreter; in an environment it is often a link."""
     return Path(executable).resolve()
 
 
-class _Place:
-    """Where the service of one node lies, and how systemd is told of it."""
+class _Service:
+    """The files of one node's service, and the calls to systemd."""
 
     def __init__(self, name: str, is_user: bool, root: Path, run: Run, out: TextIO) -> None:
         home = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config")
         units = home / "systemd/user" if is_user else Path("/etc/systemd/system")
         self._label = PREFIX + name
         self._unit = root / units.relative_to("/") / f"{self._label}.service"
-        # Once it has run, the system's manager keeps it below `private`, with a link to it.
+        # systemd moves it below `private` at the first start, and makes a link.
         self._state = root / "var/lib" / self._label
         self._is_user = is_user
         self._run = run
         self._out = out
 
     def install(self, unit: Unit, is_started: bool) -> int:
-        """Write the unit and what it needs, and have systemd start it."""
+        """Write the unit and its files, and start it."""
         if not self._is_user:
             self._copy(unit.settings)
         self._unit.parent.mkdir(parents=True, exist_ok=True)
-        _written(self._unit, unit.text.encode(), 0o644)
+        _write_atomically(self._unit, unit.text.encode(), 0o644)
         self._out.write(f"{self._unit}\n")
         if not is_started:
             return DONE
         for words in (("daemon-reload",), ("enable", self._label), ("restart", self._label)):
-            if self._tell(*words) != DONE:
-                return self._failed()
+            if self._systemctl(*words) != DONE:
+                return self._report_failure()
         if self._is_user:
-            self._out.write("It ends when you sign out, unless: loginctl enable-linger\n")
+            self._out.write("It stops when you sign out, unless you run: loginctl enable-linger\n")
         return DONE
 
     def do(self, verb: str) -> int:
-        """Restart or remove what is installed; raises ``CannotInstall`` where nothing is."""
+        """Restart or remove the service; raises ``CannotInstall`` if it is not installed."""
         if not self._unit.exists():
-            raise CannotInstall(f"{self._unit} is not there; `swarm service install SETTINGS` makes it")
+            raise CannotInstall(f"{self._unit} does not exist; install it by: swarm service install SETTINGS")
         if verb == "restart":
-            return DONE if self._tell("restart", self._label) == DONE else self._failed()
-        ended = self._tell("disable", "--now", self._label)
+            return DONE if self._systemctl("restart", self._label) == DONE else self._report_failure()
+        ended = self._systemctl("disable", "--now", self._label)
         self._unit.unlink()
-        self._tell("daemon-reload")
-        kept = "" if self._is_user else f"; what it stored stays in {self._state}"
-        self._out.write(f"{self._unit} is removed{kept}\n")
+        self._systemctl("daemon-reload")
+        kept = "" if self._is_user else f"; its data stays in {self._state}"
+        self._out.write(f"removed {self._unit}{kept}\n")
         return DONE if ended == DONE else FAILED
 
     def _copy(self, path: str) -> None:
-        """Put the settings into the service's folder, and once the files that they name in their own folder."""
+        """Copy the settings to the service's folder, and the files that they name unless they are there."""
         settings, folder = Settings.load(path), Path(path).parent
         self._state.mkdir(mode=0o700, parents=True, exist_ok=True)
         named = [settings.node.store, settings.node.membership]
@@ -158,7 +163,7 @@ class _Place:
                 inside = file.relative_to(folder)
             except ValueError:
                 raise CannotInstall(
-                    f"{file} lies outside of {folder}, where the service could not write; name it without a folder"
+                    f"{file} is outside of {folder}, where the service cannot write; use a path without a folder"
                 ) from None
             for each in (file, *(file.with_name(file.name + ending) for ending in ("-wal", "-shm"))):
                 target = self._state / inside.with_name(each.name)
@@ -166,27 +171,27 @@ class _Place:
                     target.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
                     shutil.copyfile(each, target)
                     target.chmod(0o600)
-        _written(self._state / SETTINGS, Path(path).read_bytes(), 0o600)
-        self._own()
+        _write_atomically(self._state / SETTINGS, Path(path).read_bytes(), 0o600)
+        self._set_owner()
 
-    def _own(self) -> None:
-        """Give the files to whoever has the folder already: systemd hands on the whole only when it makes the user."""
+    def _set_owner(self) -> None:
+        """Set the folder's owner on its files, because systemd does so only when it creates the user."""
         owner = self._state.stat()
         for file in self._state.rglob("*"):
             if os.getuid() == 0:
                 os.chown(file, owner.st_uid, owner.st_gid, follow_symlinks=False)
 
-    def _tell(self, *words: str) -> int:
+    def _systemctl(self, *words: str) -> int:
         return self._run(["systemctl", *(["--user"] if self._is_user else []), *words])
 
-    def _failed(self) -> int:
+    def _report_failure(self) -> int:
         user = "--user " if self._is_user else ""
-        sys.stderr.write(f"swarm service: systemd refused; see: journalctl {user}-u {self._label} -n 30\n")
+        sys.stderr.write(f"swarm service: systemctl failed; see: journalctl {user}-u {self._label} -n 30\n")
         return FAILED
 
 
-def _written(path: Path, data: bytes, mode: int) -> None:
-    """Write a file whole or not at all."""
+def _write_atomically(path: Path, data: bytes, mode: int) -> None:
+    """Write a file atomically."""
     new = path.with_name(path.name + ".new")
     descriptor = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, mode)
     with os.fdopen(descriptor, "wb") as file:

@@ -1,7 +1,7 @@
-"""Unit: the text of a systemd unit that runs one node and lets it do no more than a node needs.
+"""The systemd unit of one node, with minimal permissions.
 
-A unit of the system runs under a user that systemd makes up and takes away; what the node keeps lies in its own folder.
-A unit of a user's own manager cannot mount, so it has the limits that need no mounts.
+A system unit runs as a dynamic user with a private state folder.  A unit of a user's manager cannot use mount
+namespaces, so it has only the restrictions that do not need them.
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ from middleware.config.settings import Settings
 
 PREFIX = "swarm-node-"
 MEMORY = "256M"
-"""What one node may have; without page and camera it needs 40 MiB."""
+"""Memory limit of a node; without page and camera it uses 40 MiB."""
 LOWEST_FREE_PORT = 1024
 SETTINGS = "node.toml"
 HOMES = ("/home/", "/root/", "/run/user/")
-"""What ``ProtectHome=`` hides, on any machine (systemd.exec(5))."""
+"""Folders that ``ProtectHome=`` hides (systemd.exec(5))."""
 
 
 @dataclass(frozen=True)
 class Unit:
-    """What a unit is made of: ``twistd`` and ``settings`` are paths, ``name`` is the node's.
+    """The parameters of a unit: ``twistd`` and ``settings`` are paths, ``name`` is the node's.
 
-    ``interpreter`` is the Python that runs ``twistd``, wherever the links of its environment lead.
+    ``interpreter`` is the real path of the Python that runs ``twistd``.
     """
 
     name: str
@@ -35,12 +35,12 @@ class Unit:
     memory: str = MEMORY
     devices: tuple[str, ...] = ()
     is_low: bool = False
-    """Whether it listens at a port below 1024, which only root may otherwise."""
+    """Whether it listens on a port below 1024, which needs a capability."""
     interpreter: str = ""
 
     @property
     def label(self) -> str:
-        """The unit's name without its ending, and that of its folders."""
+        """The name of the unit without suffix, also of its folders."""
         return PREFIX + self.name
 
     @property
@@ -54,9 +54,9 @@ class Unit:
         if not self.is_user:
             yield "Wants=network-online.target"
             yield "After=network-online.target"
-        # Settings that are refused stay refused: whoever mends them starts it again.
+        # No restart after exit code 2 (invalid settings): the operator fixes them and starts the unit again.
         yield from ("StartLimitIntervalSec=60", "StartLimitBurst=10", "", "[Service]", "Type=exec")
-        yield f"ExecStart={_quoted(self.twistd)} --nodaemon --pidfile= swarm-node --config {_quoted(self._config)}"
+        yield f"ExecStart={_quote(self.twistd)} --nodaemon --pidfile= swarm-node --config {_quote(self._config)}"
         yield from ("Restart=always", "RestartSec=2", "RestartPreventExitStatus=2", "TimeoutStopSec=10")
         yield from ("UMask=0077", f"MemoryMax={self.memory}", "TasksMax=128", "LimitCORE=0")
         yield from _EVERYWHERE
@@ -69,7 +69,7 @@ class Unit:
     def _confined(self) -> Iterator[str]:
         yield from ("DynamicUser=yes", f"StateDirectory={self.label}", "StateDirectoryMode=0700")
         yield from (f"WorkingDirectory=%S/{self.label}", f"RuntimeDirectory={self.label}", "RuntimeDirectoryMode=0700")
-        # Where `swarm` finds the node's control socket.
+        # The folder in which `swarm` looks for the node's control socket.
         yield f"Environment=XDG_RUNTIME_DIR=%t/{self.label}"
         low = "CAP_NET_BIND_SERVICE" if self.is_low else ""
         yield from (f"CapabilityBoundingSet={low}", f"AmbientCapabilities={low}")
@@ -89,7 +89,7 @@ class Unit:
 
 _EVERYWHERE = (
     "NoNewPrivileges=yes",
-    # UNIX for the control socket, NETLINK to hear which interfaces there are.
+    # UNIX for the control socket, NETLINK to list the interfaces.
     "RestrictAddressFamilies=AF_INET AF_INET6 AF_UNIX AF_NETLINK",
     "RestrictNamespaces=yes",
     "RestrictRealtime=yes",
@@ -119,7 +119,7 @@ _MOUNTED = (
 
 
 def unit_for(settings: Settings, twistd: str, is_user: bool, memory: str = MEMORY, interpreter: str = "") -> Unit:
-    """The unit of the node with these settings, which are in the file ``settings.origin``."""
+    """Return the unit of the node with these settings, whose file is ``settings.origin``."""
     node, web = settings.node, settings.web
     ports = [node.port, node.tunnel_port]
     if "web" in node.roles:
@@ -136,8 +136,8 @@ def _devices(options: Mapping[str, object]) -> Iterator[str]:
             yield value
 
 
-def _quoted(path: str) -> str:
-    """A path as systemd reads it: with a percent sign doubled, but for its own specifiers at the beginning."""
+def _quote(path: str) -> str:
+    """Quote a path for systemd, with % doubled except for a specifier at the beginning."""
     head, rest = (path[:2], path[2:]) if path.startswith(("%S", "%t")) else ("", path)
     rest = rest.replace("%", "%%").replace("\\", "\\\\").replace('"', '\\"').replace("$", "$$")
     return f'"{head}{rest}"' if any(c.isspace() for c in rest) else head + rest

@@ -1,1 +1,1 @@
-"""Team: the operator's side of a closed team, and a newcomer's: the verbs of ``swarm`` that make, open and close it."""
+"""The verbs of ``swarm`` for closed teams: create a team, invite, join, list, renew and revoke members."""

@@ -1,4 +1,4 @@
-"""Init: ``swarm init``, which makes a closed team: its operator's key, and the membership of its first node."""
+"""``swarm init``: create a closed team with its operator's key and the membership of its first node."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from swarmnode.team.office import ENDING, Answer, Desk, Wrong, key_folder, optio
 
 MEMBERSHIP, SETTINGS = ".membership", ".toml"
 SHARED = ("port", "lan", "store_rows", "store_bytes", "durable", "presence_lease")
-"""Keys of ``[node]`` that an operator may give to newcomers: none runs code, opens a page or grants a right."""
+"""Keys of ``[node]`` that an operator may share with newcomers: none runs code, opens a page or grants a permission."""
 ANYWHERE = f"{EVERYWHERE}:{NODE_PORT}"
-"""Every address of the machine: what a laptop has today it may not have tomorrow."""
+"""Every address of the machine, because the addresses of a laptop change."""
 
 
 @dataclass(frozen=True)
 class _Member:
-    """Who is a member from the team's beginning, and so needs no code; its two files are made in ``folder``."""
+    """An initial member of the team, which needs no code; its two files are created in ``folder``."""
 
     name: str
     roles: Sequence[str]
@@ -47,76 +47,81 @@ class _Member:
 def main(words: Sequence[str] | None = None, desk: Desk | None = None) -> int:
     """Run the command; returns its exit code."""
     init = options(
-        "init", "Make a closed team: the operator's key, and the membership of its first node.", is_asked=False
+        "init",
+        "Create a closed team: the operator's key, and the membership of its first node.",
+        is_asked=False,
+        example="lab --first vaio --page",
     )
-    init.add_argument("team", metavar="NAME", help="what people call the team")
+    init.add_argument("team", metavar="NAME", help="name of the team")
     init.add_argument("--first", metavar="NODE", default="bootstrap", help="name of the first node (bootstrap)")
-    init.add_argument("--page", action="store_true", help="the first node serves the page, to its network as well")
-    init.add_argument("--folder", metavar="DIR", type=Path, default=Path("."), help="where its files go (here)")
+    init.add_argument("--page", action="store_true", help="the first node serves the page, also to its network")
+    init.add_argument("--folder", metavar="DIR", type=Path, default=Path("."), help="folder of its files (default: .)")
     init.add_argument(
-        "--at", metavar="HOST:PORT", help=f"where the first node listens and newcomers knock (*:{NODE_PORT})"
+        "--at", metavar="HOST:PORT", help=f"address of the first node, also for newcomers (default: *:{NODE_PORT})"
     )
     init.add_argument(
-        "--set", metavar="KEY=VALUE", action="append", default=[], help="a setting of [node] for all newcomers"
+        "--set", metavar="KEY=VALUE", action="append", default=[], help="setting of [node] for all newcomers"
     )
     init.add_argument(
         "--member",
         metavar="NAME[=ROLE,...]",
         action="append",
         default=[],
-        help="files for one more node at once, to be carried to it by hand; may be said again (device)",
+        help="create files for another node, to be copied to it; can be repeated (default role: device)",
     )
-    return run(init, words, desk, _made)
+    return run(init, words, desk, _create)
 
 
-def _made(wishes: argparse.Namespace, desk: Desk) -> Answer:
-    operator = replace(operators.drawn(wishes.team, desk.rng), settings=team_settings(wishes.set))
-    key = wishes.operator or key_folder() / f"{wishes.team}{ENDING}"
+def _create(arguments: argparse.Namespace, desk: Desk) -> Answer:
+    operator = replace(operators.drawn(arguments.team, desk.rng), settings=team_settings(arguments.set))
+    key = arguments.operator or key_folder() / f"{arguments.team}{ENDING}"
     team = dict(operator.settings)
-    first = _Member(wishes.first, FIRST, wishes.folder)
+    first = _Member(arguments.first, FIRST, arguments.folder)
     members = [first]
-    for text in wishes.member:
-        member = _member(text, wishes.folder)
+    for text in arguments.member:
+        member = _parse_member(text, arguments.folder)
         if member.name in {each.name for each in members}:
-            raise Wrong(f"--member {text}: another member is called so; give each a name of its own")
+            raise Wrong(f"--member {text}: another member has this name; choose another one")
         members.append(member)
-    texts = _texts(members, wishes.at, wishes.page, team)
+    texts = _settings_files(members, arguments.at, arguments.page, team)
     for path in (key, *(each.membership for each in members), *texts):
         if path.exists():
-            raise Wrong(f"{path} is there already; name another team, or --folder DIR")
-    founded = _founded(operator, members, desk)
-    _make_folders(key.parent, wishes.folder)
+            raise Wrong(f"{path} is there already; choose another team name, or --folder DIR")
+    created = _create_memberships(operator, members, desk)
+    _make_folders(key.parent, arguments.folder)
     operators.made(key, operator)
-    for path, membership in founded.items():
+    for path, membership in created.items():
         memberships.made(path, replace(membership, settings=team))
     for path, text in texts.items():
         written(path, text)
-    answer = {"team": wishes.team, "operator": str(key)}
+    answer = {"team": arguments.team, "operator": str(key)}
     return {**answer, "membership": str(first.membership), "settings": str(first.settings)}, [
-        f"The team {wishes.team} is made.",
-        f"  {key}  the operator's key: it lets in and puts out; no node needs it. Keep a copy in a safe place.",
+        f"Created the team {arguments.team}.",
+        f"  {key}  the operator's key: it admits and revokes members; no node needs it. Keep a copy in a safe place.",
         f"  {first.membership}  the first node's membership: a secret of that node",
         f"  {first.settings}  its settings; start it by: twistd -n --pidfile= swarm-node --config {first.settings}",
         *(
             f"  {each.membership}  for {each.name} ({', '.join(each.roles)}): "
-            f"carry it and {each.settings.name} there, and keep no copy"
+            f"copy it and {each.settings.name} to that node, then delete them here"
             for each in members[1:]
         ),
-        "Then let others in: swarm invite NAME",
+        "Next, admit other nodes: swarm invite NAME",
     ]
 
 
-def _member(text: str, folder: Path) -> _Member:
+def _parse_member(text: str, folder: Path) -> _Member:
     name, _, roles = text.partition("=")
     found = roles.split(",") if roles else ["device"]
     unknown = [role for role in found if role not in ROLES]
     if unknown:
-        raise Wrong(f"--member {text}: no role {unknown[0]!r}; there are {', '.join(ROLES)}")
+        raise Wrong(f"--member {text}: no role {unknown[0]!r}; roles: {', '.join(ROLES)}")
     return _Member(name, found, folder)
 
 
-def _texts(members: Sequence[_Member], at: str | None, has_page: bool, team: Mapping[str, Any]) -> dict[Path, str]:
-    """The settings file of each: the first node listens where it is told, the others know it from there."""
+def _settings_files(
+    members: Sequence[_Member], at: str | None, has_page: bool, team: Mapping[str, Any]
+) -> dict[Path, str]:
+    """Return the settings files: the first node listens at ``at``, and the others have it as a known node."""
     first, *others = members
     does = ["bootstrap", "edge", *(["web"] if has_page else [])]
     texts = {first.settings: settings_text(first.name, first.membership.name, does, at or ANYWHERE, (), team)}
@@ -127,8 +132,8 @@ def _texts(members: Sequence[_Member], at: str | None, has_page: bool, team: Map
     return texts
 
 
-def _founded(operator: Operator, members: Sequence[_Member], desk: Desk) -> dict[Path, Membership]:
-    """The membership of each, all with the secret of the first; raises ``Wrong``."""
+def _create_memberships(operator: Operator, members: Sequence[_Member], desk: Desk) -> dict[Path, Membership]:
+    """Return the memberships, all with the same team secret; raises ``Wrong``."""
     found: dict[Path, Membership] = {}
     secret = None
     for each in members:
@@ -146,11 +151,11 @@ def _make_folders(keys: Path, members: Path) -> None:
         keys.mkdir(mode=0o700, parents=True, exist_ok=True)
         members.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise Wrong(f"{error.filename} cannot be made: {error.strerror}") from error
+        raise Wrong(f"cannot create {error.filename}: {error.strerror}") from error
 
 
 def team_settings(given: Sequence[str]) -> dict[str, Any]:
-    """Return the settings that ``KEY=VALUE`` mean, each checked by the rule of its key; raises ``Wrong``."""
+    """Parse ``KEY=VALUE`` settings and check each by the rule of its key; raises ``Wrong``."""
     found: dict[str, Any] = {}
     for each in given:
         key, sign, value = each.partition("=")
@@ -167,7 +172,7 @@ def team_settings(given: Sequence[str]) -> dict[str, Any]:
 def settings_text(
     name: str, membership: str, roles: Sequence[str], at: str | None, known: Sequence[str], team: Mapping[str, Any]
 ) -> str:
-    """Return the text of a settings file for a new member; raises ``Wrong`` where a value is none."""
+    """Return the text of a settings file for a new member; raises ``Wrong`` for an invalid value."""
     import tomli_w
 
     node: dict[str, Any] = {"name": name, "membership": membership, "store": f"{name}.sqlite", "roles": list(roles)}
@@ -188,15 +193,15 @@ def settings_text(
 
 
 def written(path: Path, text: str) -> None:
-    """Make a settings file; one that is there is left as it is.  Raises ``Wrong``."""
+    """Create a settings file, unless it exists; raises ``Wrong``."""
     try:
-        # People write codes and passwords into it.
+        # Private, because users may add codes and passwords.
         with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="utf-8") as file:
             file.write(text)
     except FileExistsError:
         return
     except OSError as error:
-        raise Wrong(f"{path} cannot be written: {error.strerror}") from error
+        raise Wrong(f"cannot write {path}: {error.strerror}") from error
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Invitations: ``swarm invitations``, the codes of the operator, and the members that used each."""
+"""``swarm invitations``: list the operator's invitations, and the members that joined by each."""
 
 from __future__ import annotations
 
@@ -14,29 +14,30 @@ OPEN, USED, EXPIRED, REVOKED = "open", "used", "expired", "revoked"
 
 def main(words: Sequence[str] | None = None, desk: Desk | None = None) -> int:
     """Run the command; returns its exit code."""
-    invitations = options("invitations", "Print the invitations that can be used; end one by swarm revoke.", False)
-    invitations.add_argument("--all", action="store_true", help="also those that are used, expired or revoked")
-    return run(invitations, words, desk, _listed)
+    purpose = "List the invitations that can be used; end one by swarm revoke."
+    invitations = options("invitations", purpose, needs_key=False, example="--all")
+    invitations.add_argument("--all", action="store_true", help="also list used, expired and revoked invitations")
+    return run(invitations, words, desk, _list)
 
 
-def _listed(wishes: argparse.Namespace, desk: Desk) -> Answer:
+def _list(arguments: argparse.Namespace, desk: Desk) -> Answer:
     now = desk.wall()
-    found = known(wishes.node, desk)
+    found = known(arguments.node, desk)
     rows = [_row(found, each, now) for each in found.roll.invites()]
-    rows = [row for row in rows if wishes.all or row["state"] == OPEN]
+    rows = [row for row in rows if arguments.all or row["state"] == OPEN]
     width = max((len(row["name"]) for row in rows), default=0)
     lines = []
     for row in rows:
         until = day(row["until"], has_time=True)
         line = f"{row['name']:{width}}  {', '.join(row['roles'])}  {row['left']} of {row['uses']} left"
-        came = f"  came: {', '.join(row['came'])}" if row["came"] else ""
+        came = f"  joined: {', '.join(row['came'])}" if row["came"] else ""
         lines.append(f"{line}  until {until}  {row['state']}{came}")
-    end = "end one by swarm revoke NAME --invitation"
-    return {"team": found.team, "invitations": rows}, [*lines, end] if lines else ["no invitation can be used"]
+    end = "To end one: swarm revoke NAME --invitation"
+    return {"team": found.team, "invitations": rows}, [*lines, end] if lines else ["no open invitations"]
 
 
 def _row(found: Known, invite: Invite, now: float) -> dict[str, Any]:
-    """One invitation, as programs read it."""
+    """Return one invitation as plain data."""
     came = [each.member.name for each in found.roll.admissions() if each.member.invitation == invite.public]
     left = max(0, invite.uses - len(came))
     state = OPEN if left else USED

@@ -1,4 +1,4 @@
-"""Invite: ``swarm invite``, a short code that lets a newcomer in, as text and as a picture for a phone's camera."""
+"""``swarm invite``: create a join code, as text and as a QR code."""
 
 from __future__ import annotations
 
@@ -16,53 +16,57 @@ INVITED = tuple(role for role in ROLES if role != "bootstrap")
 
 def main(words: Sequence[str] | None = None, desk: Desk | None = None) -> int:
     """Run the command; returns its exit code."""
-    invite = options("invite", "Make a code that lets a newcomer into the team.")
-    invite.add_argument("name", metavar="NAME", help="what the newcomer is called")
-    invite.add_argument("--role", choices=INVITED, action="append", help="what it may do; may be said again (device)")
-    invite.add_argument("--uses", type=int, default=1, metavar="N", help=f"newcomers that may use it, 1 to {MAX_USES}")
-    invite.add_argument("--expires", type=seconds, default=DAY, metavar="TIME", help="until when, as 10m or 24h (24h)")
+    invite = options("invite", "Create a code by which a newcomer joins the team.", example="dog1 --expires 24h")
+    invite.add_argument("name", metavar="NAME", help="name of the newcomer")
+    invite.add_argument("--role", choices=INVITED, action="append", help="role; can be repeated (default: device)")
+    invite.add_argument("--uses", type=int, default=1, metavar="N", help=f"number of newcomers, 1 to {MAX_USES}")
+    invite.add_argument(
+        "--expires", type=seconds, default=DAY, metavar="TIME", help="validity of the code, such as 10m (default: 24h)"
+    )
     invite.add_argument(
         "--for",
         dest="life",
         type=seconds,
         default=float(YEAR),
         metavar="TIME",
-        help="how long it is a member (365d); a year or more is renewed",
+        help="validity of the certificate (default: 365d); a year or more is renewed automatically",
     )
-    return run(invite, words, desk, _invited)
+    return run(invite, words, desk, _invite)
 
 
-def _invited(wishes: argparse.Namespace, desk: Desk) -> Answer:
-    operator = operator_in(wishes.operator)
-    roles = wishes.role or ["device"]
+def _invite(arguments: argparse.Namespace, desk: Desk) -> Answer:
+    operator = operator_in(arguments.operator)
+    roles = arguments.role or ["device"]
     try:
         code, statement, terms = operator.invite(
-            wishes.name, roles, wishes.uses, desk.wall(), wishes.expires, desk.rng, wishes.life
+            arguments.name, roles, arguments.uses, desk.wall(), arguments.expires, desk.rng, arguments.life
         )
     except ValueError as error:
         raise Wrong(f"{error}: a name has 1 to 40 letters, digits, _ or -, and a code 1 to {MAX_USES} uses") from error
-    found = known(wishes.node, desk, operator)
-    if wishes.uses == 1 and wishes.name in {each.name for each in found.members(desk.wall())}:
-        raise Refusal(f"a member is called {wishes.name} already; choose another name, or revoke that one first")
+    found = known(arguments.node, desk, operator)
+    if arguments.uses == 1 and arguments.name in {each.name for each in found.members(desk.wall())}:
+        raise Refusal(
+            f"the team already has a member {arguments.name}; choose another name, or revoke that member first"
+        )
     doors = found.doors
-    tell(wishes.node, desk, terms)
-    tell(wishes.node, desk, statement)
-    whole = f"{code.text}@{','.join(doors)}" if doors else code.text
-    answer = {"code": code.text, "at": list(doors), "text": whole, "name": wishes.name, "roles": list(roles)}
-    times = "once" if wishes.uses == 1 else f"{wishes.uses} times"
-    lines = [f"{code.text}   lets in {wishes.name}, {times}, within {span(wishes.expires)}"]
-    lines.append(f"On the newcomer:  swarm join {whole}")
+    tell(arguments.node, desk, terms)
+    tell(arguments.node, desk, statement)
+    text = f"{code.text}@{','.join(doors)}" if doors else code.text
+    answer = {"code": code.text, "at": list(doors), "text": text, "name": arguments.name, "roles": list(roles)}
+    times = "once" if arguments.uses == 1 else f"{arguments.uses} times"
+    lines = [f"{code.text}   admits {arguments.name}, {times}, within {span(arguments.expires)}"]
+    lines.append(f"On the newcomer:  swarm join {text}")
     if not doors:
-        lines.append("No bootstrap node is in sight now; name one by: swarm join CODE --at HOST:PORT")
-    return answer, [*lines, *picture(whole)]
+        lines.append("No bootstrap node is reachable now; name one by: swarm join CODE --at HOST:PORT")
+    return answer, [*lines, *picture(text)]
 
 
 def picture(text: str) -> list[str]:
-    """A QR code of ``text`` in characters; a hint where there is no library to draw it with."""
+    """Return a QR code of ``text`` as characters; a hint if the library for it is missing."""
     try:
         import segno
     except ModuleNotFoundError:
-        return ["(a QR code is drawn where segno is installed: pip install 'swarm-node[web]')"]
+        return ["(to show a QR code, install segno: pip install 'swarm-node[web]')"]
     drawing = io.StringIO()
     segno.make(text, micro=False, error="m", boost_error=False).terminal(drawing, compact=True)
     return ["", *drawing.getvalue().splitlines()]

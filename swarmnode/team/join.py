@@ -1,4 +1,4 @@
-"""Join: ``swarm join CODE``, by which this machine becomes a member of a closed team."""
+"""``swarm join CODE``: make this machine a member of a closed team."""
 
 from __future__ import annotations
 
@@ -44,93 +44,95 @@ def main(
     around: Around | None = None,
 ) -> int:
     """Run the command; returns its exit code."""
-    join = options("join", "Become a member of a closed team, by a code of its operator.", False, is_asked=False)
-    join.add_argument("code", metavar="CODE", help="as swarm invite shows it, with or without @HOST:PORT behind it")
+    purpose = "Join a closed team with a code of its operator."
+    example = "K9TJ7-17QR2-Z31JA-KH77T@192.168.1.10:8484"
+    join = options("join", purpose, needs_key=False, is_asked=False, example=example)
+    join.add_argument("code", metavar="CODE", help="code shown by swarm invite, with or without @HOST:PORT")
     join.add_argument(
-        "--at", metavar="HOST:PORT", action="append", default=[], help="a bootstrap node to ask (else: who is here)"
+        "--at", metavar="HOST:PORT", action="append", default=[], help="bootstrap node (default: search the LAN)"
     )
     join.add_argument(
-        "--tunnel", metavar="URL", action="append", default=[], help="wss://HOST:PORT, where UDP is blocked (port 443)"
+        "--tunnel", metavar="URL", action="append", default=[], help="tunnel if UDP is blocked, as wss://HOST:PORT"
     )
-    join.add_argument("--name", metavar="NAME", default="", help="what to be called, where the code leaves that open")
-    join.add_argument("--folder", metavar="DIR", type=Path, default=Path("."), help="where the files go (here)")
-    join.add_argument("--files", metavar="NAME", default="swarm", help="what they are called (swarm)")
-    join.add_argument("--timeout", type=seconds, default=PATIENCE, metavar="TIME", help="how long to try (20s)")
+    join.add_argument("--name", metavar="NAME", default="", help="name of this member, if the code does not fix it")
+    join.add_argument("--folder", metavar="DIR", type=Path, default=Path("."), help="folder of its files (default: .)")
+    join.add_argument("--files", metavar="NAME", default="swarm", help="base name of its files (default: swarm)")
+    join.add_argument("--timeout", type=seconds, default=PATIENCE, metavar="TIME", help="maximum time (default: 20s)")
 
-    def work(wishes: argparse.Namespace, desk: Desk) -> Answer:
-        return _joined(wishes, desk, knocking or _knocking(wishes.tunnel), around or on_the_lan)
+    def work(arguments: argparse.Namespace, desk: Desk) -> Answer:
+        return _join(arguments, desk, knocking or _with_tunnels(arguments.tunnel), around or on_the_lan)
 
     return run(join, words, desk, work)
 
 
-def _joined(wishes: argparse.Namespace, desk: Desk, knocking: Knocking, around: Around) -> Answer:
-    text, _, behind = wishes.code.partition("@")
+def _join(arguments: argparse.Namespace, desk: Desk, knocking: Knocking, around: Around) -> Answer:
+    text, _, behind = arguments.code.partition("@")
     try:
         code = codes.read(text)
     except BadCode as error:
         raise Wrong(str(error)) from error
-    if wishes.name and not re.fullmatch(NAME, wishes.name, re.ASCII):
-        raise Wrong(f"--name {wishes.name}: a name has 1 to 40 letters, digits, _ or -")
-    doors = [address for each in [*wishes.at, *filter(None, behind.split(","))] for address in addresses(each)]
-    path = wishes.folder / f"{wishes.files}.membership"
+    if arguments.name and not re.fullmatch(NAME, arguments.name, re.ASCII):
+        raise Wrong(f"--name {arguments.name}: a name has 1 to 40 letters, digits, _ or -")
+    doors = [address for each in [*arguments.at, *filter(None, behind.split(","))] for address in addresses(each)]
+    path = arguments.folder / f"{arguments.files}.membership"
     if path.exists():
-        # A code is good for one: it is not spent on what cannot be kept.
-        raise Wrong(f"{path} is there already: this is a member; remove it to join anew, or say --files NAME")
+        # A code has a single use: do not spend it if the result cannot be stored.
+        raise Wrong(f"{path} is there already: this is a member; remove it to join again, or pass --files NAME")
     doors = doors or list(around())
     if not doors:
-        raise Wrong("nobody is named to ask, and none answers on this network; say --at HOST:PORT of a bootstrap node")
+        raise Wrong("no bootstrap node was named, and none replies on the LAN; pass --at HOST:PORT")
     try:
-        wishes.folder.mkdir(parents=True, exist_ok=True)
-        begun = wishes.folder / f".{wishes.files}.joining"
-        membership = knocking(code, _seed(begun, code, desk), wishes.name, doors, wishes.timeout)
+        arguments.folder.mkdir(parents=True, exist_ok=True)
+        seed_file = arguments.folder / f".{arguments.files}.joining"
+        membership = knocking(
+            code, _load_or_create_seed(seed_file, code, desk), arguments.name, doors, arguments.timeout
+        )
     except BadKeyFile:
         raise
     except EntangledError as error:
         raise Refusal(str(error)) from error
     except OSError as error:
-        raise Wrong(f"{wishes.folder} cannot be made: {error.strerror}") from error
-    settings = wishes.folder / f"{wishes.files}.toml"
+        raise Wrong(f"cannot create {arguments.folder}: {error.strerror}") from error
+    settings = arguments.folder / f"{arguments.files}.toml"
     name, roles = membership.member.name, membership.member.roles
     known = [f"[{host}]:{port}" if ":" in host else f"{host}:{port}" for host, port in membership.known]
-    # Without a host it would hear its own machine alone; by every address, since a laptop has another one tomorrow.
+    # The default host is loopback only; every address is used, because a laptop's addresses change.
     host = {} if all(is_loopback(address.host) for address in membership.known) else {"host": EVERYWHERE}
-    own = {**host, **({"tunnels": ["auto", *wishes.tunnel]} if wishes.tunnel else {})}
+    own = {**host, **({"tunnels": ["auto", *arguments.tunnel]} if arguments.tunnel else {})}
     given = {key: value for key, value in membership.settings.items() if key in SHARED}
     text = settings_text(name, path.name, ["edge"], None, known, {**given, **own})
     is_kept = settings.exists() and settings.read_text(encoding="utf-8", errors="replace") != text
     written(settings, text)
-    # The membership comes last: who finds it has all the rest.
+    # The membership is written last: if it exists, the other files do.
     memberships.made(path, membership)
-    begun.unlink(missing_ok=True)
+    seed_file.unlink(missing_ok=True)
     lines = [
-        f"This is {name} now, a member of the team {membership.team} ({', '.join(roles)}).",
+        f"This machine is now {name}, a member of the team {membership.team} ({', '.join(roles)}).",
         f"  {path}  the membership: a secret of this node",
         f"  {settings}  its settings; start it by: twistd -n --pidfile= swarm-node --config {settings}",
     ]
     if is_kept:
-        lines.append(f"{settings} was there already and is left as it is: see that its name and known_nodes are right")
+        lines.append(f"{settings} was there already and was not changed: check its name and known_nodes")
     ignored = sorted(set(membership.settings) - set(given))
     if ignored:
-        lines.append(f"Ignored settings of the invitation, which a team cannot give: {', '.join(map(repr, ignored))}")
+        lines.append(f"Ignored settings of the invitation, which a team cannot set: {', '.join(map(repr, ignored))}")
     if membership.member.trouble(desk.wall()):
-        lines.append(
-            "The clock of this machine, or that of the bootstrap node, is wrong; set it right before the start"
-        )
+        lines.append("The clock of this machine or of the bootstrap node is wrong; set it before you start the node")
     answer = {"team": membership.team, "name": name, "roles": list(roles), "membership": str(path)}
     return {**answer, "settings": str(settings)}, lines
 
 
-def _seed(path: Path, code: Code, desk: Desk) -> bytes:
-    """The newcomer's key, kept at ``path`` before anybody hears of it.
+def _load_or_create_seed(path: Path, code: Code, desk: Desk) -> bytes:
+    """Return the newcomer's key, stored at ``path`` before it is sent.
 
-    So who is let in and killed before that is kept can say the same again: its code is not spent on nobody.
+    After an interrupted join the same key is sent again, so the code's use is not lost.
     """
     invitation = code.key.public.hex()
     if path.exists():
-        kept = keyfile.read(path)
-        if kept.get("invitation") == invitation:
+        stored = keyfile.read(path)
+        if stored.get("invitation") == invitation:
             try:
-                return sized(bytes.fromhex(kept["seed"]), 32)
+                return sized(bytes.fromhex(stored["seed"]), 32)
             except (KeyError, ValueError, TypeError, RemoteError):
                 pass
     seed = desk.rng.randbytes(32)
@@ -139,26 +141,26 @@ def _seed(path: Path, code: Code, desk: Desk) -> bytes:
 
 
 def addresses(text: str) -> list[Address]:
-    """The addresses that ``HOST:PORT`` means; raises ``Wrong``."""
+    """Resolve ``HOST:PORT``; raises ``Wrong``."""
     host, colon, port = text.rpartition(":")
     if not colon or not port.isdecimal() or not 0 < int(port) < 65536:
-        raise Wrong(f"{text!r} is no address; write HOST:PORT")
+        raise Wrong(f"{text!r} is not an address; write HOST:PORT")
     try:
         found = socket.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_DGRAM)
     except (OSError, UnicodeError) as error:
-        raise Wrong(f"no address is known for {host!r}; mend the name, or write it in figures") from error
+        raise Wrong(f"no address is known for {host!r}; fix the name, or write a numeric address") from error
     return list(dict.fromkeys(Address(str(each[4][0]), int(port)) for each in found))
 
 
 def on_the_lan() -> list[Address]:
-    """Who answers on the LAN, of whatever team: only the code's own team can open."""
+    """Return the nodes on the LAN that reply, of any team; only the code's team accepts the request."""
     from swarmnode.doctor.measure import on_lan
 
     return [each.address for each in on_lan()]
 
 
-def _knocking(tunnels: Sequence[str]) -> Knocking:
-    """``knocked`` by these tunnels as well, and as ever by port 443 of each door; raises ``Wrong``."""
+def _with_tunnels(tunnels: Sequence[str]) -> Knocking:
+    """Return ``knocked`` with these tunnels and port 443 of each bootstrap node; raises ``Wrong``."""
     try:
         named = Settings.from_mapping({"node": {"name": "newcomer", "tunnels": ["auto", *tunnels]}}, COMMAND_LINE)
     except BadSetting as error:
@@ -174,9 +176,9 @@ def knocked(
     timeout: float,
     settings: NodeSettings,
 ) -> Membership:
-    """Knock at ``doors`` over UDP, on a reactor of its own; raises what ``Newcomer.join`` fails with.
+    """Send join requests to ``doors`` over UDP, in a separate reactor run; raises the errors of ``Newcomer.join``.
 
-    Where nobody answers soon, also by the tunnels of ``settings``: a firewall may let nothing else out.
+    Without an early reply it also uses the tunnels of ``settings``, because a firewall may block UDP.
     """
     from middleware.entangled.clock import use_monotonic_time
 
@@ -215,12 +217,12 @@ def knocked(
         react(go, (), reactor)
     except SystemExit as end:
         if end.code:
-            sys.stderr.write("swarm join: it was interrupted; say the same again\n")
+            sys.stderr.write("swarm join: interrupted; run the same command again\n")
             raise
     [found] = outcome
     if isinstance(found, EntangledError):
         raise found
-    # A tunnel's address means nothing to others, and nothing after the next start.
+    # A tunnel's address has no meaning for other nodes or after the next start.
     known = [*(doors if found.known[0].is_virtual else ()), *(each for each in found.known if not each.is_virtual)]
     plain = dict.fromkeys(Address(host.removeprefix("::ffff:"), port) for host, port in known)
     return replace(found, known=tuple(plain))

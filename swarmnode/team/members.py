@@ -1,4 +1,4 @@
-"""Members: ``swarm members``, who belongs to the team until when, and which invitations are open."""
+"""``swarm members``: list the members of the team with the ends of their certificates, and open invitations."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from swarmnode.team.office import Answer, Desk, day, known, options, run
 
 def main(words: Sequence[str] | None = None, desk: Desk | None = None) -> int:
     """Run the command; returns its exit code."""
-    members = options("members", "Print who belongs to the team.", needs_key=False)
-    return run(members, words, desk, _listed)
+    members = options("members", "List the members of the team.", needs_key=False, example="--json")
+    return run(members, words, desk, _list)
 
 
-def _listed(wishes: argparse.Namespace, desk: Desk) -> Answer:
+def _list(arguments: argparse.Namespace, desk: Desk) -> Answer:
     now = desk.wall()
-    found = known(wishes.node, desk)
+    found = known(arguments.node, desk)
     rows: list[dict[str, Any]] = [
         {
             "name": each.name,
@@ -47,12 +47,12 @@ def _listed(wishes: argparse.Namespace, desk: Desk) -> Answer:
     lines = [f"team {found.team}, secret number {found.secret}"]
     for row in rows:
         until = day(row["until"])
-        where = place(row["at"])
+        location = place(row["at"])
         renewal = "renewed automatically" if row["renews"] else "not renewed"
-        lines.append(f"  {row['name']:{width}}  {', '.join(row['roles'])}  until {until}, {renewal}  {where}")
+        lines.append(f"  {row['name']:{width}}  {', '.join(row['roles'])}  until {until}, {renewal}  {location}")
     for row in expired:
         until = day(row["until"])
-        lines.append(f"  {row['name']:{width}}  expired {until}; to let it in again: swarm renew {row['name']}")
+        lines.append(f"  {row['name']:{width}}  expired {until}; to readmit it: swarm renew {row['name']}")
     for row in open_:
         until = day(row["until"], has_time=True)
         lines.append(f"  {row['name']:{width}}  invited, {row['left']} left, until {until}")
@@ -62,7 +62,7 @@ def _listed(wishes: argparse.Namespace, desk: Desk) -> Answer:
 
 
 def place(address: str) -> str:
-    """Where a member is, for people: what stands for a way of this node alone says nothing to them."""
+    """Return a member's location as text; virtual addresses are meaningful to this node only."""
     if not address.startswith("~"):
-        return address or "not in sight"
-    return "by a tunnel" if address.startswith(VIRTUAL) else "carried by others"
+        return address or "no known address"
+    return "by a tunnel" if address.startswith(VIRTUAL) else "by a relay"

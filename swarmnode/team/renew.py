@@ -1,4 +1,4 @@
-"""Renew: ``swarm renew``, a new certificate for the key of a member, also of one that has expired."""
+"""``swarm renew``: issue a new certificate for a member's key, also for an expired one."""
 
 from __future__ import annotations
 
@@ -11,23 +11,24 @@ from swarmnode.team.office import Answer, Desk, day, known, operator_in, options
 
 def main(words: Sequence[str] | None = None, desk: Desk | None = None) -> int:
     """Run the command; returns its exit code."""
-    renew = options("renew", "Certify a member anew, with its key, name and roles; also one that has expired.")
-    renew.add_argument("name", metavar="NAME", help="of the member; or its key in hexadecimal")
+    purpose = "Renew the certificate of a member, with the same key, name and roles; also an expired one."
+    renew = options("renew", purpose, example="dog1 --for 365d")
+    renew.add_argument("name", metavar="NAME", help="name of the member, or its key in hexadecimal")
     renew.add_argument(
-        "--for", dest="life", type=seconds, default=float(YEAR), metavar="TIME", help="for how long from now on (365d)"
+        "--for", dest="life", type=seconds, default=float(YEAR), metavar="TIME", help="validity (default: 365d)"
     )
-    return run(renew, words, desk, _renewed)
+    return run(renew, words, desk, _renew)
 
 
-def _renewed(wishes: argparse.Namespace, desk: Desk) -> Answer:
-    operator = operator_in(wishes.operator)
-    member = known(wishes.node, desk, operator).member(wishes.name, desk.wall(), has_expired=True)
-    # Later than the operator's last word about that key, or it would not hold.
+def _renew(arguments: argparse.Namespace, desk: Desk) -> Answer:
+    operator = operator_in(arguments.operator)
+    member = known(arguments.node, desk, operator).member(arguments.name, desk.wall(), has_expired=True)
+    # The grant must be later than the operator's last one.
     begin = max(int(desk.wall()), member.since + 1)
-    tell(wishes.node, desk, operator.grant(member.public, member.name, member.roles, begin, wishes.life))
-    end = begin + int(wishes.life)
-    renews = wishes.life >= YEAR
-    how = "bootstrap nodes renew it from then on" if renews else "and ends then"
+    tell(arguments.node, desk, operator.grant(member.public, member.name, member.roles, begin, arguments.life))
+    end = begin + int(arguments.life)
+    renews = arguments.life >= YEAR
+    how = "bootstrap nodes renew it automatically" if renews else "it is not renewed automatically"
     return {"name": member.name, "roles": list(member.roles), "until": end, "renews": renews}, [
-        f"{member.name} is certified until {day(end)}; {how}"
+        f"{member.name} has a certificate until {day(end)}; {how}"
     ]

@@ -1,4 +1,4 @@
-"""Rotate: ``swarm rotate``, a new secret for all members that stay."""
+"""``swarm rotate``: replace the team's secret for all current members."""
 
 from __future__ import annotations
 
@@ -10,31 +10,32 @@ from swarmnode.asker import Refusal
 from swarmnode.team.office import Answer, Desk, known, operator_in, options, run, seconds, span, tell
 
 GRACE = 7 * 86_400.0
-"""Seconds for which the secret before is accepted, so that who was off meanwhile comes back.  Less is safer."""
+"""Seconds for which the previous secret is accepted, so offline members can return.  Less is safer."""
 
 
 def main(words: Sequence[str] | None = None, desk: Desk | None = None) -> int:
     """Run the command; returns its exit code."""
-    rotate = options("rotate", "Give the team a new secret, as after a member was lost or revoked.")
+    purpose = "Replace the team's secret, for example after a member was lost or revoked."
+    rotate = options("rotate", purpose, example="--grace 7d")
     rotate.add_argument(
-        "--grace", type=seconds, default=GRACE, metavar="TIME", help="how long the one before is accepted (7d)"
+        "--grace", type=seconds, default=GRACE, metavar="TIME", help="validity of the previous secret (default: 7d)"
     )
-    return run(rotate, words, desk, _rotated)
+    return run(rotate, words, desk, _rotate)
 
 
-def _rotated(wishes: argparse.Namespace, desk: Desk) -> Answer:
-    operator = operator_in(wishes.operator)
-    found = known(wishes.node, desk, operator)
+def _rotate(arguments: argparse.Namespace, desk: Desk) -> Answer:
+    operator = operator_in(arguments.operator)
+    found = known(arguments.node, desk, operator)
     members = found.members(desk.wall())
     if not members:
-        raise Refusal("this team has no members that the node knows of")
+        raise Refusal("the node knows no members of this team; check it by swarm doctor")
     number = found.secret + 1
     keys = [each.public for each in members][:MAX_SEALED]
-    tell(wishes.node, desk, operator.rotate(number, keys, desk.wall(), wishes.grace, desk.rng))
+    tell(arguments.node, desk, operator.rotate(number, keys, desk.wall(), arguments.grace, desk.rng))
     names = [each.name for each in members]
-    lines = [f"secret number {number} is for {', '.join(names)}", _until(wishes.grace)]
-    return {"number": number, "members": names, "grace": wishes.grace}, lines
+    lines = [f"created secret number {number} for {', '.join(names)}", _describe_grace(arguments.grace)]
+    return {"number": number, "members": names, "grace": arguments.grace}, lines
 
 
-def _until(grace: float) -> str:
-    return f"The one before is accepted for another {span(grace)}; who is off for longer has to join anew"
+def _describe_grace(grace: float) -> str:
+    return f"The previous secret is accepted for {span(grace)}; members that are offline longer have to join again"

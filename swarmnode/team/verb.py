@@ -1,6 +1,6 @@
-"""Verb: what the control socket can ask of a node about its team; it takes signed statements, and never a key.
+"""Control socket requests about the team of a node; they accept signed statements, never a key.
 
-``devices`` lists all devices, in a team of any size, as ``dht get devices`` does in a small one.
+``devices`` lists all devices in a team of any size, as ``dht get devices`` does in a small one.
 """
 
 from __future__ import annotations
@@ -18,28 +18,28 @@ from middleware.entangled.control.verb import Arguments, BadRequest, rows_of
 from middleware.entangled.errors import Refused
 from middleware.node import SwarmNode
 
-OPEN = "this node is in an open team, which has no operator; a closed one is made by swarm init, and joined by a code"
+OPEN = "this node is in an open team without an operator; create a closed team by swarm init, or join one by a code"
 
 
 class TeamVerbs:
-    """The verbs of one node: its team's, and ``others`` for whatever else is asked."""
+    """The control socket requests of one node: its team's, and ``others`` for the rest."""
 
     def __init__(self, others: Runs, node: SwarmNode) -> None:
         self._others = others
         self._node = node
 
     def run(self, name: object, arguments: object, tell: Callable[[Any], None]) -> Deferred[Any]:
-        """Do what ``name`` says, as ``Verbs.run`` does."""
+        """Run the request ``name``, as ``Verbs.run`` does."""
         if name == "devices":
             return self._node.list_devices().addCallback(lambda listing: rows_of(listing.records))
         work = {"team tell": self._tell, "team roll": self._roll}.get(name if isinstance(name, str) else "")
         if work is None:
             return self._others.run(name, arguments, tell)
-        return maybeDeferred(self._done, work, arguments)
+        return maybeDeferred(self._run_for_team, work, arguments)
 
-    def _done(self, work: Callable[[Team, Arguments], object], arguments: object) -> object:
+    def _run_for_team(self, work: Callable[[Team, Arguments], object], arguments: object) -> object:
         if not isinstance(arguments, dict):
-            raise BadRequest("the arguments of a verb are an object with names")
+            raise BadRequest("the arguments of a request have to be an object with names")
         if self._node.team is None:
             raise Refused(OPEN)
         return work(self._node.team, Arguments(arguments))
@@ -48,7 +48,7 @@ class TeamVerbs:
         return Deferred.fromCoroutine(team.tell(a.data("statement")))
 
     def _roll(self, team: Team, a: Arguments) -> object:
-        """What the node knows of its team, signed as it is: who asks can check all of it."""
+        """Return the node's view of its team, with the signed entries, so the client can verify it."""
         contacts = self._node.entangled.overlay.contacts()
         here = {contact.public: str(contact.address) for contact in contacts}
         here[team.identity.public] = str(self._node.entangled.contact.address)
@@ -59,6 +59,6 @@ class TeamVerbs:
             "secret": max([team.membership.secrets[0][0], *(each.number for each in team.roll.secrets())]),
             "entries": [base64.b64encode(packed).decode() for packed in team.roll.packed()],
             "here": {public.hex(): address for public, address in here.items()},
-            # Who is only reached by way of others opens to nobody who is not in.
+            # A newcomer cannot reach bootstrap nodes that are reached by relay or tunnel.
             "doors": [here[each] for each in bootstraps if each in here and not here[each].startswith("~")],
         }

@@ -125,7 +125,7 @@ class SaidTests(SiegeCase):
             repr(house.kept.membership.identity) + str(house.kept.membership.identity),
             repr(house.node.endpoint) + repr(house.team.door) + repr(house.team.roll),
             repr(house.node.endpoint._credentials),
-            repr(house.team._given(house.kept.membership.shown)),
+            repr(house.team._build_welcome(house.kept.membership.shown)),
         ]
         self.assertEqual([each for each in self.secrets(team) if each in "\n".join(shown)], [])
 

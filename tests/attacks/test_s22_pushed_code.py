@@ -55,7 +55,7 @@ class PushedCodeTests(SynchronousTestCase):
     def join(self, name: str, *roles: str) -> SwarmNode:
         """A member that the operator gave these roles."""
         membership = self.team.operator.founded(
-            name, roles, self.team.clock.seconds(), self.team._dice, self.team._secret
+            name, roles, self.team.clock.seconds(), self.team._member_rng, self.team._secret
         )
         self.team._memberships[name] = MemoryMembership(membership)
         self.team.add(name)

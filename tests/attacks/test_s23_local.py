@@ -158,4 +158,4 @@ class TeamKeyTests(SynchronousTestCase):
         self.assertIn("chmod 600", self.refusal("--team-key-file", str(self.path)))
         self.path.chmod(0o600)
         self.path.write_bytes(b"\xff")
-        self.assertIn("holds no text", self.refusal("--team-key-file", str(self.path)))
+        self.assertIn("is not text", self.refusal("--team-key-file", str(self.path)))

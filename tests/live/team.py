@@ -253,8 +253,15 @@ YARD: dict[str, Any] = {
 }
 KNOBS: list[list[Any]] = [
     ["description", "The dog with 1 yellow stripe on its head.", "A line about the device", "", None, 200],
-    ["presence_lease", 1.0, "How long the others believe in the device", "s", 0.1, 60.0],
-    ["capabilities", {"gripper": {"width": 0.1}}, "What the device can do beyond what its driver says", "", None, None],
+    ["presence_lease", 1.0, "Time until other nodes consider a silent device lost", "s", 0.1, 60.0],
+    [
+        "capabilities",
+        {"gripper": {"width": 0.1}},
+        "Capabilities of the device in addition to its driver's",
+        "",
+        None,
+        None,
+    ],
 ]
 CATALOGUE = [
     {"name": "search", "title": "Find and touch the red target", "requirements": {}},

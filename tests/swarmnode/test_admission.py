@@ -101,7 +101,7 @@ class AdmissionTests(SynchronousTestCase):
         words = ("yard", "--operator", str(self.folder / "yard"), "--folder", str(self.folder), "--first", "vaio")
         for twice in (("--member", "vaio"), ("--member", "dog1", "--member", "dog1=gateway")):
             self.assertEqual(self.run_verb(init.main, *words, *twice)[0], 2)
-            self.assertIn(f"--member {twice[-1]}: another member is called so", self.said)
+            self.assertIn(f"--member {twice[-1]}: another member has this name", self.said)
         settings = Settings.load(self.done(init.main, *words, "--page")["settings"])
         self.assertEqual((settings.node.host, settings.node.port), ("*", 8484))
         self.assertIn("web", settings.node.roles)
@@ -129,7 +129,7 @@ class AdmissionTests(SynchronousTestCase):
         """A code made at the laptop makes a newcomer a member, with files from which its node starts and is seen."""
         code, output = self.run_verb(invite.main, "dog9")
         self.assertEqual(code, 0, self.said)
-        self.assertIn("lets in dog9, once, within 24 h", output)
+        self.assertIn("admits dog9, once, within 24 h", output)
         self.assertGreater(sum("█" in line or "▀" in line or "▄" in line for line in output.splitlines()), 10)
         text = output.partition("swarm join ")[2].split()[0]
         self.assertTrue(text.endswith("@127.0.0.1:7000"))
@@ -164,8 +164,8 @@ class AdmissionTests(SynchronousTestCase):
 
     def test_place_of_a_member(self) -> None:
         """Where a member is stands in words that mean something to people."""
-        places = {"10.0.0.7:8484": "10.0.0.7:8484", "": "not in sight", "~wss-1fa56333f510:1": "by a tunnel"}
-        for address, words in {**places, f"~{'ab' * 20}:1": "carried by others"}.items():
+        places = {"10.0.0.7:8484": "10.0.0.7:8484", "": "no known address", "~wss-1fa56333f510:1": "by a tunnel"}
+        for address, words in {**places, f"~{'ab' * 20}:1": "by a relay"}.items():
             self.assertEqual(members.place(address), words)
 
     def test_settings_that_were_there(self) -> None:
@@ -220,13 +220,13 @@ class AdmissionTests(SynchronousTestCase):
         self.assertEqual((code, self.newcomers), (2, knocked))
         self.assertIn("is a member", self.said)
         self.assertEqual(self.run_verb(invite.main, "dog1")[0], 1)
-        self.assertIn("a member is called dog1 already", self.said)
+        self.assertIn("the team already has a member dog1", self.said)
 
     def test_revoke(self) -> None:
         """A revoked member is one no more, and its code and name can be told from a slip of the pen."""
         self.joined(self.done(invite.main, "dog9")["text"])
         self.assertEqual(self.run_verb(revoke.main, "dgo9")[0], 1)
-        self.assertIn("there are dog1, dog9, vaio", self.said)
+        self.assertIn("members: dog1, dog9, vaio", self.said)
         self.assertEqual(self.done(revoke.main, "dog9")["what"], "the member")
         self.assertEqual(self.names(), ["dog1", "vaio"])
         self.assertEqual([each["name"] for each in self.done(members.main)["revoked"]], ["dog9"])

@@ -49,7 +49,7 @@ class AssemblyTests(SynchronousTestCase):
         self.assertIsInstance(made.driver, Filming)
         with self.assertRaises(BadSetting) as caught:
             assembled(self.settings(driver={"parts": parts}), World().seams("b", 7001))
-        self.assertIn("[driver] parts: have no robot", str(caught.exception))
+        self.assertIn("[driver] parts: are set, but there is no robot", str(caught.exception))
 
     def test_node_without_body_has_no_agent(self) -> None:
         """A laptop has neither driver nor agent, and its kind is what the settings say."""

@@ -54,15 +54,15 @@ class ChaosTests(SynchronousTestCase):
         self.team(faults=False)
         code, output = self.chaos("dog1 loss")
         self.assertEqual((code, output), (1, ""))
-        self.assertIn('dog1: it allows no faults; write "allow = true" below [faults]', self.shell.said)
+        self.assertIn('dog1: it does not allow faults; set "allow = true" in [faults]', self.shell.said)
 
     def test_wrong_words(self) -> None:
         """A kind, a number and a device that there are not are one line each, which says what to give."""
         self.team()
         for line, code, said in (
             ("dog1 fly", 2, "there is no fault 'fly'; choose one of kill, freeze"),
-            ("dog1 loss --amount 2", 2, "amount: 2.0 is no lawful number; give 0 to 1"),
-            ("cat1 loss", 1, "no device is called cat1 for 60 s; there are vaio, dog1, dog2, dog3"),
+            ("dog1 loss --amount 2", 2, "amount: 2.0 is out of range; give 0 to 1"),
+            ("cat1 loss", 1, "no device has the name cat1 within 60 s; present devices: vaio, dog1, dog2, dog3"),
             ("run nowhere.toml", 2, "nowhere.toml: cannot be read"),
         ):
             self.assertEqual(self.chaos(line)[0], code, line)

@@ -228,7 +228,7 @@ class GatewayTests(SynchronousTestCase):
         self.phones.clear()
         self.live(0.5)
         refusal = self.failureResultOf(phone.at.join(b"s" * 32, "anna", CAN), Refusal).value
-        self.assertEqual((refusal.status, refusal.problem), (409, "an operator sent it away"))
+        self.assertEqual((refusal.status, refusal.problem), (409, "an operator removed it"))
         self.live(3.0)
         self.successResultOf(phone.at.join(b"s" * 32, "anna", CAN))
 
@@ -239,7 +239,7 @@ class GatewayTests(SynchronousTestCase):
         for body in (b"", b"GIF89a", jpeg()[:-2], jpeg(MOST_SIDE + 1, 10), jpeg(10, MOST_SIDE + 1), jpeg(0, 10)):
             refusal = self.assertRaises(Refusal, phone.at.look, phone.uuid, body, {})
             self.assertEqual(
-                (refusal.status, refusal.remedy), (400, f"send a whole JPEG of at most {MOST_SIDE} pixels a side")
+                (refusal.status, refusal.remedy), (400, f"send a complete JPEG of at most {MOST_SIDE} pixels a side")
             )
         self.assertEqual(self.assertRaises(Refusal, phone.at.look, "0" * 40, jpeg(), {}).status, 404)
         for _ in range(round(LOOKS)):

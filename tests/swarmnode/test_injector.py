@@ -23,7 +23,7 @@ class InjectorTests(SynchronousTestCase):
         return next(device for device in self.stage.devices() if device.name == name)
 
     def asked(self, name: str) -> dict[str, Any]:
-        told: dict[str, Any] = self.stage._called(self.named(name), ASKED)
+        told: dict[str, Any] = self.stage._call(self.named(name), ASKED)
         return told
 
     def turn(self) -> tuple[Any, str]:
@@ -105,7 +105,7 @@ class InjectorTests(SynchronousTestCase):
         self.assertEqual(self.asked("vaio")["kinds"], [kind for kind in KINDS if kind != "battery"])
         self.assertEqual(self.asked("dog1")["kinds"], list(KINDS))
         error = self.assertRaises(Refusal, self.stage.cause, self.named("vaio"), Fault("battery", 5.0, 0.01))
-        self.assertIn("cannot suffer battery; choose one of kill, freeze", str(error))
+        self.assertIn("cannot have battery; choose one of kill, freeze", str(error))
         error = self.assertRaises(Refusal, self.stage.cause, self.named("dog1"), Fault("radio", 1e9))
         self.assertIn("seconds", str(error))
         error = self.assertRaises(Refusal, self.stage.assign, "fly")

@@ -88,5 +88,5 @@ class WebCodeTests(SynchronousTestCase):
         """Where there is no page, or not that one, one line says which there are, and the exit code is 2."""
         code, out, errors = self.asked("--node", "dog1")
         self.assertEqual((code, out), (2, ""))
-        self.assertIn("no page of a node 'dog1' runs on this machine; there are those of vaio", errors)
+        self.assertIn("no node 'dog1' with a page runs on this machine; nodes with a page: vaio", errors)
         self.assertIn("start a node with the role", self.asked(here=[])[2])

@@ -48,7 +48,7 @@ class LinksTests(SynchronousTestCase):
             (
                 0,
                 [
-                    f"cdcdcdcdcd  {score:3}/100  carried by efefefefef  80.0 ms, jitter 0.0 ms, 10 % lost, for 2 min",
+                    f"cdcdcdcdcd  {score:3}/100  relayed by efefefefef  80.0 ms, jitter 0.0 ms, 10 % lost, for 2 min",
                     "efefefefef  100/100  LAN                    2.0 ms, jitter 0.0 ms, 0 % lost, for 2 h",
                 ],
             ),
@@ -57,12 +57,12 @@ class LinksTests(SynchronousTestCase):
     def test_silent_peer(self) -> None:
         """A peer that answers nothing has 0 points, and the command ends with 1."""
         self.links = [{**NEAR, "way": "none", "for": None, "times": [None] * 10}]
-        self.assertEqual(self.run_it(), (1, "efefefefef    0/100  no way yet  does not answer\n"))
+        self.assertEqual(self.run_it(), (1, "efefefefef    0/100  no path yet  does not reply\n"))
 
     def test_no_peer(self) -> None:
         """A node alone says so, and what tells why."""
         self.links = []
-        self.assertEqual(self.run_it(), (0, "this node knows no peer; swarm doctor says why\n"))
+        self.assertEqual(self.run_it(), (0, "this node has no peers; run swarm doctor to see why\n"))
 
     def test_json(self) -> None:
         """With --json it is one line with the same figures."""

@@ -87,7 +87,7 @@ class PairingTests(SynchronousTestCase):
         self.assertEqual(told, {"vaio": ("vaio", "vaio", ""), **{row[0]: row for row in ROWS}})
         self.assertEqual({device["kind"] for device in devices}, {"laptop", "aibo-ers7"})
         for device, laptop, agent in ROWS:
-            self.assertIn(f"{device} has the agent {agent} on {laptop}", lines)
+            self.assertIn(f"agent of {device}: {agent} on {laptop}", lines)
             driver = services[device].assembly.driver
             assert driver is not None
             self.assertEqual(driver.state, "ready")

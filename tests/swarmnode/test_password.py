@@ -40,7 +40,7 @@ class PasswordCommandTests(SynchronousTestCase):
             (("short",), "5 characters"),
             (("correct horse", "correct hors"), "not the same"),
             ((" correct horse",), "a space"),
-            ((), "there was none"),
+            ((), "no password entered"),
         ):
             code, out, errors = self.typed(*answers)
             self.assertEqual((code, out, errors.count("\n")), (1, "", 1))

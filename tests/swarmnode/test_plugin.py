@@ -83,7 +83,7 @@ class RefusalTests(SynchronousTestCase):
         driver = '[driver]\nkind = "sim"\n'
         for text, parts in (
             (f'{driver}[agent]\nmodule = "serch"\n', ("[agent] module", "'serch'", "search")),
-            ('[agent]\nmodule = "search"\n', ("[agent] module", "name its [driver] kind")),
+            ('[agent]\nmodule = "search"\n', ("[agent] module", "set [driver] kind")),
             (f'{driver}[agent]\nmodule = "no_such_module:Mind"\n', ("[agent] module", "no_such_module")),
             ('[driver]\nkind = "simm"\n', ("[driver]", "'simm'", known)),
             (f'{driver}options = {{ port = "x" }}\n', ("[driver]", "port", "7400")),
@@ -115,7 +115,7 @@ class RefusalTests(SynchronousTestCase):
         self.assertEqual(
             told(error, "x.toml"),
             "x.toml: [node] known_nodes: no address is known for 'no-such-host.invalid' (Name or service not known); "
-            "mend the name, or write the address in figures",
+            "fix the name, or write a numeric address",
         )
 
     def test_say_which_setting_to_mend(self) -> None:

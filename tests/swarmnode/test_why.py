@@ -68,7 +68,7 @@ class WhyTests(SynchronousTestCase):
         task = self.team.run_demo()
         self.team.clock.advance(1.0)
         code, output = self.shell.run(main, ["last"])
-        self.assertEqual((code, output.splitlines()[-1]), (1, "nobody has decided anything yet"))
+        self.assertEqual((code, output.splitlines()[-1]), (1, "no decision yet"))
         self.assertEqual(self.shell.run(main, ["zz"])[0], 1)
         self.assertEqual(self.shell.said, f"swarm why: no task begins with 'zz'; the newest are {task}\n")
         self.assertEqual(self.shell.run(main, ["last", "--node", "nobody"])[0], 2)
@@ -90,7 +90,7 @@ class WhyTests(SynchronousTestCase):
         self.assertEqual(self.shell.run(main, ["zz"])[0], 1)
         self.assertEqual(self.shell.said, "swarm why: no task begins with 'zz'; the newest are a , a [2J\n")
         self.shell.run(main, ["a"])
-        self.assertEqual(self.shell.said, "swarm why: 2 tasks begin with 'a': a , a [2J; say more of the id\n")
+        self.assertEqual(self.shell.said, "swarm why: 2 tasks begin with 'a': a , a [2J; give more of the id\n")
 
     def test_prefix(self) -> None:
         """A beginning that fits several is refused with their names; a whole id is meant, also where others go on."""
@@ -99,5 +99,5 @@ class WhyTests(SynchronousTestCase):
         self.assertEqual(chosen("ab", tasks).task_id, "ab")
         self.assertEqual(chosen("abc", tasks).task_id, "abc")
         error = self.assertRaises(Refusal, chosen, "a", tasks)
-        self.assertEqual(str(error), "2 tasks begin with 'a': abc, ab; say more of the id")
+        self.assertEqual(str(error), "2 tasks begin with 'a': abc, ab; give more of the id")
         self.assertRaises(Refusal, chosen, "", tasks)

@@ -115,8 +115,8 @@ class KnockTests(SynchronousTestCase):
     @settings(max_examples=200, deadline=None)
     def test_a_bootstrap_node_may_sign_anything(self, body: object) -> None:
         """An answer that is signed and holds something else raises nothing but Malformed, or is a refusal."""
-        whole = knock._signed(INVITE.public, HEARD, msgpack.packb(body), signer())
-        said = knock._answered(INVITE.public, EPHEMERAL, whole, random.Random(2))
+        whole = knock._sign_body(INVITE.public, HEARD, msgpack.packb(body), signer())
+        said = knock._encrypt_reply(INVITE.public, EPHEMERAL, whole, random.Random(2))
         with contextlib.suppress(Malformed):
             found = read(said)
             self.assertTrue(isinstance(found, Reply) and isinstance(found.said, str))

@@ -44,7 +44,7 @@ class RebuffTests(VillageCase):
         self.assertEqual(sorted(found), ["unknown", "used"])
         self.assertEqual((len(found["used"].who), found["unknown"].who), (32, b""))
         self.assertGreaterEqual(found["unknown"].count, 3)
-        self.assertEqual(sum("not let in by the invitation" in formatEvent(event) for event in said), 1)
+        self.assertEqual(sum("rejected by the invitation" in formatEvent(event) for event in said), 1)
 
     def test_copy_of_a_store(self) -> None:
         """A copy that was started later takes the place of the first, whose peers and itself say that it was so."""

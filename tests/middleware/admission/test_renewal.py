@@ -97,7 +97,7 @@ class LargeTeamTests(YearsCase):
         for house in (dog, cat):
             member = vaio.team.door.member(house.public)
             assert member is not None
-            Deferred.fromCoroutine(vaio.team._is_here(member)).addCallback(answers.append)
+            Deferred.fromCoroutine(vaio.team._is_reachable(member)).addCallback(answers.append)
             years.run(20.0)
         self.assertEqual(answers, [True, False])
         years.open(cat)
@@ -110,8 +110,8 @@ class BatchTests(YearsCase):
         for number in range(BATCH + 3):
             years.tell(years.signer.grant(bytes([number]) * 32, f"p{number}", ("device",), years.wall()))
         team = years.houses[0].team
-        self.patch(team, "_may_be_here", lambda member: True)
-        self.patch(team, "_is_here", lambda member: succeed(True))
+        self.patch(team, "_may_be_reachable", lambda member: True)
+        self.patch(team, "_is_reachable", lambda member: succeed(True))
         years.days += 300
         years.run(6.0)
         before = len([each for each in team.members() if each.renewer])

@@ -219,8 +219,8 @@ class SettingsTest(SynchronousTestCase):
         """A misspelt table or key, a missing name and a value in the place of a table are refused with the remedy."""
         for mapping, meant in (
             ({"nod": {}}, "nearest table is [node]"),
-            ({"store": "x"}, "store: stands outside of any table; write it below [node]"),
-            ({"prot": 7000}, "prot: stands outside of any table; the nearest setting is port, below [node] or [web]"),
+            ({"store": "x"}, "store: is outside of any table; write it below [node]"),
+            ({"prot": 7000}, "prot: is outside of any table; the nearest setting is port, below [node] or [web]"),
             ({"node": {"name": "a", "known_node": []}}, "nearest is known_nodes"),
             ({"node": {"name": "a"}, "web": {"prot": 1}}, "nearest is port"),
             ({"node": {"port": 1}}, "[node] name: is missing"),

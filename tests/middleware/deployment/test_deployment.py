@@ -128,7 +128,7 @@ class DeploymentTests(FleetCase):
         self.done(self.world, self.operator.entangled.put(hashed_key(source_key(manifest.digest)), "source", source))
         owner = self.operator.entangled.identity.public
         forged = Record(manifests_key(), "best", owner, 5, "team", 60.0, manifest.packed())
-        self.deployment._pushed([forged.signed(self.stranger.entangled.identity)])
+        self.deployment._on_manifests([forged.signed(self.stranger.entangled.identity)])
         self.world.run(1.0)
         self.assert_refused("is not signed by its operator")
 
@@ -245,4 +245,4 @@ class DeploymentTests(FleetCase):
         self.deployment = self.allow(FileShelf(folder, full))
         manifest, source = self.version(1)
         self.push(manifest, source)
-        self.assert_refused("best 1 is not on file: No space left on device", runs=1)
+        self.assert_refused("cannot store best 1: No space left on device", runs=1)

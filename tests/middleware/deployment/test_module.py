@@ -84,22 +84,22 @@ class ModuleTests(SynchronousTestCase):
             ("x = 1", "a strategy has to define Strategy"),
             ("Strategy = 7", "a strategy has to define Strategy"),
             (SPIN, "a strategy has to define Strategy"),
-            ("class Strategy: pass", "a strategy has find"),
+            ("class Strategy: pass", "a strategy has to define find"),
         ):
             self.assertIn(reason, self.refusal(source), source[:40])
         self.assertIn("a behaviour has to define Behaviour", self.refusal(GOOD, BEHAVIOUR))
-        self.assertIn("a behaviour has look", self.refusal("class Behaviour: pass", BEHAVIOUR))
+        self.assertIn("a behaviour has to define look", self.refusal("class Behaviour: pass", BEHAVIOUR))
 
     def test_what_is_no_strategy_is_refused(self) -> None:
         """A strategy that loops, names a stranger, depends on the order or prefers a report to itself is refused."""
         for body, reason in (
             ("def find(self, c):\n  while True: pass", "takes more than"),
             ("def find(self, c): return Consensus('x' * 40 if c else None)", "did not report"),
-            ("def find(self, c): return Consensus('x' * 40)", "where nobody reported"),
+            ("def find(self, c): return Consensus('x' * 40)", "without any report"),
             ("def find(self, c): return Consensus(c[0].agent if c else None)", "depends on the order"),
             ("def find(self, c): return None", "raises AttributeError"),
             ("def improves(self, a, b, h): return True", "better than itself"),
-            ("def merge(self, a, b): return tuple(r for r in (*a, *b) if r.cost > 2)", "what merge keeps"),
+            ("def merge(self, a, b): return tuple(r for r in (*a, *b) if r.cost > 2)", "find after merge"),
         ):
             indented = "".join(f"  {line}\n" for line in body.splitlines())
             self.assertIn(reason, self.refusal(f"{BASE}class Strategy(Nearest):\n{indented}"))

@@ -59,7 +59,7 @@ class ExplanationTests(SynchronousTestCase):
         """Who reported and has told no decision is no agreement."""
         (ruling,) = explained([decided(1, THREE), decided(3, THREE)]).epochs
         self.assertEqual((len(ruling.agree), ruling.of), (2, 3))
-        self.assertEqual([(d.name, d.what) for d in ruling.differ], [("dog2", "has told no decision")])
+        self.assertEqual([(d.name, d.what) for d in ruling.differ], [("dog2", "has no decision record")])
 
     def test_order_does_not_matter(self) -> None:
         """Any order of the accounts gives the same explanation, the newest epoch first."""

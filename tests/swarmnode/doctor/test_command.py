@@ -72,12 +72,12 @@ class CommandTests(SynchronousTestCase):
     def test_exit_code(self) -> None:
         """Where nothing is wrong it says so, with code 0; a finding has its reason and remedy, with code 1."""
         code, printed, _ = self.run_it(str(self.settings))
-        self.assertEqual((code, printed), (0, "nothing is wrong that can be seen while the node is off\n"))
+        self.assertEqual((code, printed), (0, "no problem found; run it again while the node runs\n"))
         self.assertEqual(self.measured, [("dog1", False, None)])
         self.facts = replace(WELL, open_files=(("dog1.toml", 0o644),))
         code, printed, _ = self.run_it(str(self.settings))
         self.assertEqual(code, 1)
-        for part in ("ERROR  key-readable: ", "    why: Its mode is 0644.", "    do:  chmod 600 dog1.toml"):
+        for part in ("ERROR  key-readable: ", "    why: Its mode is 0644.", "    do:  Run chmod 600 dog1.toml"):
             self.assertIn(part, printed)
 
     def test_running_node_is_asked(self) -> None:
@@ -86,7 +86,7 @@ class CommandTests(SynchronousTestCase):
         code, printed, _ = self.run_it(str(self.settings))
         self.assertEqual((code, self.measured[0][1]), (0, True))
         self.assertIn("cdcdcdcdcd  192.168.1.9:8484  100/100  2.0 ms, jitter 0.0 ms, 0 % lost\n", printed)
-        self.assertIn("~ef:1    0/100  does not answer\n", printed)
+        self.assertIn("~ef:1    0/100  does not reply\n", printed)
 
     def test_running_node_without_settings(self) -> None:
         """Without settings the only running node is asked; what it met is named."""

@@ -76,17 +76,17 @@ class DiagnosisTests(SynchronousTestCase):
         unplugged = (LO, WLAN, replace(CABLE, is_running=False))
         alone = {"known": (SILENT,), "lan": None}
         self.check(
-            (blocked, "error udp-blocked", "203.0.113.5 answers to TCP"),
+            (blocked, "error udp-blocked", "203.0.113.5 replies to TCP"),
             ({"known": (MEMBER, Probe(FAR, error="refused"))}, "warning nobody-listens", "203.0.113.5:8484"),
             ({"known": (Probe(FAR, error="refused"),), "lan": None}, "warning nobody-listens", ""),
             (
                 {"known": (replace(SILENT_NEAR, is_resolved=False),), "lan": CALLED},
                 "error client-isolation",
-                "The router answers",
+                "The router replies",
             ),
             ({"known": (MEMBER, OFF)}, "warning off", "192.168.1.33"),
             ({"known": (OFF,)}, "warning off", ""),
-            ({"known": (guarded,), "lan": CALLED}, "error peer-firewall", "Open UDP 8484"),
+            ({"known": (guarded,), "lan": CALLED}, "error peer-firewall", "Allow incoming UDP 8484"),
             ({**alone, "host": "192.168.7.7"}, "error wrong-interface", "192.168.1.7"),
             ({**alone, "host": "127.0.0.1"}, "error wrong-interface", "on another machine"),
             (
@@ -107,9 +107,9 @@ class DiagnosisTests(SynchronousTestCase):
         """What keeps calls from the LAN is told apart: the network, or this machine; its own answer proves nothing."""
         own = Lan((Answer(Address("192.168.1.7", 8485), offset=0.0),), True, True)
         self.check(
-            ({"lan": CALLED}, "warning multicast-blocked", "This network does not carry multicast"),
-            ({"lan": own}, "warning multicast-blocked", "This network does not carry multicast"),
-            ({"lan": Lan((), True, False)}, "warning multicast-blocked", "This machine does not let"),
+            ({"lan": CALLED}, "warning multicast-blocked", "This network does not forward multicast"),
+            ({"lan": own}, "warning multicast-blocked", "This network does not forward multicast"),
+            ({"lan": Lan((), True, False)}, "warning multicast-blocked", "This machine does not receive"),
             ({"lan": Lan((), False, False)}, "warning multicast-blocked", "This machine cannot send"),
         )
 

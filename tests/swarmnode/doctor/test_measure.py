@@ -52,6 +52,6 @@ class MeasureTests(SynchronousTestCase):
         (self.folder / "b.sqlite").mkdir()
         folder = measured(self.settings(store="b.sqlite")).storage
         assert missing is not None and folder is not None
-        self.assertIn("There is no folder", missing.problem)
+        self.assertIn("does not exist", missing.problem)
         self.assertIn("It is a folder", folder.problem)
         self.assertIsNone(measured(self.settings()).storage)

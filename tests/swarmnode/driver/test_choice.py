@@ -50,7 +50,7 @@ class CandidateTests(SynchronousTestCase):
 
     def test_nothing_is_said_as_well(self) -> None:
         """Where there is no device the network is not searched, and how to name a robot in it is said."""
-        self.assertIn("is asked only where it is named", "\n".join(candidate_lines([])))
+        self.assertIn("has to be named", "\n".join(candidate_lines([])))
 
 
 class UnitTests(SynchronousTestCase):

@@ -151,7 +151,7 @@ class CommandTests(SynchronousTestCase):
     def test_refused_settings(self) -> None:
         """A store outside of the settings' folder, and settings that a node would refuse, are refused by name."""
         for text, words in (
-            ('[node]\nname = "dog1"\nstore = "/srv/dog1.sqlite"\n', "/srv/dog1.sqlite lies outside"),
+            ('[node]\nname = "dog1"\nstore = "/srv/dog1.sqlite"\n', "/srv/dog1.sqlite is outside"),
             ("[node]\n", "[node] name: is missing"),
         ):
             self.settings.write_text(text, encoding="utf-8")
@@ -190,7 +190,7 @@ class CommandTests(SynchronousTestCase):
         for verb in ("restart", "remove"):
             code, _, complaint = self.run_it(verb, "cat")
             self.assertEqual((code, self.told), (2, []))
-            self.assertIn("swarm-node-cat.service is not there", complaint)
+            self.assertIn("swarm-node-cat.service does not exist", complaint)
         self.codes["restart"] = 1
         code, _, complaint = self.install()
         self.assertEqual(code, 1)
