@@ -46,7 +46,7 @@ class TokenTeam(VirtualTeam):
     def _membership(self, name: str) -> MemoryMembership:
         if name not in self._memberships:
             roles = ("viewer",) if name == "eve" else FIRST
-            made = self.operator.founded(name, roles, self.clock.seconds(), self._dice, self._secret)
+            made = self.operator.founded(name, roles, self.clock.seconds(), self._member_rng, self._secret)
             self._memberships[name] = MemoryMembership(made)
         return self._memberships[name]
 

@@ -37,7 +37,7 @@ class ApartTests(SynchronousTestCase):
 
     def test_ends_without_a_word(self) -> None:
         """A process that ends before it has answered is told of, with its exit code."""
-        with self.assertRaisesRegex(RuntimeError, "ended with 7"):
+        with self.assertRaisesRegex(RuntimeError, "exit code 7"):
             apart(lambda: os._exit(7))
 
     def test_ended_with_who_waits_for_it(self) -> None:
