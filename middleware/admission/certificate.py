@@ -230,18 +230,16 @@ def _verify_renewal(operator: bytes, public: bytes, fields: list[Any]) -> Member
 
 
 def _verify_invited(operator: bytes, public: bytes, content: list[Any]) -> Member:
-    """Return the member that joined by a code, without dates; checks that invitation and wish allow the name."""
+    """Return the member that joined by a code, without dates."""
     packed, wish, signature, name, admitter = content
-    invite = _verify_invitation(operator, public, packed, wish, signature)
-    if not invite.allows(named(name), wish):
-        raise Forged("the invitation does not allow this name")
+    invite = _verify_invitation(operator, public, packed, wish, signature, name)
     since = max(0, invite.not_before - SKEW)
     origin = invite.public, sized(admitter, 32)
     return Member(public, name, invite.roles, 0, 0, *origin, uses=invite.uses, since=since, life=invite.life)
 
 
-def _verify_invitation(operator: bytes, public: bytes, packed: Any, wish: Any, signature: Any) -> Invite:
-    """Verify that the invitation's key signed ``public`` and ``wish``, and return the invitation."""
+def _verify_invitation(operator: bytes, public: bytes, packed: Any, wish: Any, signature: Any, name: Any) -> Invite:
+    """Return the invitation: its key signed ``public`` and ``wish``, and with this wish it allows ``name``."""
     invite = opened(operator, packed)
     if not isinstance(invite, Invite):
         raise Malformed("the pass does not begin with an invitation")
@@ -249,12 +247,14 @@ def _verify_invitation(operator: bytes, public: bytes, packed: Any, wish: Any, s
         named(wish)
     if not is_proof(invite.public, public, wish, sized(signature, 64)):
         raise Forged("the invitation's signature does not cover this key")
+    if not invite.allows(named(name), wish):
+        raise Forged("the invitation does not allow this name")
     return invite
 
 
 def _verify_chain(operator: bytes, public: bytes, fields: list[Any]) -> Member:
     packed, wish, signature, name, begin, end, admission, packed_grant = fields
-    invite = _verify_invitation(operator, public, packed, wish, signature)
+    invite = _verify_invitation(operator, public, packed, wish, signature, name)
     moment(begin, max(0, invite.not_before - SKEW), invite.not_after)
     moment(end, begin + 1, begin + invite.life)
     grant = _parse_grant(operator, packed_grant)
@@ -262,7 +262,7 @@ def _verify_chain(operator: bytes, public: bytes, fields: list[Any]) -> Member:
     is_over = begin >= grant.not_after and grant.life < YEAR
     if BOOTSTRAP not in grant.roles or begin < grant.not_before - SKEW or is_over:
         raise Forged("the node that admitted this key was not a bootstrap node at that time")
-    content = _admission_content(invite.public, public, named(name), begin, end)
+    content = _admission_content(invite.public, public, name, begin, end)
     if not verified(grant.public, content, sized(admission, 64)):
         raise Forged("the bootstrap node's signature is not valid")
     origin = invite.public, grant.public

@@ -39,7 +39,7 @@ class BackdatingTests(SiegeCase):
         own = Identity(bytes([seed]) * 32)
         came = (own.public, "", proof(self.code.key, own.public, ""))
         thief = self.thief.kept.membership.identity
-        return own, chained(thief, self.grant, (self.packed, self.invite), came, f"dog{seed}", begin)
+        return own, chained(thief, self.grant, (self.packed, self.invite), came, f"dog-{seed}", begin)
 
     def enter(self, own: Identity, shown: bytes, port: int) -> str:
         """The code with which the first node refuses that member; empty where it is let in."""
@@ -57,17 +57,17 @@ class BackdatingTests(SiegeCase):
         for number in (2, 3, 4):
             own, shown_too = self.mint(number, self.invite.not_before)
             self.assertEqual(self.enter(own, shown_too, 700 + number), REVOKED)
-        self.assertIn("dog1", self.team.members())
-        self.assertNotIn("dog2", self.team.members())
+        self.assertIn("dog-1", self.team.members())
+        self.assertNotIn("dog-2", self.team.members())
 
     def test_revoked_with_all(self) -> None:
         """Without a list the members that a bootstrap node let in go with it."""
         own, shown = self.mint(1, int(self.team.wall()))
         self.enter(own, shown, 701)
-        self.assertIn("dog1", self.team.members())
+        self.assertIn("dog-1", self.team.members())
         self.outcome(self.team, self.team.tell(self.team.signer.revoke(self.thief.public, "boot1", self.team.wall())))
         self.team.run(2.0)
-        self.assertNotIn("dog1", self.team.members())
+        self.assertNotIn("dog-1", self.team.members())
 
     def test_more_uses_than_the_code_has(self) -> None:
         """A bootstrap node that lets in more by a code than it is good for finds no room on the list for them."""
@@ -91,7 +91,7 @@ class RoomTests(SiegeCase):
                 for number in range(invite.uses):
                     public = rng.randbytes(32)
                     came = (public, "", proof(invitation.code.key, public, ""))
-                    shown = chained(BOOT, grant, (invitation.invite, invite), came, f"p{number}", NOW)
+                    shown = chained(BOOT, grant, (invitation.invite, invite), came, f"p{code}-{number}", NOW)
                     roll.add(packed_admission(public, shown), NOW)
         self.assertGreater(len(roll.admissions()), 400)
         self.assertLessEqual(len(roll.admissions()), MAX_ENTRIES - RESERVED)

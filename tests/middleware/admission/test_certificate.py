@@ -68,6 +68,15 @@ class CertificateTests(SynchronousTestCase):
         for shown in (made_up, not_allowed, by_itself):
             self.assertRaises(Forged, member_of, OPERATOR.public, DOG.public, shown)
 
+    def test_bootstrap_node_chooses_no_other_name(self) -> None:
+        """A bootstrap node cannot admit a newcomer under a name that its invitation and its wish do not allow."""
+        vaio, grant = identity("vaio"), granted(OPERATOR, "vaio", "bootstrap")
+        for uses, wish, name in ((1, "", "cat"), (2, "rex", "cat"), (2, "", "cat-1")):
+            code, packed, invite = invited(OPERATOR, uses=uses)
+            came = (DOG.public, wish, proof(code.key, DOG.public, wish))
+            shown = chained(vaio, grant, (packed, invite), came, name, NOW)
+            self.assertRaises(Forged, member_of, OPERATOR.public, DOG.public, shown)
+
     def test_admission_needs_a_living_invitation(self) -> None:
         """Nobody is let in by an invitation that had run out, and none for longer than it says."""
         late = admitted(OPERATOR, "dog", now=NOW + int(LATER) + 1)
