@@ -10,7 +10,7 @@ function field({ key, value, about, unit, least, most }) {
   const id = `setting-${++number}`;
   const isTable = typeof value === "object" && value !== null;
   const shown = isTable ? JSON.stringify(value, null, 1) : String(value ?? "");
-  const input = element(isTable ? "textarea" : "input", { id });
+  const input = element(isTable ? "textarea" : "input", { id, name: key });
   if (isTable) input.rows = Math.min(8, shown.split("\n").length);
   if (typeof value === "number") Object.assign(input, { type: "number", step: "any", min: least ?? "", max: most ?? "", required: true });
   else if (!isTable && most) input.maxLength = most;
