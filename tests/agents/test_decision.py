@@ -111,7 +111,7 @@ class DecisionTests(SynchronousTestCase):
         self.assertEqual(decided(member("a", 1.02, EXECUTING), member("b", 1.0, EXECUTING)).assigned, "b")
         self.assertEqual(decided(member("b", 1.0, EXECUTING), member("a", 1.0, EXECUTING)).assigned, "a")
 
-    @settings(max_examples=150)
+    @settings(max_examples=60)
     @given(REPORTS, st.floats(0.0, 20.0), st.randoms(use_true_random=False))
     def test_order_of_members_does_not_matter(
         self, entries: list[tuple[int, float | None, str]], since: float, rng: object
@@ -122,7 +122,7 @@ class DecisionTests(SynchronousTestCase):
         rng.shuffle(shuffled)  # type: ignore[attr-defined]
         self.assertEqual(decided(*members, since=since), decided(*shuffled, since=since))
 
-    @settings(max_examples=150)
+    @settings(max_examples=60)
     @given(REPORTS)
     def test_assigned_agent_has_reported_and_is_good_enough(self, entries: list[tuple[int, float | None, str]]) -> None:
         """After the waiting period one is assigned when anybody reported; nobody else beats it by the hysteresis."""

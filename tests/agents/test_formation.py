@@ -21,7 +21,7 @@ def apart(one: float, other: float) -> float:
 
 
 class PostTests(SynchronousTestCase):
-    @settings(max_examples=150)
+    @settings(max_examples=80)
     @given(ANGLES, st.randoms(use_true_random=False))
     def test_even_and_the_same_for_all(self, angles: list[float], rng: Any) -> None:
         """Posts lie evenly around the target, and every robot computes the same whatever the order of the reports."""
@@ -33,7 +33,7 @@ class PostTests(SynchronousTestCase):
         for one, other in zip(around, around[1:], strict=False):
             self.assertAlmostEqual(other - one, math.tau / len(angles), 6)
 
-    @settings(max_examples=150)
+    @settings(max_examples=80)
     @given(ANGLES)
     def test_no_way_crosses_another(self, angles: list[float]) -> None:
         """The robots stand at their posts in the order in which they stood, and who is to act stays."""

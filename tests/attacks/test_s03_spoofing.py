@@ -20,7 +20,7 @@ from middleware.entangled.wire.message import Answer, Failure, Question, encoded
 from middleware.entangled.wire.session import DATA, INIT, RESP, derived_key
 from tests.fuzz.ground import STRANGER, TEAM, Ground
 
-SEQUENCES = settings(max_examples=100, stateful_step_count=25)
+SEQUENCES = settings(max_examples=40, stateful_step_count=25)
 KINDS = (INIT, RESP, DATA, WHO, HERE, 0x16, 0x17, 0x18, HAIL, ECHO, 0x03, 0x00, 0xFF)
 PLACES = (STRANGER, Address("10.0.0.2", 2), Address("10.0.0.1", 1), Address("::1", 9), Address("~" + "0" * 40, 1))
 

@@ -22,7 +22,7 @@ TARGETS: dict[str, tuple[Callable[[bytes], None], int]] = {
     "paper": (paper.check, 3000),
     "carried": (carried.check, 600),
 }
-BOUNDED = settings(max_examples=300)
+BOUNDED = settings(max_examples=120)
 SLOWEST_S = 0.25
 """For one input: the promise is a millisecond on a quiet machine; this is for a busy one, with the checks around."""
 

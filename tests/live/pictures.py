@@ -1,13 +1,17 @@
-"""Pictures: ``python -m tests.live.pictures`` takes those of the page in docs/images anew, from a real demonstration.
+"""Take the pictures of the page in docs/images from a real demonstration.
 
-Without a mouse, as nobody's would be in the picture.  A picture is kept with at most 256 colours, so that it is small.
+``python -m tests.live.pictures`` takes all, with names of scenes only those.  The pictures show no mouse pointer, and
+have at most 256 colours, so that the files are small.
 """
 
 from __future__ import annotations
 
+import os
+import signal
 import struct
 import sys
 import tempfile
+import time
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -16,6 +20,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from benchmarks.demo import family
 from tests.live.demonstration import Demonstration
 from tests.live.page import CHROMIUM, DESK, FLAGS, MISSING, PHONE, TABLET, VIEWS, Team
 
@@ -26,6 +31,8 @@ GREY = 200
 COLOURS = 224
 SAMPLED = 20_000
 PATIENCE_MS = 60_000
+FILM_SIZE = (960, 600)
+FILM_QUALITY = 60
 Picture = np.ndarray[Any, np.dtype[np.uint8]]
 
 
@@ -192,6 +199,33 @@ def lost(photographer: Photographer, demo: Demonstration) -> None:
         page.context.close()
 
 
+def takeover(photographer: Photographer, demo: Demonstration) -> None:
+    """Film a takeover: the node of the dog on its way is killed, and another dog gets the task."""
+    desk = photographer.opened(DESK)
+    frames: list[Picture] = []
+    times: list[float] = []
+
+    def film(seconds: float) -> None:
+        end = time.monotonic() + seconds
+        while (now := time.monotonic()) < end:
+            times.append(now)
+            frames.append(cv2.resize(photographer.seen(desk), FILM_SIZE, interpolation=cv2.INTER_AREA))  # type: ignore[arg-type]
+
+    name = photographer.executing(desk)
+    film(2.0)
+    os.kill(next(pid for pid, each in family(demo.pid).items() if each == name), signal.SIGKILL)
+    film(7.0)
+    animation = cv2.Animation()
+    animation.frames = frames
+    ends = [*times[1:], times[-1] + 3.0]
+    animation.durations = [round(1000 * (end - begin)) for begin, end in zip(times, ends, strict=True)]
+    path = IMAGES / "takeover.webp"
+    cv2.imwriteanimation(str(path), animation, [cv2.IMWRITE_WEBP_QUALITY, FILM_QUALITY])
+    sys.stdout.write(f"{path.name} {path.stat().st_size // 1000} kB, {len(frames)} frames\n")
+    photographer.finished(desk)
+    desk.context.close()
+
+
 def opened(photographer: Photographer, demo: Demonstration) -> None:
     """A device's dialog."""
     (uuid,) = [device["uuid"] for device in demo.api("devices") if device["name"] == "dog2"]
@@ -249,6 +283,7 @@ def main(wanted: list[str]) -> int:
                 "quiet": lambda: quiet(photographer, demo),
                 "running": lambda: running(photographer),
                 "lost": lambda: lost(photographer, demo),
+                "takeover": lambda: takeover(photographer, demo),
                 "opened": lambda: opened(photographer, demo),
                 "stopped": lambda: stopped(photographer),
                 "outdoors": lambda: outdoors(browser),

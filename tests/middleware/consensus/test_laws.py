@@ -37,7 +37,7 @@ class LawTests(SynchronousTestCase):
     def hold(self, name: str) -> None:
         """All laws, for one strategy."""
 
-        @settings(max_examples=150)
+        @settings(max_examples=60)
         @given(views, views, views, st.randoms(use_true_random=False))
         def laws(a: list[Report], b: list[Report], c: list[Report], dice: random.Random) -> None:
             strategy = strategy_for(name)
