@@ -202,7 +202,11 @@ class BrowserCase(SynchronousTestCase):
         return browser
 
     def tab(self, screen: dict[str, Any], scheme: Any = "light", **more: Any) -> Any:
-        """An empty page on that screen, in a session of its own."""
+        """Return an empty page on that screen, in a session of its own.
+
+        Its service worker, which loads every file again, is blocked unless ``service_workers="allow"`` is given.
+        """
+        more = {"service_workers": "block", **more}
         context = self.browser.new_context(**screen, color_scheme=scheme, reduced_motion="reduce", **more)
         self.addCleanup(context.close)
         page = context.new_page()

@@ -29,7 +29,7 @@ class FallbackTests(BrowserCase):
             self.addCleanup(web.end)
             web.order(f"name {name}")
             web.order(f"pages {' '.join(pages)}")
-        self.page = self.tab(DESK)
+        self.page = self.tab(DESK, service_workers="allow")
 
     def tearDown(self) -> None:
         self.assertEqual(self.faults, [])
