@@ -283,10 +283,11 @@ def main(wanted: list[str]) -> int:
                 "quiet": lambda: quiet(photographer, demo),
                 "running": lambda: running(photographer),
                 "lost": lambda: lost(photographer, demo),
-                "takeover": lambda: takeover(photographer, demo),
                 "opened": lambda: opened(photographer, demo),
                 "stopped": lambda: stopped(photographer),
                 "outdoors": lambda: outdoors(browser),
+                # It ends a node of the demonstration for good.
+                "takeover": lambda: takeover(photographer, demo),
             }
             for name, scene in scenes.items():
                 if not wanted or name in wanted:
