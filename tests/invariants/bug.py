@@ -301,7 +301,7 @@ _BUGS: dict[tuple[str, ...], dict[str, list[tuple[Any, str, Any]]]] = {
         "the device takes lower tokens": [(Gate, "admit", _admits_lower_tokens)],
         "a restarted member grants at once": [(Acceptor, "_silence", lambda self, ttl: 0.0)],
         "the new council decides the change": [
-            (Council, "_accept_change", _decided_by_the_new),
+            (Council, "_decision", _decided_by_the_new),
             (charter, "_is_majority", lambda members, signed: True),
         ],
     },

@@ -7,7 +7,7 @@ from twisted.trial.unittest import SynchronousTestCase
 from sim.team.files import DiskFleet
 from sim.team.schedule import Schedule
 from sim.team.shrink import Trim
-from tests.invariants.bug import FINDERS
+from tests.invariants.bug import FINDERS, seeded
 from tests.invariants.leases import Leases
 from tests.invariants.records import Records
 from tests.invariants.run import WORKLOADS, least, line, run, run_all
@@ -57,6 +57,12 @@ class InvariantTests(SynchronousTestCase):
         self.assertEqual({outcome.seed: outcome.found for outcome in outcomes if outcome.found}, {})
         self.assertGreater(len({outcome.digest for outcome in outcomes}), 13)
         self.assertEqual(outcomes[0], run(7001, ("tasks",)))
+
+    def test_bugs_have_their_places(self) -> None:
+        """Every seeded bug replaces something that the library has."""
+        for bug in FINDERS:
+            with self.subTest(bug=bug), seeded(bug):
+                pass
 
     def test_bugs_are_found(self) -> None:
         """A bug that is put in breaks an invariant of the workload that looks for it."""
