@@ -81,6 +81,7 @@ demo: $(RUNTIME)
 # at a lower priority, and print their results at the end.
 test: $(DEV)
 	@mkdir -p build; nice -n 10 $(PY) -m twisted.trial -j$(JOBS) $(UNIT) >build/unit.log 2>&1 & unit=$$!; \
+	trap 'trap - TERM; kill 0' INT TERM; \
 	$(PY) -m twisted.trial -j$(JOBS) tests.live; live=$$?; \
 	wait $$unit; unit=$$?; cat build/unit.log; exit $$((live | unit))
 
