@@ -5,6 +5,7 @@ No device is opened, and no network is accessed.
 
 from __future__ import annotations
 
+import errno
 import glob
 import os
 from collections.abc import Callable, Iterable
@@ -14,6 +15,7 @@ from importlib.util import find_spec
 
 from drivers.errors import UsageError
 from drivers.registry import built_in_kinds, kinds, maker, manifest_of, places
+from drivers.serial import PROBLEMS
 
 PATTERNS = ("/dev/ttyUSB*", "/dev/ttyACM*", "/dev/cu.usb*")
 
@@ -108,7 +110,7 @@ def candidate_lines(found: list[Candidate]) -> list[str]:
     for each in found:
         lines.append(f"{each.device}  {each.about}".rstrip())
         if not each.is_allowed:
-            lines.append("  no permission; add this user to the device's group (often dialout), and sign in again")
+            lines.append(f"  {PROBLEMS[errno.EACCES]}")
         lines += [f"  swarm driver probe --kind {kind} --option port={each.device}" for kind in cable_kinds()]
     return lines
 
