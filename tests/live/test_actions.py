@@ -163,7 +163,7 @@ class ActionPageTests(PageCase):
         self.assertEqual(answer.inner_text(), "No changes to save.")
         page.locator("[name=capabilities]").fill("{arm")
         page.get_by_role("button", name="Save settings").tap()
-        self.assertIn("capabilities", answer.inner_text())
+        self.assertIn("capabilities: not a table", answer.inner_text())
         page.locator("[name=presence_lease]").fill("99")
         page.get_by_role("button", name="Save settings").tap()
         self.assertFalse(page.locator("[name=presence_lease]").evaluate("e => e.checkValidity()"))

@@ -56,7 +56,7 @@ class BadInputTests(NodeCase):
         ):
             path = self.file(text)
             line = self.refused("--config", path)
-            self.assert_says(line, path, key, "192.0.2.1", "address of this machine")
+            self.assert_says(line, path, key, "192.0.2.1", "set host to an address of this machine")
             self.assertNotIn("choose another", line)
 
 

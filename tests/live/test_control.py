@@ -56,7 +56,7 @@ class ControlTests(NodeCase):
             )
             self.said("deploy", "push", str(module), "--name", "mine", "--kind", "strategy")
             self.shows(f"  a  {number} ")
-        self.said("deploy", "rollback", "mine")
+        self.assertIn("rolled back from version 2", self.said("deploy", "rollback", "mine"))
         self.shows("  a  1 ")
         node.kill()
         self.joined("--config", settings)

@@ -224,7 +224,7 @@ class UdpNetwork:
 def _port_in_use(host: str, port: int, error: Any) -> PortInUse:
     reason = getattr(error, "strerror", None) or error
     is_foreign = getattr(error, "errno", None) == errno.EADDRNOTAVAIL
-    remedy = "give host an address of this machine" if is_foreign else "choose another port, or 0 for any"
+    remedy = "set host to an address of this machine" if is_foreign else "choose another port, or 0 for any"
     return PortInUse(f"UDP {host}:{port}: {reason}; {remedy}")
 
 
