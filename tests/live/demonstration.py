@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import ssl
 import subprocess
 import sys
@@ -13,6 +15,7 @@ from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
+from benchmarks.demo import family
 from tests.live.page import BrowserCase
 
 PATIENCE_MS = 120_000
@@ -72,6 +75,12 @@ class Demonstration:
         asked = urllib.request.Request(f"{self.url}api/v1/{path}", data, headers)
         with urllib.request.urlopen(asked, timeout=20, context=self._trust) as answer:
             return json.load(answer)
+
+    def send_signal(self, name: str, how: signal.Signals) -> int:
+        """Send a signal to the process of the node ``name``; return its process id."""
+        pid = next(pid for pid, each in family(self.pid).items() if each == name)
+        os.kill(pid, how)
+        return pid
 
     def stop(self) -> None:
         """End it, and wait until all its processes are gone."""

@@ -216,6 +216,11 @@ class BrowserCase(SynchronousTestCase):
         page.on("pageerror", lambda error: self.faults.append(str(error)))
         return page
 
+    def wait_for_node(self, page: Any, name: str) -> None:
+        """Wait until the page is live at the web node ``name``."""
+        page.locator("#node", has_text=name).wait_for()
+        page.locator("#link[data-link=live]").wait_for()
+
     def live(self, page: Any, devices: int = 3) -> Any:
         """The page, when it shows so many devices of the team."""
         page.locator("#link[data-link=live]").wait_for()

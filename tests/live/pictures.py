@@ -6,7 +6,6 @@ have at most 256 colours, so that the files are small.
 
 from __future__ import annotations
 
-import os
 import signal
 import struct
 import sys
@@ -20,7 +19,6 @@ from typing import Any
 import cv2
 import numpy as np
 
-from benchmarks.demo import family
 from tests.live.demonstration import Demonstration
 from tests.live.page import CHROMIUM, DESK, FLAGS, MISSING, PHONE, TABLET, VIEWS, Team
 
@@ -213,7 +211,7 @@ def takeover(photographer: Photographer, demo: Demonstration) -> None:
 
     name = photographer.executing(desk)
     film(2.0)
-    os.kill(next(pid for pid, each in family(demo.pid).items() if each == name), signal.SIGKILL)
+    demo.send_signal(name, signal.SIGKILL)
     film(7.0)
     animation = cv2.Animation()
     animation.frames = frames

@@ -6,7 +6,6 @@ import os
 import signal
 from typing import Any
 
-from benchmarks.demo import family
 from tests.live.demonstration import DemonstrationPageCase
 from tests.live.page import DESK, BrowserCase, Team
 
@@ -37,8 +36,7 @@ class FallbackTests(BrowserCase):
     def served(self, name: str, page: Any = None) -> None:
         """Wait until the page is served by ``name``, live, with its three cameras."""
         page = page or self.page
-        page.locator("#node", has_text=name).wait_for()
-        page.locator("#link[data-link=live]").wait_for()
+        self.wait_for_node(page, name)
         page.locator(CAMERAS).nth(2).wait_for()
 
     def opened(self) -> None:
@@ -52,8 +50,7 @@ class FallbackTests(BrowserCase):
     def lose(self, how: signal.Signals) -> None:
         """Send the serving node the signal, and wait until the page is live at the other node."""
         os.kill(self.pid(0), how)
-        self.page.locator("#node", has_text="pi").wait_for()
-        self.page.locator("#link[data-link=live]").wait_for()
+        self.wait_for_node(self.page, "pi")
 
     def test_go_on_after_a_crash(self) -> None:
         """SIGKILL: the page is live at the other node, in the same view, and sends its orders there."""
@@ -76,8 +73,7 @@ class FallbackTests(BrowserCase):
         self.opened()
         os.kill(self.pid(0), signal.SIGSTOP)
         self.page.get_by_role("button", name="Run Demo").click()
-        self.page.locator("#node", has_text="pi").wait_for()
-        self.page.locator("#link[data-link=live]").wait_for()
+        self.wait_for_node(self.page, "pi")
         self.page.locator("#line", has_text="The demo runs").wait_for()
         self.served("pi")
 
@@ -156,16 +152,6 @@ class DemonstrationFallbackTests(DemonstrationPageCase):
 
     options = ("--web-port", "0")
 
-    def strike(self, name: str, how: signal.Signals) -> int:
-        pid = next(pid for pid, each in family(self.demo.pid).items() if each == name)
-        os.kill(pid, how)
-        return pid
-
-    def goes_on(self, page: Any, name: str) -> None:
-        """Wait until the page is live at that web node."""
-        page.locator("#node", has_text=name).wait_for()
-        page.locator("#link[data-link=live]").wait_for()
-
     def test_experiment_2_and_the_web_node(self) -> None:
         """The dog on its way is killed and the page's node frozen: page and task go on; then the other one crashes."""
         page = self.opened(DESK)
@@ -174,9 +160,9 @@ class DemonstrationFallbackTests(DemonstrationPageCase):
         going = page.locator(".device[data-state=EXECUTING] b")
         going.wait_for()
         dog = going.inner_text()
-        self.strike(dog, signal.SIGKILL)
-        frozen = self.strike("vaio", signal.SIGSTOP)
-        self.goes_on(page, "pi")
+        self.demo.send_signal(dog, signal.SIGKILL)
+        frozen = self.demo.send_signal("vaio", signal.SIGSTOP)
+        self.wait_for_node(page, "pi")
         page.locator("#tasks li", has_text="completed").wait_for()
         done = page.locator("#tasks li").first.inner_text()
         self.assertIn("Done by dog", done)
@@ -184,6 +170,6 @@ class DemonstrationFallbackTests(DemonstrationPageCase):
         page.locator(CAMERAS).first.wait_for()
         os.kill(frozen, signal.SIGCONT)
         page.locator("#reserve", has_text="vaio").wait_for()
-        self.strike("pi", signal.SIGKILL)
-        self.goes_on(page, "vaio")
+        self.demo.send_signal("pi", signal.SIGKILL)
+        self.wait_for_node(page, "vaio")
         page.locator(CAMERAS).first.wait_for()

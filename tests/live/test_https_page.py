@@ -35,7 +35,6 @@ class HttpsPageTests(BrowserCase, NodeCase):
         told = json.loads(asked(f"{first.plain}/api/v1/node"))["pages"]
         self.assertEqual({each["url"] for each in told}, {first.plain, first.secure, second.plain, second.secure})
         first.process.send_signal(signal.SIGKILL)
-        page.locator("#node", has_text="pi").wait_for()
-        page.locator("#link[data-link=live]").wait_for()
+        self.wait_for_node(page, "pi")
         self.assertTrue(any(url.startswith(f"{second.secure}/events") for url in wanted))
         self.assertEqual([url for url in wanted if url.startswith("http:")], [])

@@ -6,7 +6,6 @@ The demonstration's page is asked over https, as a phone has to, where the libra
 from __future__ import annotations
 
 import json
-import os
 import signal
 import urllib.error
 import urllib.request
@@ -14,7 +13,6 @@ from collections.abc import Callable
 from importlib.util import find_spec
 from typing import Any
 
-from benchmarks.demo import family
 from tests.live.demonstration import DemonstrationCase
 from tests.live.page import DESK, PHONE, TABLET, BrowserCase, TeamCase, pin
 from tests.live.until import until
@@ -192,7 +190,7 @@ class DemonstrationPhoneTests(BrowserCase, DemonstrationCase):
     def lose_web_node(self, page: Any) -> None:
         """Kill the node that the phone takes part at; it goes on at the other as the same device."""
         before = self.devices()["anna"]
-        os.kill(next(pid for pid, name in family(self.demo.pid).items() if name == "vaio"), signal.SIGKILL)
+        self.demo.send_signal("vaio", signal.SIGKILL)
         page.locator("#node", has_text="pi").wait_for()
         self.demo.sign_in(page.evaluate("import('/static/link.js').then(({ base }) => base())") + "/")
         self.until(lambda: self.devices().get("anna", before)["address"] != before["address"], page=page)
