@@ -1,4 +1,4 @@
-"""Gate: a door for tests; what it lets in and allows is written down by the test."""
+"""An admission check for tests that records each peer that it checks."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ ROOM = 640
 
 
 class Gate(OpenDoor):
-    """Lets in who shows a pass that begins with ``pass``, unless its key is among ``refused``.
+    """Admit a peer if its certificate begins with ``pass`` and its key is not in ``refused``.
 
-    ``forbidden`` are pairs of a public key and a method, ``unwritable`` pairs of a public key and a slot's name.
+    ``forbidden`` contains pairs of a public key and a method, ``unwritable`` pairs of a public key and the name of a
+    slot.
     """
 
     fingerprint = b"the team"
@@ -42,7 +43,7 @@ class Gate(OpenDoor):
         return self.may_store(slot)
 
     def authority(self, owner: bytes) -> Authority:
-        """As ``judge`` says of who shows a good pass."""
+        """Return the result of ``judge`` for this owner with a valid certificate."""
         return Authority(self.refused.get(owner, ""))
 
     def certificate(self, owner: bytes) -> bytes:

@@ -1,4 +1,4 @@
-"""Tests of the work that nobody waits for."""
+"""Tests of background work."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class BackgroundTests(SynchronousTestCase):
         self.runs: list[object] = []
 
     def test_later_and_cancel(self) -> None:
-        """What is put off runs once with its arguments, unless it is prevented; to prevent it late is harmless."""
+        """A delayed call runs once with its arguments unless it is cancelled; a late cancel has no effect."""
         prevent = self.chores.later(1.0, self.runs.append, "a")
         self.chores.later(1.0, self.runs.append, "b")()
         self.clock.advance(2.0)
@@ -29,7 +29,7 @@ class BackgroundTests(SynchronousTestCase):
         self.assertEqual(self.runs, ["a"])
 
     def test_every_survives_an_accident(self) -> None:
-        """A chore that fails once is done again the next time."""
+        """A periodic call that raises an error runs again at the next interval."""
 
         def work() -> None:
             self.runs.append(1)
@@ -42,7 +42,7 @@ class BackgroundTests(SynchronousTestCase):
         self.assertEqual(len(self.runs), 3)
 
     def test_stop_leaves_nothing(self) -> None:
-        """A sleeper is woken in time; after the stop no timer is left, nothing new begins, and no sleeper is woken."""
+        """``sleep`` ends on time; after ``stop`` no timer is left, no new call is scheduled and no sleep ends."""
         self.chores.every(2.0, lambda: self.runs.append(1))
         sleep = self.chores.sleep(1.0)
         self.clock.advance(0.9)
@@ -59,7 +59,7 @@ class BackgroundTests(SynchronousTestCase):
         self.assertEqual(self.runs, [])
 
     def test_fork_hears_only_accidents(self) -> None:
-        """The weather and a refusal end work quietly, anything else is logged."""
+        """``fork`` ignores network errors and rejections, and logs any other error."""
         for error in (NoAnswer("x"), Refused("x"), ZeroDivisionError()):
             self.chores.fork(wait(fail(error)))
         self.assertEqual(len(self.flushLoggedErrors()), 1)
@@ -73,7 +73,7 @@ class FirstTests(SynchronousTestCase):
         return Deferred.fromCoroutine(first(needed, [wait(d) for d in self.asked]))
 
     def test_enough(self) -> None:
-        """As many as are needed settle it, in the order in which they came; what comes later changes nothing."""
+        """``first`` returns the needed number of results in the order of arrival and ignores later results."""
         result = self.begin(2)
         self.asked[2].callback(2)
         self.assertNoResult(result)
@@ -83,7 +83,7 @@ class FirstTests(SynchronousTestCase):
         self.assertEqual(results, [2, 0])
 
     def test_too_few(self) -> None:
-        """Where too many fail, those that succeeded are the result; nothing needed, or to do, is settled at once."""
+        """If too many calls fail, ``first`` returns the successful results; without calls it returns at once."""
         result = self.begin(3)
         self.asked[0].errback(NoAnswer("x"))
         self.asked[1].callback(1)

@@ -1,4 +1,4 @@
-"""Tests of the copies that a node holds beside its records: on the path of lookups, and of what it watches."""
+"""Tests of the cached copies that a node holds in addition to its records: on lookup paths and for its watches."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from middleware.entangled.replication.keepsake import Keepsakes
 
 
 def copied(key: bytes, size: int = 1) -> list[Record]:
-    """One record of ``key``; copies do not look at signatures."""
+    """Return one record of ``key``; the cache does not verify signatures."""
     return [Record(key, "a", bytes(32), 1, "team", 60.0, bytes(size), bytes(64))]
 
 
@@ -23,21 +23,21 @@ class PathCacheTests(SynchronousTestCase):
         self.key = hashed_key("a")
 
     def test_a_copy_runs_out(self) -> None:
-        """A copy is there for its time, at most for the longest that any may have."""
+        """A copy expires after its TTL, which is at most ``MAX_AGE``."""
         for ttl, lives in ((5.0, 5.0), (1e9, MAX_AGE)):
             self.cache.put(self.key, copied(self.key), ttl, 0.0)
             self.assertEqual(self.cache.get(self.key, lives - 0.1), copied(self.key))
             self.assertIsNone(self.cache.get(self.key, lives))
 
     def test_what_is_not_kept(self) -> None:
-        """A copy that has no time left, or none that is a number, or is too large, is not kept, nor the one before."""
+        """A copy without a positive finite TTL or over the size limit is not stored and removes the previous copy."""
         for ttl, size in ((0.0, 1), (-1.0, 1), (float("nan"), 1), (9.0, MAX_BYTES)):
             self.cache.put(self.key, copied(self.key), 9.0, 0.0)
             self.cache.put(self.key, copied(self.key, size), ttl, 0.0)
             self.assertIsNone(self.cache.get(self.key, 0.0))
 
     def test_keys_are_bounded(self) -> None:
-        """There is an end to keys, and what was not read for longest goes first."""
+        """The number of keys is bounded; the least recently read key is evicted first."""
         keys = [hashed_key(str(number)) for number in range(MAX_KEYS + 1)]
         for key in keys[:-1]:
             self.cache.put(key, copied(key), 9.0, 0.0)
@@ -46,7 +46,7 @@ class PathCacheTests(SynchronousTestCase):
         self.assertEqual(self.held(keys[:3]), [0, 2])
 
     def test_bytes_are_counted(self) -> None:
-        """Copies fill the cache to the byte; beyond, the least recently read one goes, and what goes frees its room."""
+        """The cache is limited in bytes: it evicts the least recently read copy, and a removed copy frees its bytes."""
         half = MAX_BYTES // 2 - copied(self.key, 0)[0].message_bytes
         keys = [hashed_key(str(number)) for number in range(4)]
         for key in (keys[0], keys[1], keys[1]):
@@ -65,7 +65,7 @@ class PathCacheTests(SynchronousTestCase):
         self.assertIsNotNone(self.cache.get(self.key, 9.0))
 
     def held(self, keys: list[bytes]) -> list[int]:
-        """Which of ``keys`` have a copy, by number; each of these is then read, in that order."""
+        """Return the numbers of the cached ``keys``, and read each in order."""
         return [number for number, key in enumerate(keys) if self.cache.get(key, 0.0) is not None]
 
 
@@ -74,12 +74,12 @@ KEY = hashed_key("devices")
 
 
 def record(name: str, sequence: int = 1) -> Record:
-    """A lease; nobody looks at its signature here."""
+    """Return a leased record with an unchecked signature."""
     return Record(KEY, name, DOG.public, sequence, "leased", 1.0, b"v", bytes(64))
 
 
 class ClosedStore(MemoryStore):
-    """A store that its owner has closed already."""
+    """A store that is already closed."""
 
     def discard(self, slot: Slot) -> bool:
         raise NotRunning("closed")
@@ -91,7 +91,7 @@ class KeepsakeTests(SynchronousTestCase):
         self.copies = Keepsakes(self.store)
 
     def test_what_is_held_is_left_alone(self) -> None:
-        """A slot that the node holds as a replica is neither copied nor let go of."""
+        """A slot that the node holds as a replica is neither copied nor released."""
         self.store.put(record("a"), 5.0)
         self.copies.keep(KEY, [record("a", 2)], 0.0)
         self.copies.keep(KEY, [], 0.0)
@@ -100,7 +100,7 @@ class KeepsakeTests(SynchronousTestCase):
         self.assertEqual(self.store.expire(5.0), [record("a")])
 
     def test_full_store(self) -> None:
-        """Where there is no room for copies there are fewer; what is held for others stays."""
+        """A full store limits the number of copies; the records of a replica are kept."""
         self.store.put(record("z"), 5.0)
         self.copies.keep(KEY, [record(name) for name in "abc"], 0.0)
         self.assertEqual([r.name for r in self.store.get(KEY)], ["a", "b", "z"])
@@ -108,7 +108,7 @@ class KeepsakeTests(SynchronousTestCase):
         self.assertEqual([r.name for r in self.store.get(KEY)], ["z"])
 
     def test_closed_store(self) -> None:
-        """A store that is closed already does not stand in the way of a stop."""
+        """A closed store raises no error while the copies are cleared."""
         copies = Keepsakes(ClosedStore())
         copies.keep(KEY, [record("a")], 0.0)
         copies.clear()

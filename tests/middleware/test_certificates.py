@@ -1,4 +1,4 @@
-"""Tests of ``middleware.entangled.replication.certificates``: whose certificates are asked for, and of which peers."""
+"""Tests of ``middleware.entangled.replication.certificates``, which requests the certificates of unknown owners."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from middleware.entangled.wire.door import FOREIGN, Authority, OpenDoor
 
 
 class KnownDoor(OpenDoor):
-    """Knows the owners whose certificates it learned; a certificate that holds is the owner's key itself."""
+    """An admission check that accepts learned owners; in these tests a valid certificate equals the owner's key."""
 
     def __init__(self) -> None:
         self.known: set[bytes] = set()
@@ -51,7 +51,7 @@ class Endpoint:
 
 
 def made() -> Any:
-    """An endpoint, as far as it is needed."""
+    """Return the endpoint stub."""
     return Endpoint()
 
 
@@ -74,7 +74,7 @@ class CertificateTests(SynchronousTestCase):
         self.successResultOf(Deferred.fromCoroutine(self.certificates.learn(contact(peer), which)))
 
     def test_asked_once_for_each(self) -> None:
-        """Only unknown owners are asked for, each once, a few in one question."""
+        """Each unknown owner is requested once, several in one request."""
         self.door.known.update(owners(3))
         self.learn(owners(20) * 2)
         self.assertEqual(self.endpoint.asked, [owners(20)[3 : 3 + MAX_OWNERS], owners(20)[3 + MAX_OWNERS :]])
@@ -82,7 +82,7 @@ class CertificateTests(SynchronousTestCase):
         self.assertEqual(len(self.endpoint.asked), 2)
 
     def test_a_peer_that_cannot_show_one(self) -> None:
-        """After junk, silence or nothing a peer is left alone for a while; another one is asked all the same."""
+        """After an invalid, empty or missing reply a peer is not queried for a time; other peers still are."""
         junk: list[Any] = [
             lambda asked: fail(NoAnswer("silent")),
             lambda asked: succeed(None),
@@ -103,20 +103,20 @@ class CertificateTests(SynchronousTestCase):
         self.assertEqual(self.door.known, set(owners(2)))
 
     def test_only_those_that_were_asked_for(self) -> None:
-        """What a peer shows counts for the owner that was asked for, and the ones before a bad one are kept."""
+        """A certificate counts only for the requested owner; certificates before the first invalid one are kept."""
         self.endpoint.answer = lambda asked: succeed([asked[0], b"", *asked[2:]])
         self.learn(owners(3))
         self.assertEqual(self.door.known, {owners(3)[0]})
 
     def test_bounded(self) -> None:
-        """However many peers show junk, no more than so many are remembered."""
+        """The table of peers that replied with invalid certificates is bounded."""
         self.endpoint.answer = lambda asked: succeed(None)
         for peer in range(MAX_UNASKED + 10):
             self.learn(owners(1), peer)
         self.assertEqual(len(self.certificates._unasked), MAX_UNASKED)
 
     def test_answer(self) -> None:
-        """A node shows the certificates that it knows, of a few owners, and nothing for what is no key."""
+        """A node returns known certificates for up to ``MAX_OWNERS`` owners, and an empty entry for an invalid key."""
         self.door.known.update(owners(2))
         answer = self.endpoint.exposed(contact(1), [*owners(3), b"short", 7])
         self.assertEqual(answer, [*owners(2), b"", b"", b""])

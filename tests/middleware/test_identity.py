@@ -1,4 +1,4 @@
-"""The lasting key pair of a node."""
+"""Tests of the permanent key pair of a node."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ CAT = Identity(b"\2" * 32)
 
 class IdentityTest(SynchronousTestCase):
     def test_published_vector(self) -> None:
-        """A seed makes the public key and the signature that RFC 8032 (section 7.1, test 2) gives for it."""
+        """A seed yields the public key and the signature of RFC 8032 (section 7.1, test 2)."""
         seed = bytes.fromhex("4ccd089b28ff96da9db6c346ec114e0f5b8a319f35aba624da8cf6ed4fb8a6fb")
         public = "3d4017c3e843895a92b70aa74d1b7ebc9c982ccf2ec4968cc0cd55f12af4660c"
         signature = (
@@ -25,13 +25,13 @@ class IdentityTest(SynchronousTestCase):
         self.assertEqual(identity.sign(b"\x72").hex(), signature)
 
     def test_id_follows_from_the_key(self) -> None:
-        """The id is the 160-bit hash of the public key, so nobody chooses or borrows one."""
+        """The node id is the 160-bit hash of the public key; a node cannot choose it or use another node's id."""
         self.assertEqual(DOG.node_id, node_id(DOG.public))
         self.assertEqual(len(DOG.node_id), ID_BYTES)
         self.assertNotEqual(DOG.node_id, CAT.node_id)
 
     def test_signatures(self) -> None:
-        """A signature stands for one message of one node; anything else is refused, whatever its length."""
+        """A signature is valid for one message of one node; other input of any length is rejected."""
         signature = DOG.sign(b"sit")
         self.assertTrue(verified(DOG.public, b"sit", signature))
         self.assertFalse(verified(DOG.public, b"run", signature))
@@ -41,17 +41,17 @@ class IdentityTest(SynchronousTestCase):
         self.assertFalse(verified(b"short", b"sit", signature))
 
     def test_both_ends_of_an_exchange_agree(self) -> None:
-        """The exchange keys of two nodes make one shared secret, whichever of them makes it."""
+        """The exchange keys of two nodes yield the same shared secret at both nodes."""
         here = bindings.crypto_scalarmult(DOG.exchange_secret, exchange_key(CAT.public))
         there = bindings.crypto_scalarmult(CAT.exchange_secret, exchange_key(DOG.public))
         self.assertEqual(here, there)
 
     def test_no_key(self) -> None:
-        """Bytes that are no public key have no exchange key, and say so by ``ValueError``."""
+        """``exchange_key`` raises ``ValueError`` for bytes that are not a valid public key."""
         for public in (b"", bytes(32), b"\xff" * 32, b"\1" * 31):
             self.assertRaises(ValueError, exchange_key, public)
 
     def test_secrets_are_not_shown(self) -> None:
-        """The text of an identity, as it may reach a log, holds neither seed nor secrets."""
+        """The ``repr`` of an identity, which may be logged, contains neither the seed nor the secrets."""
         for secret in (DOG.seed, DOG.exchange_secret):
             self.assertNotIn(repr(secret), repr(DOG))

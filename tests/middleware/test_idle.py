@@ -1,4 +1,4 @@
-"""Tests of what a node does while nothing happens: what need not be looked at is not looked at."""
+"""Tests that an idle node does no periodic work for empty tables."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ OWNER = Identity(bytes([7]) * 32)
 
 
 def record(name: str, ttl: float) -> Record:
-    """A record that lives for so many seconds."""
+    """Return a record with this TTL in seconds."""
     return Record(KEY, name, OWNER.public, 1, "team", ttl, b"x").signed(OWNER)
 
 
 class IdleTests(FleetCase):
     def looks(self, fleet: Fleet) -> list[float]:
-        """The moments at which the first node looks from now on for what ran out."""
+        """Return a list that receives the time of each later expiry sweep of the first node."""
         moments: list[float] = []
         store = fleet.nodes[0].store
         expire = store.expire
@@ -32,7 +32,7 @@ class IdleTests(FleetCase):
         return moments
 
     def test_an_empty_store_is_not_swept(self) -> None:
-        """Where nothing is held hardly anything is done; what is taken in then goes in time, at a multiple of 0.1 s."""
+        """An empty store is not swept; stored records expire on time, and each sweep is at a multiple of 0.1 s."""
         fleet = self.fleet(1)
         node, moments = fleet.nodes[0], self.looks(fleet)
         fleet.run(10.0)
@@ -53,7 +53,7 @@ class IdleTests(FleetCase):
         self.assertLess(len(moments), 6)
 
     def test_who_leases_nothing_says_nothing(self) -> None:
-        """The beat of leases rests while there are none, and goes on, in its old measure, with the first one."""
+        """A node without leased records sends no renewals; after its first lease it renews at the usual interval."""
         fleet = self.fleet(2)
         node = fleet.nodes[0]
         beats: list[float] = []
@@ -73,7 +73,7 @@ class IdleTests(FleetCase):
         self.assertEqual(len(self.done(fleet, fleet.nodes[1].get(KEY), 0.5)), 1)
 
     def test_a_store_knows_what_is_due(self) -> None:
-        """A store says when something may run out first, and that never is where it holds nothing."""
+        """A store returns the earliest expiry time of its records, or infinity if it is empty."""
         store = MemoryStore()
         self.assertEqual(store.due(), float("inf"))
         store.put(record("b", 60.0), 60.0)

@@ -1,4 +1,4 @@
-"""Test that docs/reference/limits.md has the figures of the code, and that invented members stay within them."""
+"""Tests that docs/reference/limits.md matches the code and that invented identities cannot exceed the limits."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ PATCHED = (
     *((module, "MAX_KNOWN") for module in (acquaintance, carrier, introducer, outside, upgrade, way)),
 )
 
-# Bounded by caps of their own, which are larger than this crowd.
+# These tables have separate limits, larger than ``CROWD``.
 OTHERS: tuple[str, ...] = ("_members", "_listed_at", "_inquiries", "_peers", "sessions", "_responses", "_unconfirmed")
 OTHERS += ("_contacts", "_store", "_entries", "_live", "_absent")
-OTHERS += ("_board._names", "_board._untraced")  # of the simulation
+OTHERS += ("_board._names", "_board._untraced")  # Tables of the simulation.
 
 
 class PageTests(FleetCase):
     def test_figures(self) -> None:
-        """Every cap that the page names is that of the code."""
+        """Each limit on the page equals the constant in the code."""
         rows = ROW.findall(PAGE.read_text(encoding="utf-8"))
         self.assertGreater(len(rows), 60)
         for figure, place, name in rows:
@@ -45,10 +45,10 @@ class PageTests(FleetCase):
 
 
 class CrowdTests(FleetCase):
-    """An open team, one of whom invents identities."""
+    """An open team with a member that invents identities."""
 
     def test_tables_stay_small(self) -> None:
-        """However many identities a member invents, with all they can ask, no table of a node outgrows its cap."""
+        """No table of a node exceeds its limit while a member invents identities and sends all types of request."""
         for module, name in PATCHED:
             self.patch(module, name, SMALL)
         team = self.swarm(1)
@@ -68,7 +68,7 @@ class CrowdTests(FleetCase):
         self.assertGreater(max(sizes.values()), SMALL)
 
     def visit(self, team: Any, node: Any, number: int) -> None:
-        """One made-up member asks for everything once, and is gone."""
+        """Send each type of request once from an invented identity, then stop it."""
         own = Identity(random.Random(f"crowd {number}").randbytes(32))
         network = team.board.network(f"10.9.{number}.1", 7)
         crowd = Endpoint(own, TEAM, network, team.clock, random.Random(number))
@@ -100,7 +100,7 @@ class CrowdTests(FleetCase):
 
 
 def walk(thing: Any, path: str, sizes: dict[str, int], seen: set[int]) -> None:
-    """Note the size of every table that can be reached from a node."""
+    """Record the size of every table that is reachable from a node."""
     if id(thing) in seen or isinstance(thing, str | bytes | int | float | random.Random | type):
         return
     seen.add(id(thing))

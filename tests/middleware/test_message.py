@@ -1,4 +1,4 @@
-"""Tests of the messages."""
+"""Tests of the encoding of messages."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _VALUES = st.recursive(
 
 
 def by_the_table(kind: object, fields: list[Any]) -> Message | None:
-    """What ``docs/reference/wire-protocol.md`` calls the message of these fields, by patterns, without any haste."""
+    """Decode fields by the table of ``docs/reference/wire-protocol.md``, in a simple implementation with patterns."""
     if type(kind) is not int or any(deep(field) > 15 for field in fields):
         return None
     match [kind, *fields]:
@@ -44,7 +44,7 @@ def by_the_table(kind: object, fields: list[Any]) -> Message | None:
 
 
 def deep(value: object) -> int:
-    """How many levels there are in a value."""
+    """Return the nesting depth of a value."""
     inside = value if isinstance(value, list) else list(value.values()) if isinstance(value, dict) else []
     return 1 + max(map(deep, inside), default=0)
 
@@ -55,7 +55,7 @@ class MessageTests(SynchronousTestCase):
     @settings(max_examples=150)
     @given(number=st.integers(0, 2**64 - 1), value=_VALUES)
     def test_round_trip(self, number: int, value: Any) -> None:
-        """Every kind of message comes back as it was."""
+        """Every kind of message survives encoding and decoding."""
         messages: list[Message] = [
             Question(number, "find", (value, 1)),
             Question(number, "find", (value, 1), 5, number // 2),
@@ -76,7 +76,7 @@ class MessageTests(SynchronousTestCase):
         ),
     )
     def test_decoded_reads_as_the_table_says(self, kind: Any, fields: list[Any]) -> None:
-        """Each message has the fields that the table of ``docs/reference/wire-protocol.md`` gives."""
+        """``decoded`` accepts exactly the messages of the table in ``docs/reference/wire-protocol.md``."""
         try:
             found: Message | None = decoded(msgpack.packb([kind, *fields]))
         except Malformed:
@@ -84,7 +84,7 @@ class MessageTests(SynchronousTestCase):
         self.assertEqual(found, by_the_table(kind, fields))
 
     def test_refuses_what_is_out_of_shape(self) -> None:
-        """Deep nesting, extensions, huge claims, odd map keys and what is no message are refused."""
+        """Deep nesting, extension types, false lengths, map keys other than text and other input are rejected."""
         deep: object = 1
         deep_maps: object = 1
         for _ in range(40):
@@ -114,6 +114,6 @@ class MessageTests(SynchronousTestCase):
             self.assertRaises(Malformed, decoded, data)
 
     def test_encoded_refuses_what_cannot_be_packed(self) -> None:
-        """An object, and a number beyond 64 bits, are errors of the caller."""
+        """``encoded`` raises ``TypeError`` for an object and ``OverflowError`` for a number beyond 64 bits."""
         self.assertRaises(TypeError, encoded, Answer(1, object()))
         self.assertRaises(OverflowError, encoded, Answer(1, 2**64))

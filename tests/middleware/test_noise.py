@@ -33,14 +33,14 @@ class NoiseTests(SynchronousTestCase):
     """Behaviour of ``Initiator`` and ``Responder``."""
 
     def setUp(self) -> None:
-        """Read the vectors."""
+        """Load the test vectors."""
         self.vectors = json.loads(VECTORS.read_text())["vectors"]
 
     def _psk(self, vector: dict[str, Any]) -> bytes | None:
         return bytes.fromhex(vector["init_psks"][0]) if "init_psks" in vector else None
 
     def test_published_vectors(self) -> None:
-        """Both handshakes and their transport messages come out byte for byte as published."""
+        """Both handshakes and their transport messages match the published vectors byte for byte."""
         self.assertEqual(len(self.vectors), 2)
         for vector in self.vectors:
             initiator, responder = _sides(vector, self._psk(vector))
@@ -62,14 +62,14 @@ class NoiseTests(SynchronousTestCase):
                 self.assertEqual(opened(key, number // 2, ciphertext, b""), payload)
 
     def test_wrong_psk_opens_nothing(self) -> None:
-        """Who holds another pre-shared key cannot read the first payload."""
+        """A responder with another pre-shared key cannot decrypt the first payload."""
         vector = next(vector for vector in self.vectors if "init_psks" in vector)
         initiator, _ = _sides(vector, self._psk(vector))
         _, stranger = _sides(vector, bytes(32))
         self.assertRaises(Forged, stranger.read, initiator.write(b"secret"))
 
     def test_every_flipped_byte_is_noticed(self) -> None:
-        """A change of any byte of either message is noticed."""
+        """Both sides reject a handshake message with a flipped byte at any position."""
         vector = self.vectors[1]
         initiator, responder = _sides(vector, self._psk(vector))
         first = initiator.write(b"hello")
@@ -86,7 +86,7 @@ class NoiseTests(SynchronousTestCase):
             self.assertRaises(Forged, initiator.copy().read, bytes(damaged))
 
     def test_short_and_weak_messages(self) -> None:
-        """A message that is cut short and a key of small order are refused by the same error."""
+        """Truncated messages and keys of small order raise ``Forged``."""
         vector = self.vectors[1]
         initiator, responder = _sides(vector, self._psk(vector))
         self.assertRaises(Forged, responder.copy().read, bytes(95))

@@ -18,7 +18,7 @@ MAX_PAYLOAD = 1200
 
 
 class Run:
-    """The keys and payloads of one run, drawn from a seed."""
+    """The keys and payloads of one run, generated from a seed."""
 
     def __init__(self, seed: int, has_psk: bool) -> None:
         rng = random.Random(seed)
@@ -30,16 +30,16 @@ class Run:
 
     @property
     def initiator(self) -> KeyPair:
-        """The static keys of the side that speaks first."""
+        """The static keys of the initiator."""
         return self.statics[0]
 
     @property
     def responder(self) -> KeyPair:
-        """The static keys of the other side."""
+        """The static keys of the responder."""
         return self.statics[1]
 
     def other(self, is_initiator: bool) -> Any:
-        """One side in the other implementation."""
+        """Return one side of the handshake in the reference implementation."""
         name = b"Noise_IKpsk1_25519_ChaChaPoly_BLAKE2s" if self.psk else b"Noise_IK_25519_ChaChaPoly_BLAKE2s"
         side = NoiseConnection.from_name(name)
         own = 0 if is_initiator else 1
@@ -58,19 +58,19 @@ class Run:
 
 
 class DifferentialTests(SynchronousTestCase):
-    """Each side of a handshake, with the other implementation on the other side."""
+    """Each side of a handshake against the reference implementation on the other side."""
 
-    suppress = (util.suppress(message="One of ephemeral keypairs"),)  # it is set, so that both say the same bytes
+    suppress = (util.suppress(message="One of ephemeral keypairs"),)  # fixed, for equal bytes on both sides
 
     def check_transport(self, run: Run, keys: TransportKeys, other: Any) -> None:
-        """Both hold the same hash, and read what the other one seals, in both directions."""
+        """Check that both sides have the same handshake hash and decrypt each other's messages."""
         self.assertEqual(keys.handshake_hash, other.get_handshake_hash())
         for counter, payload in enumerate(run.payloads[2:]):
             self.assertEqual(other.decrypt(sealed(keys.sending, counter, payload, b"")), payload)
             self.assertEqual(opened(keys.receiving, counter, other.encrypt(payload), b""), payload)
 
     def initiate(self, run: Run) -> None:
-        """Ours speaks first."""
+        """Run our initiator against the reference responder."""
         ours = Initiator(run.initiator, run.responder.public, run.ephemerals[0], run.prologue, run.psk)
         twin, other = run.other(True), run.other(False)
         first = ours.write(run.payloads[0])
@@ -81,7 +81,7 @@ class DifferentialTests(SynchronousTestCase):
         self.check_transport(run, keys, other)
 
     def respond(self, run: Run) -> None:
-        """Ours is spoken to."""
+        """Run our responder against the reference initiator."""
         ours = Responder(run.responder, run.ephemerals[1], run.prologue, run.psk)
         twin, other = run.other(False), run.other(True)
         first = bytes(other.write_message(run.payloads[0]))
@@ -93,13 +93,13 @@ class DifferentialTests(SynchronousTestCase):
         self.check_transport(run, keys, other)
 
     def test_initiator(self) -> None:
-        """Our initiator says what theirs would say, and agrees with their responder."""
+        """Our initiator sends the same bytes as the reference initiator and agrees with the reference responder."""
         for seed in range(RUNS):
             for has_psk in (False, True):
                 self.initiate(Run(seed, has_psk))
 
     def test_responder(self) -> None:
-        """Our responder says what theirs would say, and agrees with their initiator."""
+        """Our responder sends the same bytes as the reference responder and agrees with the reference initiator."""
         for seed in range(RUNS):
             for has_psk in (False, True):
                 self.respond(Run(seed, has_psk))

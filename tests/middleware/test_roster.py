@@ -1,4 +1,4 @@
-"""Tests of who counts in a majority; pure."""
+"""Tests of the roster, which counts the members for a majority."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ ME = Contact(Identity(bytes(32)).public, Address("10.0.0.1", 1))
 
 
 def contact(number: int) -> Contact:
-    """Somebody."""
+    """Return a contact with this number."""
     return Contact(number.to_bytes(32), Address("10.0.0.1", number))
 
 
@@ -27,14 +27,14 @@ class RosterTests(SynchronousTestCase):
             self.assertTrue(self.roster.heard(contact(number), 0.0))
 
     def test_closest_with_oneself(self) -> None:
-        """The closest members come with the node itself among them, closest first."""
+        """The closest members include the node itself and are sorted by distance."""
         self.fill(6)
         everybody = [ME, *map(contact, range(1, 7))]
         for key in (ME.node_id, contact(3).node_id):
             self.assertEqual(self.roster.closest(key, 4, ME), closest(everybody, key, 4))
 
     def test_coming_and_going(self) -> None:
-        """Who is lost is absent until it is heard; who said goodbye is gone; the digest tells teams apart."""
+        """A lost member is absent until it is heard, a member that left is removed; the digest covers the members."""
         self.fill(3)
         before = self.roster.digest()
         self.assertTrue(self.roster.lost(contact(2).node_id, 1.0))
@@ -48,7 +48,7 @@ class RosterTests(SynchronousTestCase):
         self.assertEqual((len(self.roster), self.roster.absent()), (2, []))
 
     def test_a_majority_strikes_soon(self) -> None:
-        """Absent members are struck soon where a majority is in touch, in a minority only when no cut lasts so long."""
+        """Absent members are removed early if a majority is in touch, and in a minority only after ``COUNTED_S``."""
         for lost, wait in ((2, STRUCK_S), (3, COUNTED_S)):
             self.roster = Roster(ME.node_id)
             self.fill(4)
@@ -59,7 +59,7 @@ class RosterTests(SynchronousTestCase):
             self.assertEqual(self.roster.absent(), [])
 
     def test_in_touch(self) -> None:
-        """A node is in touch while it heard a majority of all, the absent counted in, lately enough."""
+        """A node is in touch if it recently heard a majority of all members, including the absent ones."""
         self.assertTrue(self.roster.in_touch(0.0, 10.0))
         self.fill(4)
         self.assertTrue(self.roster.in_touch(10.0, 10.0))
@@ -69,7 +69,7 @@ class RosterTests(SynchronousTestCase):
         self.assertTrue(self.roster.in_touch(11.0, 10.0))
 
     def test_full(self) -> None:
-        """A full roster takes nobody new, unless somebody absent can make room."""
+        """A full roster accepts a new member only if it can remove an absent one."""
         self.fill(MAX_MEMBERS)
         self.assertTrue(self.roster.is_full)
         self.assertFalse(self.roster.heard(contact(1000), 0.0))
@@ -78,7 +78,7 @@ class RosterTests(SynchronousTestCase):
         self.assertEqual(self.roster.absent(), [])
 
     def test_remembered(self) -> None:
-        """Whom an earlier life knew counts as absent until it is heard."""
+        """A member restored from an earlier run counts as absent until it is heard."""
         self.roster.remembered(contact(1), 0.0)
         self.assertEqual((len(self.roster), self.roster.absent()), (0, [contact(1)]))
         self.assertFalse(self.roster.in_touch(0.0, 10.0))

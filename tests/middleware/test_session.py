@@ -18,14 +18,14 @@ class SessionTests(SynchronousTestCase):
     """Behaviour of ``Session``."""
 
     def setUp(self) -> None:
-        """Make the two ends of one session."""
+        """Create the two ends of one session."""
         contact = Contact(Identity(bytes(32)).public, Address("127.0.0.1", 1))
         one, two = b"1" * 32, b"2" * 32
         self.a = Session(contact, 7, 8, TransportKeys(one, two, b""), 0.0, True)
         self.b = Session(contact, 8, 7, TransportKeys(two, one, b""), 0.0, True)
 
     def test_carries_messages_both_ways(self) -> None:
-        """What one end seals the other opens, with at most 36 bytes more, and the largest fits a datagram."""
+        """Each end decrypts the other's messages; the overhead is at most 36 bytes; the largest message fits."""
         datagram = self.a.seal(b"hello")
         self.assertEqual(self.b.open(datagram), (b"hello", 1))
         self.assertEqual(self.a.open(self.b.seal(b"")), (b"", 1))
@@ -34,7 +34,7 @@ class SessionTests(SynchronousTestCase):
         self.assertEqual(len(self.a.seal(bytes(MAX_PLAIN))), MAX_DATAGRAM)
 
     def test_opens_each_once_in_any_order(self) -> None:
-        """Shuffled datagrams within the window open once each, and never again."""
+        """Datagrams within the replay window decrypt exactly once, in any order."""
         datagrams = [self.a.seal(b"%d" % number) for number in range(WINDOW)]
         shuffled = datagrams[:]
         random.Random(1).shuffle(shuffled)
@@ -44,14 +44,14 @@ class SessionTests(SynchronousTestCase):
             self.assertRaises(Forged, self.b.open, datagram)
 
     def test_refuses_what_fell_out_of_the_window(self) -> None:
-        """A datagram older than the window is refused, the oldest inside it is not."""
+        """A datagram older than the replay window is rejected; the oldest one inside it is accepted."""
         datagrams = [self.a.seal(b"") for _ in range(WINDOW + 1)]
         self.b.open(datagrams[-1])
         self.assertTrue(self.b.is_replay(datagrams[0]))
         self.assertEqual(self.b.open(datagrams[1]), (b"", 1 - WINDOW))
 
     def test_window_survives_a_leap(self) -> None:
-        """After a leap over more than a window the old ones are refused and the next ones open."""
+        """After a gap larger than the window, older datagrams are rejected and later ones are accepted."""
         early = self.a.seal(b"early")
         self.b.open(self.a.seal(b""))
         self.a._sent = 2**40
@@ -62,7 +62,7 @@ class SessionTests(SynchronousTestCase):
         self.assertEqual(self.b.open(self.a.seal(b"next"))[0], b"next")
 
     def test_forged_datagram_changes_nothing(self) -> None:
-        """A datagram with any byte flipped does not open, and the genuine one still does."""
+        """A datagram with a flipped byte is rejected, and the original is accepted afterwards."""
         datagram = self.a.seal(b"hello")
         for place in range(5, len(datagram)):
             damaged = bytearray(datagram)

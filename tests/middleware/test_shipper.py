@@ -1,4 +1,4 @@
-"""Tests of how a node's own records come to their replicas, many of them in one question."""
+"""Tests of the shipper, which sends a node's records to their replicas in batches."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class ShipperTests(FleetCase):
         self.world.nodes[1].endpoint.expose("store", counted, changes=True, idempotent=True)
 
     def test_a_flood_shares_questions(self) -> None:
-        """Of forty records the first goes alone and at once; the others share questions of one datagram each."""
+        """The first of forty records is sent alone at once; the others share requests of one datagram each."""
         self.count_questions()
         verdicts = self.stored(*[self.record(number) for number in range(FLOOD)])
         self.world.run(0.1)
@@ -56,7 +56,7 @@ class ShipperTests(FleetCase):
         self.assertEqual(self.shipper._waiting, {})
 
     def test_what_is_handed_on_keeps_its_life(self) -> None:
-        """A record of another is kept as long as whoever hands it on would have; an own one for a whole ttl."""
+        """A forwarded record keeps the remaining TTL of its sender; the node's own record gets the full TTL."""
         self.count_questions()
         replica, stranger = self.world.nodes[1].replica, Identity(bytes([9]) * 32)
         own, others = self.record(0), Record(KEY, "s", stranger.public, 1, "team", TEAM_TTL, b"x").signed(stranger)
@@ -69,7 +69,7 @@ class ShipperTests(FleetCase):
         self.assertAlmostEqual(replica.left(own), TEAM_TTL - 1.0, delta=0.1)
 
     def test_one_that_is_refused_goes_alone(self) -> None:
-        """A replica without room for one of the records takes the others that came with it."""
+        """If a replica rejects one record of a batch, it stores the other records."""
         replica, keep = self.world.nodes[1].replica, Replica.keep
 
         def picky(record: Record, left: float | None = None) -> StoreReply:
@@ -84,7 +84,7 @@ class ShipperTests(FleetCase):
         self.assertEqual([self.successResultOf(verdict) for verdict in verdicts], [0] * 5)
 
     def test_a_silent_replica_is_not_asked_in_turn(self) -> None:
-        """Where the first question gets no answer, all that wait get their own chance at once, and end together."""
+        """If the first request gets no reply, all waiting records are sent at once and fail at the same time."""
         self.world.kill(1)
         verdicts = self.stored(*[self.record(number) for number in range(FLOOD)])
         self.world.run(2 * PATIENCE + 0.1)
@@ -93,7 +93,7 @@ class ShipperTests(FleetCase):
         self.assertEqual(self.shipper._waiting, {})
 
     def test_a_long_record_holds_up_nobody(self) -> None:
-        """A record that needs a parcel goes by itself; a short one that comes after it is asked for at once."""
+        """A record that needs fragments is sent alone and does not delay a later short record."""
         self.count_questions()
         verdicts = self.stored(self.record(0, size=50_000), self.record(1))
         self.world.run(0.5)

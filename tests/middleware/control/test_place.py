@@ -1,4 +1,4 @@
-"""Tests of ``control.place``: where control sockets lie."""
+"""Tests of ``control.place``, which finds the paths of control sockets."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from middleware.entangled.control.place import NoControl, folder, found, made
 
 class PlaceTests(SynchronousTestCase):
     def setUp(self) -> None:
-        # Trial's own folders are deeper than the path of a socket may be.
+        # The folders of trial are too deep for the path of a Unix socket.
         self.runtime = Path(tempfile.mkdtemp())
         self.addCleanup(shutil.rmtree, self.runtime)
         self.patch(os, "environ", {**os.environ, "XDG_RUNTIME_DIR": str(self.runtime)})
 
     def problem(self, name: str | None) -> str:
-        """What is said where no socket is found."""
+        """Return the error message if no socket is found."""
         return str(self.assertRaises(NoControl, found, name))
 
     def test_only_node_needs_no_name(self) -> None:
-        """Where one node runs it is meant; where none or several do, or another name is asked for, one is told so."""
+        """The only running node needs no name; with no node, several nodes or an unknown name, the error says so."""
         self.assertIn("no node runs", self.problem(None))
         self.assertIn("no node runs", self.problem("a"))
         made("a").touch()
@@ -35,7 +35,7 @@ class PlaceTests(SynchronousTestCase):
         self.assertEqual(found("b").name, "b.control")
 
     def test_folder_is_the_owners_alone(self) -> None:
-        """A folder that others can enter, or that is none, is refused with the remedy."""
+        """A folder that other users can access, a symbolic link and a file are rejected with an error."""
         made("a")
         self.assertEqual(folder().stat().st_mode & 0o777, 0o700)
         folder().chmod(0o777)
@@ -48,12 +48,12 @@ class PlaceTests(SynchronousTestCase):
         self.assertRaises(NoControl, made, "a")
 
     def test_path_that_is_too_long(self) -> None:
-        """A path that does not fit into a socket's address is refused before anything is opened."""
+        """A path that exceeds the length of a socket address is rejected before a socket is opened."""
         deep = self.runtime / ("x" * 100)
         self.patch(os, "environ", {**os.environ, "XDG_RUNTIME_DIR": str(deep)})
         self.assertIn("107", str(self.assertRaises(NoControl, made, "a")))
 
     def test_without_runtime_folder(self) -> None:
-        """Without ``XDG_RUNTIME_DIR`` the sockets lie in a folder of the user's own in /tmp."""
+        """Without ``XDG_RUNTIME_DIR`` the sockets are in a folder for the user in /tmp."""
         self.patch(os, "environ", {})
         self.assertEqual(str(folder()), f"/tmp/swarm-node-{os.getuid()}")

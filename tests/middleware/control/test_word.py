@@ -1,4 +1,4 @@
-"""Tests of ``control.word``: values as words of a shell and as JSON."""
+"""Tests of ``control.word``, which converts values to and from shell words and JSON."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FIELDS = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, 
 class WordTests(SynchronousTestCase):
     @given(st.lists(FIELDS | st.binary()))
     def test_fields_come_back_from_json(self, fields: list[Any]) -> None:
-        """Every tuple survives the way through JSON and back, bytes included, and no text is taken for bytes."""
+        """Every tuple, including bytes, survives a JSON round trip, and no text is converted to bytes."""
         there = json.loads(json.dumps(word.plain(fields)))
         back = word.value(there)
         self.assertEqual(back, fields)
@@ -25,12 +25,12 @@ class WordTests(SynchronousTestCase):
 
     @given(FIELDS)
     def test_json_is_read_as_a_field(self, field: Any) -> None:
-        """A field that is written as JSON is read as that field."""
+        """A field written as JSON is parsed as the same field."""
         self.assertEqual(word.scalar(json.dumps(field)), field)
 
     @given(st.text())
     def test_every_word_is_read_or_refused(self, text: str) -> None:
-        """Whatever stands on a command line is a field, a template's field, or ``BadWord``, and nothing else."""
+        """Any word on a command line is parsed as a field or a template field, or raises ``BadWord``."""
         for read in (word.scalar, word.pattern):
             try:
                 field = read(text)
@@ -39,14 +39,14 @@ class WordTests(SynchronousTestCase):
             self.assertIsInstance(field, bool | int | float | str | dict | None)
 
     def test_words_that_are_no_json_are_text(self) -> None:
-        """What is not JSON stands for itself, and so do the numbers that JSON does not have."""
+        """A word that is not JSON is text; so are numbers that JSON does not have, such as NaN."""
         for text in ("red", "dog 1", "", "007", "NaN", "[", "-"):
             self.assertEqual(word.scalar(text), text)
         self.assertRaises(word.BadWord, word.scalar, "[1, 2]")
         self.assertRaises(word.BadWord, word.scalar, '{"a": 1}')
 
     def test_patterns(self) -> None:
-        """A template's words: anything, a kind, a predicate, a value; a quoted one is always a value."""
+        """A template word is a wildcard, a type, a predicate or a value; a quoted word is always a value."""
         for text, meant in (
             ("_", {"any": True}),
             ("?int", {"kind": "int"}),
@@ -65,7 +65,7 @@ class WordTests(SynchronousTestCase):
 
     @given(st.text())
     def test_what_a_terminal_is_shown(self, text: str) -> None:
-        """Of any words no control character is left: as text each is a space, in JSON an escape that is read back."""
+        """Control characters in text become spaces; in JSON they become escapes that parse back to the original."""
         self.assertTrue(word.printable(text).isprintable())
         self.assertEqual(len(word.printable(text)), len(text))
         written = word.written({text: [text]})
@@ -73,7 +73,7 @@ class WordTests(SynchronousTestCase):
         self.assertEqual(json.loads(written), {text: [text]})
 
     def test_bytes_for_people(self) -> None:
-        """A value that is text is shown as text, any other as base64; text that looks like base64 is not bytes."""
+        """UTF-8 values are shown as text and others as base64; text that resembles base64 does not become bytes."""
         self.assertEqual(word.text_or_base64("dög".encode()), "dög")
         self.assertEqual(word.text_or_base64(b"\xff\x00"), {"base64": "/wA="})
         self.assertRaises(word.BadWord, word.value, {"base64": "!"})

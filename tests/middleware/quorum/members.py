@@ -1,4 +1,4 @@
-"""Acceptors with the codec and terms of each user, for tests of what holds for either."""
+"""Acceptors with the codec and terms of each user of Paxos (tuple takes and leases), for tests that apply to both."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ TTL = 10.0
 
 @dataclass(frozen=True)
 class Use:
-    """How one user names its register, its proposers and its values."""
+    """The register key, the proposers and the values of one user."""
 
     key: Any
     codec: Codec[Any]
@@ -30,7 +30,7 @@ class Use:
     values: tuple[Any, ...]
 
     def ballot(self, number: int, name: int) -> Ballot:
-        """A ballot of the only life of a proposer."""
+        """Return the ballot of a proposer that never restarted."""
         return Ballot(number * self.codec.lives, self.names[name])
 
 
@@ -41,7 +41,7 @@ LEASE = Use("t", lease_codec.CODEC, Terms(AHEAD), ("a", "b", "c"), (MEMBERS[:3],
 
 
 class Member:
-    """An acceptor of one user, and the store that outlives its processes."""
+    """An acceptor of one user, with a store that survives restarts."""
 
     def __init__(self, use: Use) -> None:
         self.use = use

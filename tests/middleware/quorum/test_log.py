@@ -22,7 +22,7 @@ def entered(log: Log[str], task_id: str, now: float) -> Register | None:
 
 
 def granted(log: Log[str], task_id: str, token: int, now: float, ttl: float = 2.0) -> Register:
-    """A register with a lease in it, kept."""
+    """Return a stored register with a granted lease."""
     register = entered(log, task_id, now)
     assert register is not None
     register.promised = register.holder = Ballot(token, "a")
@@ -37,16 +37,16 @@ class LogTests(SynchronousTestCase):
         self.log = self.opened()
 
     def opened(self, now: float = 0.0) -> Log[str]:
-        """The log of a process on that store."""
+        """Open the log of a new process on the same store."""
         return Log(self.store, CODEC, may_forget, now)
 
     def test_first_life_may_lack_something(self) -> None:
-        """Who finds nothing may have lost it, and is not whole; whoever finds what it kept is."""
+        """A log without stored votes may have lost them and is not whole; a log that finds them is whole."""
         self.assertFalse(self.log.is_whole)
         self.assertTrue(self.opened().is_whole)
 
     def test_everything_is_back_after_a_restart(self) -> None:
-        """Promises, tokens, councils and ends are kept; what was leased is leased for as long again."""
+        """Promises, tokens, councils and ends are durable; a restart extends a granted lease by its full TTL."""
         entry = granted(self.log, "t", 7, 0.0)
         entry.accepted, entry.value, entry.spent, entry.is_over = Ballot(9, "b"), MEMBERS[:3], Ballot(1, "c"), True
         self.log.keep("t")
@@ -54,19 +54,19 @@ class LogTests(SynchronousTestCase):
         assert back is not None
         self.assertEqual(CODEC.pack({"t": back}), CODEC.pack({"t": entry}))
         self.assertEqual(back.until, 102.0)
-        entry.holder = NONE  # what was given back holds nobody up
+        entry.holder = NONE  # A released lease does not block other proposers.
         self.log.keep("t")
         back = self.opened(100.0).get("t")
         self.assertEqual(back and back.until, 0.0)
 
     def test_longest_ttl_is_remembered(self) -> None:
-        """The longest lease ever granted is known after a restart: so long may others rely on what was forgotten."""
+        """The longest TTL ever granted survives a restart, as a forgotten lease may last that long."""
         granted(self.log, "t", 1, 0.0, ttl=9.0)
         granted(self.log, "u", 1, 0.0, ttl=2.0)
         self.assertEqual(self.opened().floor.longest, 9.0)
 
     def test_rotten_notes(self) -> None:
-        """Where a note cannot be read the rest is used, and the ledger knows that something is missing."""
+        """If a stored vote is unreadable, the log uses the others and is not whole."""
         granted(self.log, "t", 7, 0.0)
         for rotten in (b"\xc1", msgpack.packb([1]), msgpack.packb({"t": [1]}), msgpack.packb({"t": 5})):
             for name in filter(self.store.noted, CODEC.names):
@@ -76,7 +76,7 @@ class LogTests(SynchronousTestCase):
         self.assertFalse(self.opened().is_whole)
 
     def test_bounded(self) -> None:
-        """A full ledger forgets what is long over, keeps a floor under its numbers, and else takes no more."""
+        """A full log removes old ended registers, keeps their highest numbers as a floor and rejects new registers."""
         self.patch(module, "MAX_REGISTERS", 3)
         granted(self.log, "old", 40, 0.0)
         granted(self.log, "done", 30, 0.0).is_over = True
@@ -94,7 +94,7 @@ class LogTests(SynchronousTestCase):
         self.assertEqual(again.floor[:2], (40, 40))
 
     def test_changed_councils_are_not_forgotten(self) -> None:
-        """That a council was changed is known for as long as its task is open: an old council must not rise again."""
+        """The register of a changed council is kept while its task is open, or the old council could decide again."""
         self.patch(module, "MAX_REGISTERS", 1)
         granted(self.log, "t", 1, 0.0).configuration = FIRST + 1
         self.assertIsNone(entered(self.log, "u", 1e9))
@@ -102,7 +102,7 @@ class LogTests(SynchronousTestCase):
     @settings(max_examples=200)
     @given(ANYTHING)
     def test_rows_are_total(self, row: object) -> None:
-        """Whatever stands in a row is an entry or none, and never an accident."""
+        """Decoding any row returns a register or None, without an exception."""
         self.assertIsNone(unpack_row(row))
         unpack_row([1, row, 1, 1.0, row, False])
         unpack_row([row, [0, ""] * 4, row, row, [], row])

@@ -1,4 +1,4 @@
-"""Tests of publishing by keyword."""
+"""Tests of publication and search by keyword."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.fleet import FleetCase
 
 class WordsTests(SynchronousTestCase):
     def test_names(self) -> None:
-        """A name is parted at everything but letters and digits, without regard to case, each word once."""
+        """A name is split at each character that is not a letter or digit; words are case-folded and unique."""
         for name, wanted in [
             ("red_target-3.jpg", ["red", "target", "3", "jpg"]),
             ("Red RED red", ["red"]),
@@ -27,14 +27,14 @@ class WordsTests(SynchronousTestCase):
     @settings(max_examples=200)
     @given(text=st.text(max_size=30))
     def test_stable(self, text: str) -> None:
-        """Any text has words, and the words of its words are the same."""
+        """Splitting any text yields unique words."""
         found = words(text)
         self.assertEqual(len(set(found)), len(found))
 
 
 class KeywordsTests(FleetCase):
     def test_search(self) -> None:
-        """What was published is found by any of its words, in any case, and by all of several; others are not."""
+        """A search returns the names that contain all of its words, in any case."""
         fleet = self.fleet(5)
         a, b, c = (Keywords(node) for node in fleet.nodes[:3])
         self.done(fleet, a.publish("red_target-3.jpg", b"one"))
@@ -50,7 +50,7 @@ class KeywordsTests(FleetCase):
         self.assertEqual(self.done(fleet, c.search("tar")), [])
 
     def test_publishers_at_the_same_moment(self) -> None:
-        """All of eight who publish one name at the same moment, over a wire that loses some, are in the index."""
+        """Eight nodes publish one name concurrently under datagram loss, and all eight matches are in the index."""
         fleet = self.fleet(8, weather=Weather(delay_s=0.005, jitter_s=0.004, loss=0.1))
         keywords = [Keywords(node) for node in fleet.nodes]
         work = [one.publish("same name", bytes([number])) for number, one in enumerate(keywords)]
@@ -61,7 +61,7 @@ class KeywordsTests(FleetCase):
         self.assertEqual(sorted(match.data for match in found), [bytes([number]) for number in range(8)])
 
     def test_replace_and_remove(self) -> None:
-        """A publisher replaces and removes what is its own, and nothing else."""
+        """A publisher replaces and removes only its own matches."""
         fleet = self.fleet(4)
         a, b = Keywords(fleet.nodes[0]), Keywords(fleet.nodes[1])
         for one, data in [(a, b"1"), (b, b"2"), (a, b"3")]:
@@ -72,7 +72,7 @@ class KeywordsTests(FleetCase):
             self.assertEqual([m.data for m in self.done(fleet, b.search(word))], [b"2"])
 
     def test_watch(self) -> None:
-        """Who watches a keyword is told of each match that comes, changes and goes, soon, and of nothing else."""
+        """A watch reports each added, changed and removed match of its keyword within 0.5 s, and no other match."""
         fleet = self.fleet(4)
         a = Keywords(fleet.nodes[0])
         told: list[list[bytes]] = []
@@ -91,7 +91,7 @@ class KeywordsTests(FleetCase):
         self.assertEqual(len(told), 3)
 
     def test_wrong_use(self) -> None:
-        """Names without words, too many words, and too much data raise at once."""
+        """Names without words, names with too many words and oversized data raise an error."""
         fleet = self.fleet(2)
         a = Keywords(fleet.nodes[0])
         for name in ("", "--", " ".join(f"a{n}" for n in range(17))):

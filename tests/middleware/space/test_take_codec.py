@@ -1,4 +1,4 @@
-"""Tests of ``middleware.entangled.space.take_codec``: what comes from the wire, and notes of the version before."""
+"""Tests of ``middleware.entangled.space.take_codec``: received replies, and stored votes of the previous version."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ class WireTests(SynchronousTestCase):
     @settings(max_examples=100)
     @given(reply=REPLIES, accepted=st.none() | st.integers(1, 2**48 - 1), name=st.binary(min_size=1, max_size=40))
     def test_round_trip(self, reply: Reply, accepted: int | None, name: bytes) -> None:
-        """Every reply comes back as it was, to every question."""
+        """Every reply survives encoding and decoding, for each type of request."""
         if accepted is not None:
             reply = reply._replace(accepted=Ballot(accepted, name), value=name)
         for event in (Event.PREPARE, Event.ACCEPT, Event.RELEASE):
             self.assertEqual(unpack_reply(pack_reply(reply, event), event), reply)
 
     def test_codes(self) -> None:
-        """The answer to one question is none to another."""
+        """A reply to one type of request is invalid for another type."""
         codes = [pack_reply(Reply(Kind.GRANTED), event)[0] for event in (Event.PREPARE, Event.ACCEPT, Event.RELEASE)]
         self.assertEqual(codes, [0, 1, 5])
         self.assertEqual(pack_reply(Reply(Kind.SEALED), Event.PREPARE)[0], 0)
@@ -49,13 +49,13 @@ class WireTests(SynchronousTestCase):
     @settings(max_examples=300)
     @given(foreign=FOREIGN, accepted=FOREIGN)
     def test_total(self, foreign: Any, accepted: Any) -> None:
-        """Anything else is None, and never an exception."""
+        """Any other input decodes to None without an exception."""
         for fields in (foreign, [0, 1, 0.5, accepted], [0, 1, 0.5, [1, b"a", foreign]], [foreign, 1, 0.5, None]):
             reply = unpack_reply(fields, Event.PREPARE)
             self.assertTrue(reply is None or isinstance(reply.kind, Kind))
 
     def test_out_of_range(self) -> None:
-        """Numbers and names that cannot be are refused."""
+        """Numbers and names out of range are rejected."""
         for fields in (
             [9, 1, 0.5, None], [True, 1, 0.5, None], [0, -1, 0.5, None], [0, 1, 601.0, None],
             [0, 1, float("nan"), None], [0, 1, 1, None], [0, 1, 0.5, [1, b"a"]],
@@ -67,7 +67,7 @@ class WireTests(SynchronousTestCase):
 
 class NoteTests(SynchronousTestCase):
     def test_old_notes(self) -> None:
-        """What was promised, leased and accepted is read, and written as it was."""
+        """Stored promises, leases and accepted values of the previous version are read and written unchanged."""
         codec, key, owner = CODEC, b"k" * 20, b"o" * 32
         rows = [
             [key, [owner, "one", b"m" * 8], 3, b"a", 2.5, None],

@@ -1,4 +1,4 @@
-"""Tests of many takers at the same time: nothing is confirmed twice and nothing is lost, whatever dies."""
+"""Tests of concurrent takers: each tuple is confirmed at most once and none is lost, even if nodes fail."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ class TakesTests(SynchronousTestCase):
         return trial
 
     def test_calm(self) -> None:
-        """Eight takers share the tuples, and each tuple is told to exactly one of them."""
+        """Eight takers share the tuples, and each tuple is delivered to exactly one taker."""
         trial = self._checked(LightTrial(1, TUPLES))
         self.assertEqual((len(trial.witness.posted), trial.witness.open()), (TUPLES, []))
 
     def test_loss_churn_and_partitions(self) -> None:
-        """Though datagrams are lost, links cut, and takers, members and publishers die: once each, and none lost."""
+        """Each tuple is taken once under datagram loss, partitions and restarts of takers, members and publishers."""
         for seed, loss, is_churning in ((2, 0.1, False), (4, 0.5, False), (10, 0.4, True), (13, 0.1, True)):
             self._checked(LightTrial(seed, TUPLES, loss, is_churning))
 
     def test_whole_nodes(self) -> None:
-        """So it is with records that are replicated by whole nodes, some of which die, over a wire that loses some."""
+        """Each tuple is taken once if whole nodes replicate the records, datagrams are lost and some nodes die."""
         self._checked(Trial(1, 15, 0.1, True, nodes=10))
 
     def test_members_that_lost_their_memory_keep_silent(self) -> None:
-        """A member that comes back without its votes has no say about older tuples, so none is confirmed twice."""
+        """A member that restarts without its votes does not vote on older tuples; no tuple is confirmed twice."""
         for seed in range(30, 32):
             trial = ForgottenLife(seed, TUPLES, 0.1, True)
             trial.aftermath = 20.0

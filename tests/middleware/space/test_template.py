@@ -38,20 +38,20 @@ FOREIGN = st.recursive(
 
 class TemplateTests(SynchronousTestCase):
     def test_values_match_their_like_only(self) -> None:
-        """One, 1.0 and True are three different values, and None is one as well."""
+        """1, 1.0, True and None are four distinct values and match only themselves."""
         self.assertTrue(template_of(["a", 1, None, b"x"]).matches(("a", 1, None, b"x")))
         for other in (1.0, True, "1", None):
             self.assertFalse(template_of([1]).matches((other,)))
 
     def test_types_and_wildcards(self) -> None:
-        """A type takes exactly its own values, ANY takes everything, and a template only tuples of its own length."""
+        """A type matches only its values, ANY matches each value, and a template only matches tuples of its length."""
         self.assertTrue(template_of([int, str, ANY]).matches((1, "a", None)))
         self.assertFalse(template_of([int]).matches((True,)))
         self.assertFalse(template_of([float]).matches((1,)))
         self.assertFalse(template_of([ANY]).matches(("a", "b")))
 
     def test_predicates(self) -> None:
-        """Each operator holds where it should, compares int with float, and holds for nothing it can't compare."""
+        """Each operator gives its specified result, compares int with float, and is false for incomparable values."""
         rows: list[tuple[str, Any, Any, bool]] = [
             ("<", 5, 4.5, True), ("<", 5, 5, False), ("<", 5, "a", False), ("<", 5, None, False), ("<", 5, True, False),
             ("<=", 5, 5.0, True), ("<=", "b", "b", True), (">", b"a", b"b", True), (">", b"a", "b", False),
@@ -65,7 +65,7 @@ class TemplateTests(SynchronousTestCase):
             self.assertEqual(template_of([where(operator, operand)]).matches((value,)), holds, (operator, value))
 
     def test_wrong_predicates(self) -> None:
-        """What an operator cannot take is refused at once, by name."""
+        """An invalid operator or operand raises ``BadTuple``."""
         wrong: list[tuple[Any, Any]] = [
             ("=", 1), ("<", None), ("<", True), ("in", 1), ("in", [1] * 33), ("in", [object()]), ("prefix", 1),
             ("!=", object()), (">", [1]), ("<", float("nan")),
@@ -74,7 +74,7 @@ class TemplateTests(SynchronousTestCase):
             self.assertRaises(BadTuple, where, operator, operand)
 
     def test_wrong_fields(self) -> None:
-        """What is no tuple or template raises at once and says which field is wrong."""
+        """Invalid tuples and templates raise ``BadTuple``, and the message names the field."""
         for wrong in ([], [1] * 33, "text", b"bytes", [object()], [[1]], [2**64], ["\ud800"], [float("nan")], 5):
             self.assertRaises(BadTuple, tuple_of, wrong)
             self.assertRaises(BadTuple, template_of, wrong)
@@ -83,14 +83,14 @@ class TemplateTests(SynchronousTestCase):
         self.assertIn("field 1", str(self.assertRaises(BadTuple, tuple_of, [1, object()])))
 
     def test_too_large(self) -> None:
-        """A tuple that would not fit into a record is refused before anything is sent."""
+        """A tuple that does not fit into a record raises ``TooLarge``."""
         self.assertRaises(TooLarge, tuple_of, ["x" * 700])
         self.assertRaises(TooLarge, template_of, [b"x" * 700])
 
     @settings(max_examples=150)
     @given(fields=st.lists(VALUES, min_size=1, max_size=8))
     def test_tuple_round_trip(self, fields: list[Any]) -> None:
-        """Every tuple comes back from a message as it was, and matches itself."""
+        """Every tuple survives encoding and decoding, and matches itself as a template."""
         back = tuple_unpacked(msgpack.unpackb(msgpack.packb(list(tuple_of(fields)))))
         self.assertEqual(repr(back), repr(tuple(fields)))
         self.assertTrue(template_of(fields).matches(back))
@@ -98,7 +98,7 @@ class TemplateTests(SynchronousTestCase):
     @settings(max_examples=300)
     @given(operator=st.sampled_from([*OPERATORS, "=", "like"]), foreign=FOREIGN | st.lists(FOREIGN, max_size=4))
     def test_total(self, operator: str, foreign: Any) -> None:
-        """Anything is a tuple or ``Malformed``, and an operand or ``BadTuple``, and nothing else."""
+        """Any input decodes to a tuple or raises ``Malformed``; any operand is valid or raises ``BadTuple``."""
         with contextlib.suppress(Malformed):
             self.assertIsInstance(tuple_unpacked(foreign), tuple)
         with contextlib.suppress(BadTuple):
