@@ -1,4 +1,4 @@
-"""Tests of what a call carries beside its arguments: deadline, cancellation, typed errors, checked types."""
+"""Tests of the call features of ``Answerer``: deadline, cancellation, typed errors and checked types."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class CallTests(EndpointCase):
         self.got(self.a.ask(self.to_b, "echo", 1))
 
     def equip(self, endpoint: Any) -> None:
-        """Add slow methods, and one that wants its deadline."""
+        """Register slow methods and a method that takes the deadline."""
         super().equip(endpoint)
         endpoint.expose("slow", self.slow)
         endpoint.expose("slow change", self.slow, changes=True)
@@ -32,19 +32,19 @@ class CallTests(EndpointCase):
         endpoint.expose("busy", self.occupied)
 
     def slow(self, peer: Contact) -> Deferred[Any]:
-        """Never end by itself."""
+        """Return a Deferred that never fires."""
         work: Deferred[Any] = Deferred()
         work.addErrback(self.note)
         self.works.append(work)
         return work
 
     def note(self, failure: Any) -> Any:
-        """Remember how a piece of work ended."""
+        """Record the type of the failure."""
         self.ended.append(failure.type.__name__)
         return failure
 
     async def crawl(self, peer: Contact) -> None:
-        """Wait for something that never comes, as a coroutine."""
+        """Wait forever, as a coroutine."""
         try:
             await Deferred()
         except CancelledError:
@@ -52,15 +52,15 @@ class CallTests(EndpointCase):
             raise
 
     def when(self, peer: Contact, *, deadline: float) -> float:
-        """How long the asker still waits."""
+        """Return the time that the caller still waits, in seconds."""
         return deadline - self.clock.seconds()
 
     def occupied(self, peer: Contact) -> None:
-        """Refuse."""
+        """Reject the call."""
         raise Refused("with a bone", self.code)
 
     def test_cancelling_reaches_the_method(self) -> None:
-        """Cancelling what ``ask`` returned cancels the Deferred or coroutine of the method, one way's delay later."""
+        """Cancelling the Deferred of ``ask`` cancels the method's Deferred or coroutine after the one-way delay."""
         for name, how in (("slow", "CancelledError"), ("slow change", "CancelledError"), ("crawl", "coroutine")):
             asked = self.a.ask(self.to_b, name, timeout=60.0, changes=name == "slow change")
             self.clock.advance(1.0)
@@ -72,7 +72,7 @@ class CallTests(EndpointCase):
         self.assertEqual([account.running for account in self.b._answerer._ledger._accounts.values()], [{}])
 
     def test_cancel_overtakes_its_question(self) -> None:
-        """A question that arrives after it was cancelled does not run."""
+        """A request that arrives after its cancellation does not run."""
         session = next(iter(self.a._sessions.values()))
         late = session.seal(encoded(Question(5, "add", (1,))))
         receive = self.taps[self.to_b.address].receiver
@@ -81,7 +81,7 @@ class CallTests(EndpointCase):
         self.assertEqual((self.runs, self.b.counters["cancelled"]), ([], 1))
 
     def test_a_stranger_cancels_nothing(self) -> None:
-        """A peer cannot cancel what another one asked."""
+        """A peer cannot cancel another peer's request."""
         asked = self.a.ask(self.to_b, "slow", timeout=60.0)
         c, _ = self.endpoint(3)
         self.got(c.ask(self.to_b, "echo", 1))
@@ -93,7 +93,7 @@ class CallTests(EndpointCase):
         self.assertEqual(self.got(asked), "done")
 
     def test_deadline_is_carried(self) -> None:
-        """A method learns how long its asker waits, less the way there, in milliseconds, cut to four bytes."""
+        """A method gets the caller's remaining time, less the network delay, in milliseconds as 32 bits."""
         for seconds, milliseconds in ((1.5, 1500), (-1.0, 0), (1e9, NO_LIMIT_MS)):
             aged_one = decoded(aged(encoded(Question(1, "m", (), 7)), seconds))
             self.assertEqual(aged_one, Question(1, "m", (), milliseconds))
@@ -102,7 +102,7 @@ class CallTests(EndpointCase):
             self.assertTrue(least <= left <= most, left)
 
     def test_what_is_too_late_stops(self) -> None:
-        """When the asker's time is over the work is cancelled, and a question whose time was over never runs."""
+        """The deadline cancels a running method; a request that arrives after its deadline never runs."""
         asked = self.a.ask(self.to_b, "slow", timeout=2.0)
         self.clock.advance(1.9)
         self.assertEqual(self.ended, [])
@@ -114,7 +114,7 @@ class CallTests(EndpointCase):
         self.assertEqual((self.runs, self.b.counters["late"]), ([], 2))
 
     def test_refusals_have_a_code(self) -> None:
-        """A refusal arrives with its code and its text; one with a code that cannot be sent, as a plain refusal."""
+        """A rejection carries its code and text; an invalid code is replaced by ``refused``."""
         for code, arrives in (("dog.busy", "dog.busy"), ("", "refused"), ("x" * 65, "refused"), ("a\nb", "refused")):
             self.code = code
             asked = self.a.ask(self.to_b, "busy")

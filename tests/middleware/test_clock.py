@@ -16,19 +16,19 @@ from middleware.entangled.clock import HeapClock, boot_time, use_monotonic_time
 
 class HeapClockTests(SynchronousTestCase):
     def setUp(self) -> None:
-        """Make a clock and a list of what was called."""
+        """Create a clock and a list that records the calls."""
         self.clock = HeapClock()
         self.called: list[object] = []
 
     def test_provides_interfaces(self) -> None:
-        """Clock and call provide what Twisted's interfaces ask for; a negative delay is an error of the caller."""
+        """The clock and its calls implement Twisted's interfaces; a negative delay raises ``ValueError``."""
         self.assertRaises(ValueError, self.clock.callLater, -1, self.called.append, 1)
 
         self.assertTrue(verifyObject(IReactorTime, self.clock))
         self.assertTrue(verifyObject(IDelayedCall, self.clock.callLater(1, self.called.append, 1)))
 
     def test_call_sees_its_own_moment(self) -> None:
-        """A call that runs during a long step sees the moment for which it was scheduled, and what it adds runs too."""
+        """A call sees the time for which it was scheduled, and calls that it schedules run in the same advance."""
 
         def again() -> None:
             self.called.append(self.clock.seconds())
@@ -41,7 +41,7 @@ class HeapClockTests(SynchronousTestCase):
         self.assertEqual(self.clock.seconds(), 10.0)
 
     def test_cancel_reset_delay(self) -> None:
-        """A cancelled call never comes, a moved one comes once and at its new moment."""
+        """A cancelled call never runs; a rescheduled call runs once, at its new time."""
         gone = self.clock.callLater(1, self.called.append, "gone")
         later = self.clock.callLater(1, self.called.append, "later")
         sooner = self.clock.callLater(5, self.called.append, "sooner")
@@ -59,7 +59,7 @@ class HeapClockTests(SynchronousTestCase):
         self.assertEqual(self.clock.getDelayedCalls(), [])
 
     def test_exception_passes(self) -> None:
-        """An exception of a call reaches whoever moves the time, and the clock stands at that call."""
+        """An exception in a call propagates to the caller of ``advance``, and the clock stops at that call."""
         self.clock.callLater(1, int, "x")
         self.clock.callLater(2, self.called.append, "next")
         self.assertRaises(ValueError, self.clock.advance, 5)
@@ -68,7 +68,7 @@ class HeapClockTests(SynchronousTestCase):
         self.assertEqual(self.called, ["next"])
 
     def test_agrees_with_a_sorted_list(self) -> None:
-        """Under random scheduling, moving and cancelling the calls come as a sorted list says."""
+        """Under random scheduling, rescheduling and cancelling the calls run in sorted order."""
         rng = random.Random(7)
         expected: dict[int, tuple[float, int]] = {}
         calls = []
@@ -90,7 +90,7 @@ class HeapClockTests(SynchronousTestCase):
         self.assertEqual(self.called, sorted(expected, key=lambda number: expected[number]))
 
     def test_cancelled_calls_leave_the_heap(self) -> None:
-        """A hundred thousand cancelled time-outs do not pile up."""
+        """Cancelled calls are removed from the heap."""
         for _ in range(100_000):
             self.clock.callLater(60, self.called.append, 1).cancel()
         self.assertLess(len(self.clock._heap), 200)
@@ -98,18 +98,18 @@ class HeapClockTests(SynchronousTestCase):
 
 class MonotonicTests(SynchronousTestCase):
     def test_reactors_run_on_boot_time(self) -> None:
-        """After the call every reactor measures with the clock that nobody sets; a second call changes nothing."""
+        """``use_monotonic_time`` makes every reactor use the boot-time clock, and can be called twice."""
         self.patch(ReactorBase, "seconds", ReactorBase.__dict__["seconds"])
         use_monotonic_time()
         use_monotonic_time()
         before = boot_time()()
         self.assertLessEqual(before, ReactorBase.seconds())
         self.assertLess(ReactorBase.seconds(), before + 1.0)
-        if hasattr(time, "CLOCK_BOOTTIME"):  # it counts the seconds in which the machine was suspended
+        if hasattr(time, "CLOCK_BOOTTIME"):  # CLOCK_BOOTTIME includes suspended time
             self.assertAlmostEqual(boot_time()(), time.clock_gettime(time.CLOCK_BOOTTIME), 1)
 
     def test_leap(self) -> None:
-        """After a suspension the clock has moved on, and what came due meanwhile is done once, late."""
+        """After a suspension, overdue calls run once, at the new time."""
         clock = HeapClock()
         called: list[float] = []
         clock.callLater(1.0, lambda: called.append(clock.seconds()))

@@ -1,4 +1,4 @@
-"""Tests of how long an answer is waited for, and how often it is asked for where datagrams get lost."""
+"""Tests of the round-trip estimate, the loss estimate and the number of retransmissions."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ FAR = 0.12
 
 
 class RoundTripTests(SynchronousTestCase):
-    """Behaviour of ``RoundTrip``."""
+    """Tests of ``RoundTrip``."""
 
     def test_an_answer_to_the_second_try(self) -> None:
-        """It may belong to either, so nothing is measured; the wait grows, up to what the answer took or the most."""
+        """A reply after a retransmission is ambiguous: it is not measured, and the timeout grows within limits."""
         for seconds, wait in ((0.0, FIRST_GUESS * BACK_OFF), (0.4, 0.4), (60.0, LONGEST)):
             unknown = RoundTrip()
             unknown.ambiguous(seconds)
@@ -42,16 +42,16 @@ class RoundTripTests(SynchronousTestCase):
 
 
 class LongWayTests(EndpointCase):
-    """A first contact over a way that is longer than anybody guesses."""
+    """A first contact over a path with a longer delay than the initial estimate."""
 
     def setUp(self) -> None:
-        """Move the two apart."""
+        """Set a long delay between the two endpoints."""
         super().setUp()
         self.equip(self.a)
         self.board.weather = Weather(FAR)
 
     def test_one_handshake_is_enough(self) -> None:
-        """Whoever asks or asks back what waits for the session, no second handshake is begun meanwhile."""
+        """Concurrent requests in both directions wait for one handshake; no second one is started."""
         self.got(self.a.ask(self.to_b, "add", 1))
         self.got(self.b.ask(self.to_a, "add", 2))
         self.got(self.a.ask(self.to_b, "add", 3))
@@ -59,7 +59,7 @@ class LongWayTests(EndpointCase):
         self.assertEqual((len(inits), self.runs), (1, [1, 2, 3]))
 
     def test_who_was_asked_knows_the_way(self) -> None:
-        """The confirmation of a session times the way for the one that was asked, which then asks back only once."""
+        """The confirmation of a session gives its responder a round-trip time, and its next request is sent once."""
         self.got(self.a.ask(self.to_b, "echo", 1))
         self.assertEqual(self.b.round_trip(self.to_a), 2 * FAR)
         sent = self.board.counters["sent"]
@@ -68,7 +68,7 @@ class LongWayTests(EndpointCase):
 
 
 def heard(share: float, count: int, rng: random.Random) -> Loss:
-    """What is learned of ``count`` datagrams, of which a share gets lost."""
+    """Simulate ``count`` datagrams with this loss rate and return the estimate."""
     loss, ahead = Loss(), 1
     for _ in range(count):
         if rng.random() < share:
@@ -80,16 +80,16 @@ def heard(share: float, count: int, rng: random.Random) -> Loss:
 
 
 class LossTests(SynchronousTestCase):
-    """Behaviour of ``Loss``."""
+    """Tests of ``Loss``."""
 
     def test_the_share_is_what_gets_lost(self) -> None:
-        """After some hundred datagrams the share is about right, on average over many that listen."""
+        """After 500 datagrams the mean estimate over 100 receivers is within 0.02 of the loss rate."""
         for share in (0.0, 0.1, 0.3):
             shares = [heard(share, 500, random.Random(seed)).share for seed in range(100)]
             self.assertLess(abs(sum(shares) / 100 - share), 0.02)
 
     def test_as_many_tries_as_it_takes(self) -> None:
-        """Of an exchange whose every try fails with the share there and back, hardly any fails in all of them."""
+        """The number of tries limits the probability that all of them fail to ``RARE``."""
         for share in (0.02, 0.1, 0.2):
             loss = Loss()
             loss.share = share
@@ -98,14 +98,14 @@ class LossTests(SynchronousTestCase):
             self.assertGreater(fails ** (loss.tries - 1), RARE)
 
     def test_none_where_nothing_is_lost_and_bounded_where_all_is(self) -> None:
-        """Without losses one try is enough; with nearly all lost there is a most."""
+        """Without loss one try is enough; with high loss the number of tries is bounded."""
         loss = Loss()
         self.assertEqual(loss.tries, 1)
         loss.share = 0.95
         self.assertEqual(loss.tries, MOST_TRIES)
 
     def test_what_was_overtaken_is_not_lost(self) -> None:
-        """Datagrams that come in another order than they were sent leave no more than a trace."""
+        """Reordered datagrams raise the loss estimate only slightly."""
         loss = Loss()
         for _ in range(100):
             loss.arrived(2)
@@ -113,7 +113,7 @@ class LossTests(SynchronousTestCase):
         self.assertLess(loss.share, 0.06)
 
     def test_a_leap_counts_once(self) -> None:
-        """A session that was cut off for long tells no more of the weather than a few datagrams do."""
+        """A long gap in the sequence numbers counts as at most ``MOST_AT_ONCE`` lost datagrams."""
         one, other = Loss(), Loss()
         one.arrived(2**40)
         other.arrived(MOST_AT_ONCE + 1)
@@ -122,10 +122,10 @@ class LossTests(SynchronousTestCase):
 
 
 class RoughWeatherTests(EndpointCase):
-    """How questions fare where much gets lost."""
+    """Requests under high loss."""
 
     def answered(self, count: int, timeout: float) -> int:
-        """How many of so many questions, one after the other, are answered in time."""
+        """Return the number of ``count`` sequential requests that are answered in time."""
         answers = 0
         for number in range(count):
             asked = self.a.ask(self.to_b, "echo", number, timeout=timeout)
@@ -135,14 +135,14 @@ class RoughWeatherTests(EndpointCase):
         return answers
 
     def test_at_30_percent_lost_hardly_any_question_fails(self) -> None:
-        """A question has as many tries within its time as the losses demand, where the usual four would not do."""
+        """At 30 % loss a request gets more tries within its timeout than the usual four, and hardly any fails."""
         self.board.weather = Weather(DELAY, loss=0.3)
         self.answered(100, 1.0)
         self.assertGreater(self.a.peers.tries, MAX_TRIES)
-        self.assertGreaterEqual(self.answered(500, 1.0), 498)  # with four tries each about 466
+        self.assertGreaterEqual(self.answered(500, 1.0), 498)  # with four tries about 466
 
     def test_the_first_contact_as_well(self) -> None:
-        """Handshakes, too, are tried as often as the losses demand."""
+        """Handshakes, too, are retransmitted according to the loss rate."""
         strangers = [self.endpoint(seed) for seed in range(3, 103)]
         for stranger, _ in strangers:
             self.equip(stranger)
@@ -151,10 +151,10 @@ class RoughWeatherTests(EndpointCase):
         asked = [self.a.ask(to, "echo", 1) for _, to in strangers]
         self.clock.advance(3.0)
         answers = [one.addErrback(lambda failure: None) for one in asked]
-        self.assertGreaterEqual(sum(self.successResultOf(one) == 1 for one in answers), 97)  # with four tries each 94
+        self.assertGreaterEqual(sum(self.successResultOf(one) == 1 for one in answers), 97)  # with four tries 94
 
     def test_few_tries_are_in_vain(self) -> None:
-        """Where round trips differ, no more than one answer in eight is overtaken by the next try."""
+        """With variable round-trip times at most one reply in eight arrives after the next retransmission."""
         dice, path = random.Random(1), RoundTrip()
         took = [0.04 + dice.expovariate(100.0) + dice.expovariate(100.0) for _ in range(400)]
         self.a.peers.loss.share = 0.5

@@ -1,4 +1,4 @@
-"""Tests of finding the team on a LAN in memory."""
+"""Tests of discovery on a simulated LAN."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.fleet import TEAM, Fleet, FleetCase
 
 
 class Lan(Fleet):
-    """Nodes that were told no address, on one segment."""
+    """Nodes without known addresses on one LAN segment."""
 
     def __init__(self) -> None:
         super().__init__(0)
@@ -23,7 +23,7 @@ class Lan(Fleet):
         self.groups: list[SegmentMulticast] = []
 
     def on(self, place: int, *known: Address, segment: Segment | None = None, team: bytes = TEAM) -> EntangledNode:
-        """A node of this place on ``segment``, which starts."""
+        """Create and start the node of this number on ``segment``."""
         group = (segment or self.segment).group()
         network = self.board.network(*self.address(place))
         identity, store, rng = self.identity(place), self.store(place), self.rng(place)
@@ -34,22 +34,22 @@ class Lan(Fleet):
         return node
 
     def traffic(self) -> dict[str, int]:
-        """What all nodes together counted."""
+        """Return the sum of the counters of all nodes."""
         counted = [node.discovery.counters for node in self.nodes if node.discovery is not None]
         return {name: sum(each[name] for each in counted) for name in ("calls", "answered", "left", "greeted")}
 
 
 class DiscoveryTests(FleetCase):
-    """Behaviour of ``Discovery``."""
+    """Tests of ``Discovery``."""
 
     def lan(self) -> Lan:
-        """A LAN that is stopped when the test ends."""
+        """Return a LAN that is stopped after the test."""
         lan = Lan()
         self.worlds.append(lan)
         return lan
 
     def test_two_find_each_other(self) -> None:
-        """Two nodes without known nodes are one network half a second later; who lost everybody calls again soon."""
+        """Two nodes without known nodes join within 0.5 s; a node that lost all peers soon searches again."""
         lan = self.lan()
         a, b = lan.on(0), lan.on(1)
         lan.run(0.5)
@@ -62,7 +62,7 @@ class DiscoveryTests(FleetCase):
         self.assertIn(c.contact, a.overlay.contacts())
 
     def test_newcomer_is_not_whole_before_it_met_all(self) -> None:
-        """Who entered through the LAN takes its team for whole only when it has met everybody in it."""
+        """A node that joins through the LAN regards its view as whole only after it met all members."""
         lan = self.lan()
         for place in range(6):
             lan.on(place)
@@ -76,7 +76,7 @@ class DiscoveryTests(FleetCase):
         self.assertEqual(len(newcomer.overlay.contacts()), 6)
 
     def test_first_of_a_network_waits_a_moment(self) -> None:
-        """Where nobody answers a node takes itself for the first of its network, after ``LISTEN`` and not before."""
+        """A node without replies regards itself as the first of its team after ``LISTEN`` seconds, not before."""
         lan = self.lan()
         lan.nodes.append(node := lan.made(0))
         node.stop()
@@ -88,7 +88,7 @@ class DiscoveryTests(FleetCase):
         self.assertTrue(alone.overlay.is_whole)
 
     def test_storm_of_a_hundred_stays_small(self) -> None:
-        """A hundred nodes that start at one moment are one network, with a few answers to each call."""
+        """A hundred nodes that start at the same time form one network, with few replies to each query."""
         lan = self.lan()
         for place in range(100):
             lan.on(place)
@@ -103,7 +103,7 @@ class DiscoveryTests(FleetCase):
         self.assertLess(traffic["greeted"], 350)
 
     def test_team_in_company_is_quiet(self) -> None:
-        """Ten nodes that know each other call about twice a minute, all together."""
+        """Ten connected nodes together send about two discovery queries per minute."""
         lan = self.lan()
         for place in range(10):
             lan.on(place)
@@ -113,7 +113,7 @@ class DiscoveryTests(FleetCase):
         self.assertLess(lan.traffic()["calls"] - before, 30)
 
     def test_two_halves_become_one(self) -> None:
-        """Two networks of one team, each whole for itself, become one soon after their LANs are joined."""
+        """Two separate networks of one team merge soon after their LANs are connected."""
         lan = self.lan()
         other = Segment(lan.board)
         for place in range(3):
@@ -127,7 +127,7 @@ class DiscoveryTests(FleetCase):
         self.assertEqual({len(node.overlay.contacts()) for node in lan.nodes}, {5})
 
     def test_new_interface_is_called_at_once(self) -> None:
-        """A node that comes to another LAN calls there at once, however long it would have waited."""
+        """A node that is connected to another LAN sends a discovery query there at once."""
         lan = self.lan()
         lan.segment.is_blocked = True
         a, b = lan.on(0), lan.on(1)
@@ -139,7 +139,7 @@ class DiscoveryTests(FleetCase):
         self.assertEqual(a.overlay.contacts(), [b.contact])
 
     def test_strangers_change_nothing(self) -> None:
-        """Another team hears nothing, a recorded call is answered once, and forged answers are greeted a few times."""
+        """Other teams are ignored, a replayed query gets one reply, and forged replies cause few handshakes."""
         lan = self.lan()
         a, b = lan.on(0), lan.on(1, team=b"o" * 32)
         lan.run(5.0)
@@ -165,7 +165,7 @@ class DiscoveryTests(FleetCase):
         self.assertLessEqual(a.discovery.counters["greeted"], 2)
 
     def test_known_node_that_is_gone_is_no_bar(self) -> None:
-        """A node whose known node is dead enters through whoever it finds on the LAN."""
+        """A node whose known node is dead joins through a node on the LAN."""
         lan = self.lan()
         first = lan.on(0)
         lan.run(1.0)

@@ -1,4 +1,4 @@
-"""Tests of what is said before any key is exchanged: cookies under load, and who is there at all."""
+"""Tests of the exchange before the handshake: cookies under load, and probes."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ HOME, ELSEWHERE = Address("10.0.0.1", 1), Address("10.0.0.1", 2)
 
 
 class CookieTests(EndpointCase):
-    """Behaviour of ``Cookies`` and of endpoints under a flood."""
+    """Tests of ``Cookies`` and of endpoints under a flood."""
 
     def invitation(self, number: int, cookie: bytes = b"") -> bytes:
-        """An INIT of some member."""
+        """Return an INIT datagram of a member."""
         own = Credentials.of(Identity(b"m" * 32), TEAM)
         ephemeral = (number << 64).to_bytes(32, "big")
         return Invitation(own, exchange_key(self.to_b.public), ephemeral, number, b"").datagram(cookie)
 
     def flood(self, count: int) -> list[bytes]:
-        """What ``b`` sends to an address from which that many INITs come at once."""
+        """Send ``count`` INITs to ``b`` from one address and return its replies."""
         answers: list[bytes] = []
         deaf = self.board.network("10.0.0.1", 1)
         deaf.listen(lambda datagram, source: answers.append(datagram))
@@ -37,7 +37,7 @@ class CookieTests(EndpointCase):
         return answers
 
     def test_above_the_rate_comes_a_cookie(self) -> None:
-        """A burst gets as many RESPs as the rate allows and cookies after that, which leave no session behind."""
+        """Up to the rate limit INITs get a RESP, above it a cookie that creates no session."""
         answers = self.flood(300)
         kinds = [answer[0] for answer in answers]
         self.assertEqual(kinds, [RESP] * int(QUIET_RATE) + [COOKIE] * (300 - int(QUIET_RATE)))
@@ -46,7 +46,7 @@ class CookieTests(EndpointCase):
         self.assertEqual({len(answer) for answer in answers if answer[0] == COOKIE}, {COOKIE_BYTES})
 
     def test_a_cookie_is_bound_to_its_address_and_time(self) -> None:
-        """A cookie pays from its own address, for at most four minutes, and for so many handshakes in a second."""
+        """A cookie is valid from its address for at most four minutes, and at a limited rate of handshakes."""
         cookies = Cookies(b"c" * 32, random.Random(1))
         cookie = cookies._cookie(HOME, int(1000 / 120))
         paid = self.invitation(1, cookie)
@@ -59,7 +59,7 @@ class CookieTests(EndpointCase):
         self.assertEqual(admitted, int(MOST_RATE))
 
     def test_forged_cookies(self) -> None:
-        """A COOKIE from elsewhere, for no INIT of ours or with a wrong seal is counted and changes nothing."""
+        """A COOKIE from another address, for an unknown INIT or with a wrong tag is counted and has no effect."""
         self.b._cookies._limit._tokens = -1e6
         self.a.ask(self.to_b, "echo", 7).addErrback(lambda failure: None)
         self.clock.advance(1.5 * DELAY)
@@ -80,10 +80,10 @@ TOKEN = b"0123456789abcdef"
 
 
 class HailTests(EndpointCase):
-    """Behaviour of ``Endpoint.hail`` and of what answers it."""
+    """Tests of ``Endpoint.hail`` and of its replies."""
 
     def test_who_is_there(self) -> None:
-        """An echo, of another team too, has the team's fingerprint, version and clock, and where the hail came from."""
+        """A reply, also of another team, contains fingerprint, version and clock, and the address of the prober."""
         self.b.echoer.wall = lambda: 1_700_000_000.25
         self.b.echoer._fingerprint = lambda: Gate.fingerprint
         found = self.got(self.a.hail(self.to_b.address), 2 * DELAY)
@@ -95,7 +95,7 @@ class HailTests(EndpointCase):
         self.assertEqual((found.fingerprint, found.wall), (bytes(8), 0.0))
 
     def test_nobody_is_there(self) -> None:
-        """Where nobody listens the hail fails in time, and one that is cancelled leaves nothing behind."""
+        """A probe without a reply fails after its timeout, and a cancelled probe leaves no state."""
         self.failed(self.a.hail(HOME, 1.0), NoAnswer, 1.0)
         self.a.hail(HOME, 1.0).addErrback(lambda failure: None).cancel()
         self.assertEqual(self.a.hailer._pending, {})
@@ -105,7 +105,7 @@ class HailTests(EndpointCase):
         self.failureResultOf(self.a.hail(HOME), NotRunning)
 
     def test_what_is_none(self) -> None:
-        """Hails and echoes of a wrong length or for no question are counted and answered by nothing."""
+        """Probes and replies of wrong length, and replies without a probe, are counted and not answered."""
         receiver = self.taps[self.to_b.address].receiver
         before = self.board.counters["sent"]
         for datagram in (hail(TOKEN)[:-1], hail(TOKEN) + b"x", bytes([HAIL]), bytes([ECHO]) + bytes(7)):
@@ -117,7 +117,7 @@ class HailTests(EndpointCase):
         self.assertRaises(Malformed, echo_of, hail(TOKEN))
 
     def test_an_echo_from_elsewhere(self) -> None:
-        """An echo from another address than was hailed is no answer."""
+        """A reply from another address than the probed one is ignored."""
         sent: list[bytes] = []
         hailer = Hailer(lambda datagram, to: sent.append(datagram), self.clock, random.Random(1))
         asked = hailer.hail(HOME)

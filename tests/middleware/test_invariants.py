@@ -1,4 +1,4 @@
-"""A few schedules of ``tests.invariants``, and the seeded bugs that they find; ``make schedules`` runs 2,000."""
+"""Some schedules of ``tests.invariants`` and the seeded bugs that they find; ``make schedules`` runs 2,000."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ DIGEST = "from tests.middleware.test_invariants import digests; print(digests())
 
 
 def digests() -> list[str]:
-    """The hashes of all datagrams and all events of a run with every workload of nodes, and of the other worlds."""
+    """Return the digests of all datagrams and events of one run of every workload, with tasks and leases."""
     schedule, tasks, leases = Schedule(1, DiskFleet), Tasks(3), Leases(3)
     schedule.run([workload(schedule) for workload in WORKLOADS.values()])
     tasks.run()
@@ -43,29 +43,29 @@ class InvariantTests(SynchronousTestCase):
         return schedule.run([Records(schedule)])
 
     def test_schedules(self) -> None:
-        """Eight random schedules of loss, cuts, kills and restarts break no invariant of the records."""
+        """Eight random schedules of loss, partitions, kills and restarts violate no invariant of the records."""
         failed = {seed: found for seed in range(5001, 5009) if (found := self.found(seed))}
         self.assertEqual(failed, {})
 
     def test_all_workloads(self) -> None:
-        """A schedule of all workloads breaks no invariant: records, tuples, hostile datagrams, failing disks."""
+        """A schedule of all workloads (records, tuples, hostile datagrams, disk errors) violates no invariant."""
         self.assertEqual({seed: found for seed in (7,) if (found := run(seed, ALL).found)}, {})
 
     def test_whole_agents(self) -> None:
-        """Fifteen schedules of agents that join, leave, fail, pause and cancel break none of E4 to E7; none repeats."""
+        """Fifteen schedules of agents that join, leave, fail, pause and cancel violate none of E4 to E7 and differ."""
         outcomes = [run(seed, ("tasks",)) for seed in range(7001, 7016)]
         self.assertEqual({outcome.seed: outcome.found for outcome in outcomes if outcome.found}, {})
         self.assertGreater(len({outcome.digest for outcome in outcomes}), 13)
         self.assertEqual(outcomes[0], run(7001, ("tasks",)))
 
     def test_bugs_have_their_places(self) -> None:
-        """Every seeded bug replaces something that the library has."""
+        """Every seeded bug replaces an existing attribute of the code."""
         for bug in FINDERS:
             with self.subTest(bug=bug), seeded(bug):
                 pass
 
     def test_bugs_are_found(self) -> None:
-        """A bug that is put in breaks an invariant of the workload that looks for it."""
+        """A schedule with a seeded bug violates the invariant that detects it."""
         blind = []
         for bug, (seed, invariant) in BITING.items():
             found = run(seed, FINDERS[bug], bug).found
@@ -74,17 +74,17 @@ class InvariantTests(SynchronousTestCase):
         self.assertEqual(blind, [])
 
     def test_same_in_every_process(self) -> None:
-        """Runs are the same, datagram by datagram and event by event, however the process hashes its strings."""
+        """Runs produce the same datagrams and events in every process, regardless of string hash randomization."""
         replayed(self, DIGEST)
 
     def test_order(self) -> None:
-        """What runs before it in the same process changes nothing about a run: they may come in any order."""
+        """A run does not depend on earlier runs in the same process."""
         wanted = [(seed, only) for only in (("records",), ("tasks",), ("leases",), ("groups",)) for seed in (3,)]
         outcomes = [run(seed, only) for seed, only in wanted]
         self.assertEqual([run(seed, only) for seed, only in reversed(wanted)], outcomes[::-1])
 
     def test_shrunk(self) -> None:
-        """A schedule that a bug fails is shrunk to the faults that it takes, and its line repeats it."""
+        """A failing schedule is reduced to the necessary faults, and the printed command line reproduces it."""
         bug = "votes forgotten by a restart"
         whole = run(SHRUNK, ("tuples", "deciders"), bug)
         left = least(whole, bug)
@@ -102,6 +102,6 @@ class InvariantTests(SynchronousTestCase):
         )
 
     def test_jobs(self) -> None:
-        """Several processes give the same outcomes in the same order as one."""
+        """Several processes return the same outcomes in the same order as a single process."""
         seeds = range(1, 4)
         self.assertEqual(list(run_all(seeds, 2, ("records",))), [run(seed, ("records",)) for seed in seeds])

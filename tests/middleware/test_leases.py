@@ -1,4 +1,4 @@
-"""Tests of leases that differ: each record lives as long as its own, and signs of life go out when they are due."""
+"""Tests of leased records with different TTLs, and of the interval of their renewals."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class LeaseTests(FleetCase):
         return [record.name for record in fleet.nodes[place].store.get(key, tombstones=True)]
 
     def told(self, fleet: Fleet, place: int, seconds: float) -> list[float]:
-        """The leases that the node of ``place`` is told in the next seconds, one for each sign of life."""
+        """Return the TTLs of the renewals that the node at ``place`` receives in this time."""
         told: list[float] = []
         replica = fleet.nodes[place].replica
         answer = replica.answer_alive
@@ -28,7 +28,7 @@ class LeaseTests(FleetCase):
         return told
 
     def test_each_its_own(self) -> None:
-        """With its owner a lease of 1 s is gone within that, and one of 12 s lasts as long as it says."""
+        """After their owner fails, a record with a 1 s lease expires within 1.2 s, one with 12 s after 12 s."""
         fleet = self.fleet(3)
         fleet.nodes[2].put(KEY, "short", b"x", "leased")
         fleet.nodes[1].put(KEY, "long", b"x", "leased", lease=12.0)
@@ -44,14 +44,14 @@ class LeaseTests(FleetCase):
         self.assertEqual(self.names(fleet), [])
 
     def test_signs_are_as_seldom_as_the_lease_is_long(self) -> None:
-        """A node that leases for 60 s says three times a minute that it lives, not 180 times."""
+        """A node with a lease of 60 s renews it three times per minute."""
         fleet = self.fleet(2)
         fleet.nodes[1].put(KEY, "long", b"x", "leased", lease=60.0)
         fleet.run(30.0)
         self.assertEqual(self.told(fleet, 0, 60.0), [60.0] * 3)
 
     def test_the_shorter_one_is_told(self) -> None:
-        """Who holds a long lease and a short one is told the short one, and after it has ended the long one again."""
+        """A node with a long and a short lease renews the short one; after its release it renews the long one again."""
         fleet = self.fleet(2)
         fleet.nodes[1].put(KEY, "long", b"x", "leased", lease=60.0)
         fleet.nodes[1].put(OTHER, "short", b"x", "leased")
@@ -62,7 +62,7 @@ class LeaseTests(FleetCase):
         self.assertEqual(self.told(fleet, 0, 60.0), [60.0] * 3)
 
     def test_who_has_the_long_one_only(self) -> None:
-        """Who holds only the long lease of an owner is told of it as seldom as it is long."""
+        """A replica that stores only the long lease of an owner receives renewals at the long interval."""
         fleet = self.fleet(10)
         fleet.run(3.0)
         owner = fleet.nodes[1]
@@ -77,7 +77,7 @@ class LeaseTests(FleetCase):
         self.assertEqual(self.told(fleet, place, 60.0), [60.0] * 3)
 
     def test_a_short_one_comes_later(self) -> None:
-        """A short lease that begins between two far signs of a long one is kept alive from its first moment on."""
+        """A short lease that starts between two renewals of a long one is renewed from its start."""
         fleet = self.fleet(3)
         fleet.nodes[1].put(KEY, "long", b"x", "leased", lease=60.0)
         fleet.run(25.0)
@@ -87,9 +87,9 @@ class LeaseTests(FleetCase):
             self.assertEqual(sorted(self.names(fleet)), ["long", "short"])
 
     def test_release(self) -> None:
-        """What is released leaves its owner at once, the others within its lease, and no trace; all else stays.
+        """A released record disappears at its owner at once and at the replicas within its lease.
 
-        The slot can be filled again at once.
+        Other records stay, and the slot can be used again at once.
         """
         fleet = self.fleet(3)
         fleet.nodes[1].put(KEY, "stays", b"x", "leased", lease=6.0)
@@ -107,7 +107,7 @@ class LeaseTests(FleetCase):
         self.assertEqual([r.value for r in fleet.nodes[0].store.get(OTHER)], [b"z"])
 
     def test_what_the_team_keeps_is_not_released(self) -> None:
-        """A record that outlives its owner has no lease to let go of."""
+        """``release`` does not affect a record that outlives its owner."""
         fleet = self.fleet(2)
         self.done(fleet, fleet.nodes[1].put(KEY, "kept", b"x"), 1.0)
         fleet.nodes[1].release(KEY, "kept")
@@ -115,7 +115,7 @@ class LeaseTests(FleetCase):
         self.assertEqual(self.names(fleet), ["kept"])
 
     def test_the_nodes_lease_changes(self) -> None:
-        """A record is kept for the longer one of its own lease and the node's, which may change."""
+        """A record is kept for the longer one of its lease and the node's lease, which can change."""
         fleet = self.fleet(2)
         fleet.nodes[1].put(OTHER, "short", b"x", "leased", lease=0.1)
         fleet.run(5.0)

@@ -1,4 +1,4 @@
-"""Tests of ``docs/reference/wire-protocol.md`` by a whole exchange with fixed keys: every datagram byte for byte."""
+"""Tests of ``docs/reference/wire-protocol.md``: a complete exchange with fixed keys, byte for byte."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ LARGE = bytes(range(256)) * 6
 
 
 class Dice(random.Random):
-    """Dice that fall as the vectors say: bytes that count up from ``start``, and numbers made of them."""
+    """A deterministic random generator that returns bytes counting up from ``start``, and numbers of them."""
 
     def __init__(self, start: int) -> None:
         super().__init__(0)
@@ -33,7 +33,7 @@ class Dice(random.Random):
         self.secrets: list[str] = []
 
     def randbytes(self, n: int) -> bytes:
-        """The next ``n`` bytes."""
+        """Return the next ``n`` bytes."""
         taken = bytes((self._next + place) % 256 for place in range(n))
         self._next = (self._next + 16) % 256
         if n == 32:
@@ -41,13 +41,13 @@ class Dice(random.Random):
         return taken
 
     def getrandbits(self, k: int) -> int:
-        """The next number of ``k`` bits, little-endian."""
+        """Return the next number of ``k`` bits, from little-endian bytes."""
         number: int = int.from_bytes(self.randbytes(8), "little") % (1 << k)
         return number
 
 
 class Doorway(Gate):
-    """A door that shows a short pass."""
+    """An admission check with a short certificate."""
 
     def __init__(self, name: str, seed: int) -> None:
         super().__init__(seed, seed, f"pass of {name}".encode())
@@ -55,7 +55,7 @@ class Doorway(Gate):
 
 
 def exchange() -> dict[str, Any]:
-    """What ``alice`` and ``bob`` say to each other: a hail, a greeting, four calls, one of them under load."""
+    """Run ``alice`` and ``bob`` through a probe, a handshake and four calls, one of them under load."""
     clock = HeapClock()
     board = Switchboard(clock, random.Random(0), Weather(0.01))
     team = bytes(range(32))
@@ -121,14 +121,14 @@ def exchange() -> dict[str, Any]:
 
 
 class ProtocolTests(SynchronousTestCase):
-    """The vectors."""
+    """The test vectors."""
 
     def test_whole_exchange(self) -> None:
-        """Fixed keys and dice give the very datagrams that stand in the vectors."""
+        """Fixed keys and a fixed random generator produce exactly the datagrams of the vectors."""
         self.assertEqual(exchange(), json.loads(VECTORS.read_text(encoding="utf-8")))
 
     def test_every_kind_is_there(self) -> None:
-        """The vectors have every kind of datagram, a parcel each way and a receipt for it."""
+        """The vectors contain every kind of datagram, and fragments and acknowledgements in both directions."""
         said = json.loads(VECTORS.read_text(encoding="utf-8"))["datagrams"]
         self.assertEqual({one["kind"] for one in said}, set(NAMES.values()))
         parcels = {(one["from"], one["inside"][:2]) for one in said if one["kind"] == "DATA"}

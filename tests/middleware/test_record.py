@@ -1,4 +1,4 @@
-"""Records: which holds, who signed, and what may come from the wire."""
+"""Tests of records: conflict resolution, signatures and decoding."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ ANYTHING = st.recursive(
 
 class RecordTest(SynchronousTestCase):
     def test_which_holds(self) -> None:
-        """The higher sequence holds; of two with one sequence all replicas choose the same, and none beats itself."""
+        """The higher sequence number wins; for equal numbers all replicas choose the same record."""
         one, other = record(value=b"1"), record(value=b"2")
         self.assertTrue(record(sequence=2).beats(one))
         self.assertFalse(one.beats(record(sequence=2)))
@@ -39,7 +39,7 @@ class RecordTest(SynchronousTestCase):
         self.assertTrue(one.beats(None))
 
     def test_signature_covers_all(self) -> None:
-        """A record of which anything was changed after it was signed is not genuine."""
+        """A record with any field changed after signing has no valid signature."""
         self.assertTrue(record().is_genuine())
         changes: list[dict[str, object]] = [
             {"key": hashed_key("tasks")},
@@ -57,7 +57,7 @@ class RecordTest(SynchronousTestCase):
             self.assertFalse(replace(record(), **change).is_genuine(), change)  # type: ignore[arg-type]
 
     def test_good_signatures_are_remembered(self) -> None:
-        """A record with a good signature is checked once; whatever is changed in it is another record."""
+        """A valid signature is verified once; a changed record is verified separately."""
         signed = Signed()
         self.assertTrue(signed.is_genuine(record()))
         for change in ({"value": b"there"}, {"sequence": 2}, {"signature": bytes(64)}, {"owner": CAT.public}):
@@ -67,7 +67,7 @@ class RecordTest(SynchronousTestCase):
         self.assertTrue(signed.is_genuine(replace(record())))
 
     def test_remembered_signatures_are_bounded(self) -> None:
-        """Of many records those are remembered that were seen last."""
+        """The cache of valid signatures is bounded and keeps the most recently used ones."""
         self.patch(records, "MAX_SIGNED", 3)
         signed = Signed()
         for sequence in (1, 2, 3, 1, 4):
@@ -76,18 +76,18 @@ class RecordTest(SynchronousTestCase):
         self.assertEqual([n for n in range(1, 5) if signed.is_genuine(record(sequence=n))], [1, 3, 4])
 
     def test_there_and_back(self) -> None:
-        """What was packed into a message comes out of it the same."""
+        """A record survives packing and unpacking."""
         for one in (record(), record(value=None, lifetime="leased"), record("", value=bytes(MAX_VALUE))):
             self.assertEqual(unpacked(msgpack.unpackb(msgpack.packb(one.packed()))), one)
 
     def test_message_bytes(self) -> None:
-        """The bytes that a record is said to take in a message are enough for it, and not many more."""
+        """``message_bytes`` is an upper bound of the packed size, by less than 40 bytes."""
         for one in (record(), record(value=None), record("ä" * 64, sequence=2**63 - 1), record(value=bytes(20_000))):
             taken = len(msgpack.packb(one.packed()))
             self.assertTrue(taken <= one.message_bytes < taken + 40, (taken, one.message_bytes))
 
     def test_limits(self) -> None:
-        """Whatever is out of its limits, or of another type, is no record."""
+        """A field with a value out of range or of another type makes the record invalid."""
         bad: dict[int, list[object]] = {
             0: [KEY[:-1], KEY + b"\0", "key", None],
             1: ["n" * (MAX_NAME + 1), b"name", None],
@@ -109,11 +109,11 @@ class RecordTest(SynchronousTestCase):
 
     @given(ANYTHING | st.lists(ANYTHING, min_size=8, max_size=8))
     def test_total(self, fields: object) -> None:
-        """Anything a message can hold is a record or is not; nothing makes an accident."""
+        """Any input decodes to a record or None, without an exception."""
         self.assertTrue(unpacked(fields) is None or isinstance(unpacked(fields), Record))
 
     def test_slots(self) -> None:
-        """A slot that was sent as a list comes back; what is no list of a key, an owner and a name is no slot."""
+        """A slot survives packing as a list; anything but a list of key, owner and name is rejected."""
         self.assertEqual(slot_unpacked(list(record().slot)), record().slot)
         wrong: list[object] = [
             [],
@@ -127,6 +127,6 @@ class RecordTest(SynchronousTestCase):
             self.assertIsNone(slot_unpacked(fields), fields)
 
     def test_keys_of_texts(self) -> None:
-        """The key of a text has 160 bits, is the same everywhere, and another text has another one."""
+        """The key of a text has 160 bits, is the same on every node, and differs from the keys of other texts."""
         self.assertEqual(hashed_key("devices").hex(), "880ce22f2953aafc3ac777bc4930bb783fb05bfa")
         self.assertNotEqual(hashed_key("devices"), hashed_key("device"))

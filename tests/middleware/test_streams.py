@@ -1,4 +1,4 @@
-"""Tests of camera channels: publisher and viewers on a switchboard."""
+"""Tests of camera streams from a publisher to its viewers on a switchboard."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ CAMERA = "camera"
 
 
 class StreamsTests(EndpointCase):
-    """``b`` publishes, ``a`` looks."""
+    """``b`` publishes, ``a`` views."""
 
     def setUp(self) -> None:
         super().setUp()
@@ -35,7 +35,7 @@ class StreamsTests(EndpointCase):
         self.viewer._answer_part(self.to_publisher, CAMERA, sequence, number, count, part, age_ms)
 
     def test_frames_arrive_whole(self) -> None:
-        """A frame of many parts arrives as it was, at every watcher, until it stops; no timer is left."""
+        """A frame of many fragments arrives intact at every viewer until it stops; no timer is left."""
         others: list[int] = []
         stop = self.viewer.look(self.to_publisher, CAMERA, self.see)
         stop_other = self.viewer.look(self.to_publisher, CAMERA, lambda sequence, frame, age: others.append(sequence))
@@ -57,7 +57,7 @@ class StreamsTests(EndpointCase):
         self.assertEqual(self.clock.getDelayedCalls(), [])
 
     def test_age_counts_from_the_camera(self) -> None:
-        """A frame's age is what it was when it was sent, and its time on the way, though no clock is compared."""
+        """The age of a frame is its age when sent plus its transfer time, without synchronized clocks."""
         self.viewer.look(self.to_publisher, CAMERA, self.see)
         self.clock.advance(0.1)
         self.publisher.offer(CAMERA, 1, bytes(2 * PART_BYTES), 0.25)
@@ -70,7 +70,7 @@ class StreamsTests(EndpointCase):
         self.assertLess(abs(self.ages[1] - 0.8 - DELAY), 0.0005)
 
     def test_nothing_is_sent_unseen(self) -> None:
-        """While nobody looks nothing is sent, soon after the last look neither; nor are empty and too large frames."""
+        """A publisher sends nothing without viewers, or soon after the last one, and no empty or oversized frames."""
         self.assertFalse(self.publisher.is_wanted(CAMERA))
         stop = self.viewer.look(self.to_publisher, CAMERA, self.see)
         self.clock.advance(10.0)
@@ -86,7 +86,7 @@ class StreamsTests(EndpointCase):
         self.assertEqual(self.board.counters["sent"], sent)
 
     def test_lost_part_drops_the_frame(self) -> None:
-        """A frame that misses a part is dropped, and so is an older one that comes late; none is shown twice."""
+        """A frame with a lost fragment is dropped, as is a late older frame; no frame is shown twice."""
         self.viewer.look(self.to_publisher, CAMERA, self.see)
         self.part(1, 0, 2, b"a")
         self.part(2, 1, 2, b"d")
@@ -96,7 +96,7 @@ class StreamsTests(EndpointCase):
         self.assertEqual(self.frames, [(2, b"cd")])
 
     def test_publisher_begins_anew(self) -> None:
-        """A camera that counts from the start again is seen again after a moment."""
+        """After a camera restarts its sequence numbers, its frames are accepted within about a second."""
         self.viewer.look(self.to_publisher, CAMERA, self.see)
         self.part(500, 0, 1, b"old")
         self.part(1, 0, 1, b"too soon")
@@ -106,7 +106,7 @@ class StreamsTests(EndpointCase):
         self.assertEqual([frame for _, frame in self.frames], [b"old", b"new", b"newer"])
 
     def test_crafted_parts(self) -> None:
-        """Parts that do not fit together, are too many or too large, change nothing and raise nothing."""
+        """Inconsistent, oversized or unexpected fragments are ignored without an exception."""
         self.viewer.look(self.to_publisher, CAMERA, self.see)
         self.part(1, 5, 6, b"x")
         self.part(1, 0, 2, b"x")
@@ -120,7 +120,7 @@ class StreamsTests(EndpointCase):
         self.assertEqual(self.frames, [])
 
     def test_viewers_are_bounded(self) -> None:
-        """There is an end to viewers and names, whoever looks may go on looking, and places come free again."""
+        """The number of viewers is bounded, existing viewers can renew, and expired entries free their places."""
         peers = [Contact(bytes([n]) * 32, Address("10.0.0.1", 9)) for n in range(MAX_VIEWERS + 1)]
         for number, peer in enumerate(peers[:-1]):
             self.assertTrue(self.publisher._answer_open(peer, f"channel {number}"))

@@ -1,4 +1,4 @@
-"""Tests of the networks in memory."""
+"""Tests of the simulated network."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from middleware.entangled.network.switchboard import Switchboard, Weather
 
 
 class _Far:
-    """A link on which everything takes 2 s, comes twice, and is written down."""
+    """A link that delays each datagram by 2 s, duplicates it and records it."""
 
     def __init__(self) -> None:
         self.asked: list[tuple[Address, Address, int, float]] = []
@@ -24,10 +24,10 @@ class _Far:
 
 
 class SwitchboardTests(SynchronousTestCase):
-    """Behaviour of ``Switchboard``."""
+    """Tests of ``Switchboard``."""
 
     def setUp(self) -> None:
-        """Join two networks."""
+        """Create two networks."""
         self.clock = HeapClock()
         self.board = Switchboard(self.clock, random.Random(3))
         self.got: list[tuple[float, bytes]] = []
@@ -45,7 +45,7 @@ class SwitchboardTests(SynchronousTestCase):
         self.clock.advance(1)
 
     def test_delivers_later_and_in_order(self) -> None:
-        """Without delay a datagram arrives after the sender is done, in order; one too large, or to nobody, is lost."""
+        """Datagrams arrive asynchronously and in order; an oversized one, and one to an unused address, are dropped."""
         network: Network = self.a
         self.a.send(bytes(MAX_CARRIED + 1), self.b.address)
         self.a.send(b"x", Address("127.0.0.1", 9))
@@ -56,7 +56,7 @@ class SwitchboardTests(SynchronousTestCase):
         self.assertEqual((self.board.counters["oversized"], self.board.counters["unheard"]), (1, 1))
 
     def test_loses_doubles_and_delays(self) -> None:
-        """Loss, duplication, delay and jitter come as the weather says."""
+        """Loss, duplication, delay and jitter match the configured ``Weather``."""
         self.board.weather = Weather(delay_s=0.1, jitter_s=0.02, loss=0.2, duplicate=0.1, reorder=0.1)
         self._send(5000)
         self.assertApproximates(self.board.counters["lost"] / 5000, 0.2, 0.02)
@@ -67,7 +67,7 @@ class SwitchboardTests(SynchronousTestCase):
         self.assertApproximates(len(late) / len(self.got), 0.1, 0.02)
 
     def test_cut_one_way(self) -> None:
-        """A one-way cut, and a barrier, stop one direction, what is on its way included; healing opens it."""
+        """A one-way cut and a barrier drop datagrams in one direction, also those in transit, until they heal."""
         for close in (
             lambda: self.board.cut(self.a.address, self.b.address, one_way=True),
             lambda: self.board.barriers.append(lambda source, to: source == self.a.address),
@@ -85,7 +85,7 @@ class SwitchboardTests(SynchronousTestCase):
             self.assertEqual(len(self.got), 2)
 
     def test_partition(self) -> None:
-        """Nothing passes between groups, and who is named in none is with the others who are not."""
+        """Groups are isolated from each other; addresses without a group form another group."""
         c = self.board.network()
         c.listen(self._receive)
         self.board.partition([self.a.address], [self.b.address])
@@ -98,7 +98,7 @@ class SwitchboardTests(SynchronousTestCase):
         self.assertEqual(len(self.got), 1)
 
     def test_killed_network_is_deaf_and_mute(self) -> None:
-        """A killed network neither sends nor receives, and its address may be taken by another one."""
+        """A killed network neither sends nor receives, and another network can use its address."""
         self.board.kill(self.b.address)
         self._send(1)
         self.b.send(b"ghost", self.a.address)
@@ -110,7 +110,7 @@ class SwitchboardTests(SynchronousTestCase):
         self.assertEqual(len(self.got), 1)
 
     def test_port_is_held_once(self) -> None:
-        """A second network at an address that is listened to is refused; after closing, twice even, it is free."""
+        """A second network on an address in use is rejected; after ``close``, which can be repeated, it can listen."""
         twin = self.board.network(*self.b.address)
         self.assertRaises(PortInUse, twin.listen, self._receive)
         self.b.close()
@@ -118,7 +118,7 @@ class SwitchboardTests(SynchronousTestCase):
         twin.listen(self._receive)
 
     def test_link_says_how_long_everything_takes(self) -> None:
-        """A link says how long each datagram takes, unless one direction of two addresses has a weather of its own."""
+        """A link sets the delay of each datagram, except in a direction that has a separate ``Weather``."""
         link = self.board.link = _Far()
         self.clock.advance(5)
         self.a.send(b"far", self.b.address)
@@ -134,7 +134,7 @@ class SwitchboardTests(SynchronousTestCase):
         self.assertEqual(len(link.asked), 3)
 
     def test_traffic_goes_on_in_the_next_life(self) -> None:
-        """Datagrams and bytes are counted at both ends, in a tally that a later network may go on with."""
+        """Datagrams and bytes are counted at both ends, and a later network can continue the counters."""
         self.board.weather = Weather(loss=1.0)
         self.a.send(b"lost", self.b.address)
         self.board.weather = Weather()
@@ -149,7 +149,7 @@ class SwitchboardTests(SynchronousTestCase):
         self.assertEqual((self.a.traffic.sent, self.a.traffic.sent_bytes), (5, 8))
 
     def test_digest_is_that_of_every_delivery(self) -> None:
-        """The same seed gives the same digest, however often it is asked for; another seed gives another one."""
+        """A seed determines the digest, which does not depend on earlier queries of it."""
 
         def run(seed: int, is_asked_often: bool) -> str:
             clock = HeapClock()

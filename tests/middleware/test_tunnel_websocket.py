@@ -1,4 +1,4 @@
-"""Tests of ``middleware.entangled.network.websocket`` and ``url``: datagrams in a WebSocket, and where one begins."""
+"""Tests of ``middleware.entangled.network.websocket`` and ``url``: datagrams in WebSocket messages, and tunnel URLs."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class WebSocketTests(SynchronousTestCase):
         self.assertTrue(self.client.is_open and self.server.is_open, (self.client.fault, self.server.fault))
 
     def test_carry_datagrams_cut_anyhow(self) -> None:
-        """Datagrams of every length arrive whole and in order, both ways, whether bytes come one by one or together."""
+        """Datagrams of every length arrive in order in both directions, for any segmentation of the byte stream."""
         sizes = [0, 1, 125, 126, 127, 1399, 1400, 1452, MAX_PAYLOAD]
         sent = [random.Random(size).randbytes(size) for size in sizes]
         for is_cut in (True, False):
@@ -40,7 +40,7 @@ class WebSocketTests(SynchronousTestCase):
                 self.assertEqual(sink.fault, "")
 
     def test_refuse_garbage(self) -> None:
-        """A text, or a message longer than a datagram, ends the link with a goodbye."""
+        """A text message and a message longer than a datagram close the connection."""
         masked = bytes(4)
         garbage = {
             "text": b"\x81\x80" + masked,
@@ -57,7 +57,7 @@ class WebSocketTests(SynchronousTestCase):
             self.assertEqual(self.server.received(self.client.framed(b"x")), ([], b""), name)
 
     def test_refuse_other_requests(self) -> None:
-        """Another page, another version and another kind of WebSocket are answered in HTTP and end the link."""
+        """A request for another path, version or subprotocol gets an HTTP error and closes the connection."""
         lawful = self.client.opening()
         for stream, status in (
             (lawful.replace(b"/swarm", b"/admin"), b"404"),
@@ -70,7 +70,7 @@ class WebSocketTests(SynchronousTestCase):
             self.assertEqual(reply.split(b" ")[1], status)
 
     def test_refuse_other_answers(self) -> None:
-        """A client knows a page, an answer out of a cache and another WebSocket from a tunnel."""
+        """A client rejects a web page, a cached response and the WebSocket of another service."""
         for old, new, why in (
             (b"101 Switching Protocols", b"403 Forbidden", "403"),
             (b"swarm-tunnel-1", b"chat", "chat"),
@@ -85,7 +85,7 @@ class WebSocketTests(SynchronousTestCase):
             self.assertFalse(client.is_open)
 
     def test_hear_for_whom_a_proxy_speaks(self) -> None:
-        """Of the addresses that a request names the last one is taken: it is the proxy's own word."""
+        """The last address in X-Forwarded-For is used, as the proxy itself adds it."""
         head = self.client.opening().replace(b"Upgrade: w", b"X-Forwarded-For: 6.6.6.6, 10.0.0.9\r\nUpgrade: w")
         self.server.received(head)
         self.assertEqual(self.server.forwarded, "10.0.0.9")
@@ -93,7 +93,7 @@ class WebSocketTests(SynchronousTestCase):
 
 class UrlTests(SynchronousTestCase):
     def test_read(self) -> None:
-        """Host, port and path are found, the usual ones where they are left out; the text comes back."""
+        """Host, port and path are parsed, with defaults for omitted parts, and converted back to text."""
         for text, parts, again in (
             ("wss://a.example", ("wss", "a.example", 443, "/swarm"), "wss://a.example/swarm"),
             ("ws://127.0.0.1:8000/x", ("ws", "127.0.0.1", 8000, "/x"), "ws://127.0.0.1:8000/x"),
@@ -113,7 +113,7 @@ class UrlTests(SynchronousTestCase):
             self.assertRaises(ValueError, Url.of, text)
 
     def test_address(self) -> None:
-        """Each URL has a virtual address of its own, the same whenever it is read."""
+        """Each URL has a distinct, stable virtual address."""
         addresses = {Url.of(text).address for text in ("wss://a", "wss://a:443/swarm", "wss://b", "wss://a:444")}
         self.assertEqual(len(addresses), 3)
         for address in addresses:
@@ -121,7 +121,7 @@ class UrlTests(SynchronousTestCase):
             self.assertTrue(address.is_virtual and not Address("10.0.0.1", 7000).is_virtual)
 
     def test_proxy(self) -> None:
-        """What ``https_proxy`` usually says is read, a login included, and no error shows it."""
+        """The usual values of ``https_proxy``, with a login, are parsed, and no error message contains the login."""
         for text, parts in (
             ("http://10.0.0.1:8080", ("10.0.0.1", 8080, "")),
             ("proxy:3128/", ("proxy", 3128, "")),

@@ -1,4 +1,4 @@
-"""Tests of what a running node says of itself, and of how good it finds the ways to its peers."""
+"""Tests of the health report of a running node and of the measurements of its links."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class GaugeTests(FleetCase):
         return {each["id"]: each for each in self.gauge.links()}
 
     def test_answer_at_once(self) -> None:
-        """The first answer has the ways, and no figures yet; a second later it has those of ten questions."""
+        """The first report lists the paths without measurements; a second later it has the results of ten probes."""
         first = self.measured()
         self.assertEqual(set(first), {node.uuid for node in self.team.nodes[1:]})
         for each in first.values():
@@ -36,7 +36,7 @@ class GaugeTests(FleetCase):
             self.assertGreater(each["for"], 2.0)
 
     def test_see_what_gets_worse(self) -> None:
-        """Loss that begins while it measures is seen within ten seconds."""
+        """Loss that starts during the measurement is visible within ten seconds."""
         self.measured()
         self.team.run(3.0)
         self.team.board.weather = Weather(delay_s=0.01, loss=0.3)
@@ -47,7 +47,7 @@ class GaugeTests(FleetCase):
         self.assertEqual(losses[0] <= 0.5 and max(losses) > 0.1, True, losses)
 
     def test_end_when_nobody_looks(self) -> None:
-        """Without anybody who asks it falls silent, and begins anew with the next one."""
+        """Without reports for ``IDLE`` seconds the measurement stops; the next report starts it again."""
         asked: list[float] = []
 
         def answer(peer: object, said: bytes) -> bytes:
@@ -67,7 +67,7 @@ class GaugeTests(FleetCase):
         self.assertEqual([each["loss"] for each in self.measured().values()], [None, None])
 
     def test_many_peers_cost_no_more(self) -> None:
-        """However many peers a node has, it asks 10 questions a second, 100 in the beginning."""
+        """A node sends at most 10 probes per second (100 initially), for any number of peers."""
         large = self.swarm(24, weather=Weather(delay_s=0.003))
         large.run(3.0)
         asked: list[float] = []
@@ -90,7 +90,7 @@ class GaugeTests(FleetCase):
 
 class HealthTests(FleetCase):
     def test_health(self) -> None:
-        """A node says whom it knows, what it holds and may hold, and that nobody refused it."""
+        """The health report contains the contacts, the number of stored records and its limit, and no rejections."""
         fleet = self.fleet(3)
         said = health(fleet.nodes[1])
         self.assertEqual((said["contacts"], said["trouble"], said["refusals"]), (2, "", []))
@@ -98,7 +98,7 @@ class HealthTests(FleetCase):
         self.assertEqual(said["address"], str(fleet.address(1)))
 
     def test_links(self) -> None:
-        """Each peer is timed by small questions; one that is gone answers none of them."""
+        """Each peer is timed with small requests; a failed peer answers none."""
         fleet = self.fleet(3, weather=Weather(delay_s=0.02))
         fleet.run(3.0)
         fleet.kill(2)
@@ -112,7 +112,7 @@ class HealthTests(FleetCase):
 
 class LinkTests(SynchronousTestCase):
     def test_scores(self) -> None:
-        """A steady peer on the same LAN has all points, one that answers at all has one, a silent one none."""
+        """A stable peer on the same LAN has score 100, a barely reachable one 1, an unreachable one 0."""
         rows: list[tuple[list[float | None], bool, int]] = [
             ([0.002, 0.0021, 0.0019, 0.002], False, 100),
             ([0.4, 0.9, None, None, None, None], True, 1),
@@ -123,14 +123,14 @@ class LinkTests(SynchronousTestCase):
         self.assertEqual((link([None], False).loss, link([None], False).round_trip), (1.0, None))
 
     def test_a_second_try_counts_as_a_loss(self) -> None:
-        """An answer that came so late that it was asked for twice is a loss, and does not spoil the round trip."""
+        """A reply after a retransmission counts as a loss and is excluded from the round-trip time."""
         found = link([0.002] * 8 + [0.055, 0.11], False)
         self.assertEqual((found.loss, found.round_trip), (0.2, 0.002))
         found = link([0.1] * 8 + [0.26, None], False)
         self.assertEqual((round(found.loss, 3), found.round_trip), (0.2, 0.1))
 
     def test_each_trouble_costs(self) -> None:
-        """Loss, delay, jitter and a relay each take points, and more of it takes more."""
+        """Loss, delay, jitter and a relay each lower the score, and more of each lowers it further."""
         best = link([0.002] * 10, False).score
         lossy = [link([0.002] * (10 - n) + [None] * n, False).score for n in (1, 2, 3)]
         late = [link([seconds] * 10, False).score for seconds in (0.05, 0.1, 0.2)]

@@ -1,4 +1,4 @@
-"""Tests of ``middleware.entangled.quorum.proposer``: how a round ends, and what is decided under any schedule."""
+"""Tests of ``middleware.entangled.quorum.proposer``: the outcome of a round, and the decision under any schedule."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def reply(kind: Kind, counter: int = 9, accepted: Ballot = NONE, value: bytes | 
 
 class ConcludeTests(SynchronousTestCase):
     def test_conclude(self) -> None:
-        """Promises win, the highest accepted value is completed, one that a majority accepted is decided, else lost."""
+        """A round is won, decided, held, outbid or silent by its replies; the highest accepted value is completed."""
         yes, held = reply(Kind.GRANTED), Reply(Kind.HELD, Ballot(4, b""), remaining=2.5)
         old, new = reply(Kind.GRANTED, 9, LOW, b"old"), reply(Kind.GRANTED, 9, MID, b"new")
         outbid = reply(Kind.OUTBID, 9, LOW, b"x")
@@ -35,7 +35,7 @@ class ConcludeTests(SynchronousTestCase):
             ([yes, old], Outcome(Result.WON, b"old", 9)),
             ([outbid, outbid], Outcome(Result.DECIDED, b"x", 9)),
             ([old, old], Outcome(Result.DECIDED, b"old", 9)),
-            # The same value under two ballots is not decided.
+            # Two acceptors accepted the same value under two ballots, which is no decision.
             ([outbid, reply(Kind.OUTBID, 9, MID, b"x")], Outcome(Result.OUTBID, None, 9)),
             ([held], None),
             ([held, None], Outcome(Result.HELD, None, 4, 2.5)),
@@ -52,7 +52,7 @@ class ConcludeTests(SynchronousTestCase):
 
 class DecideTests(SynchronousTestCase):
     def decide(self, seed: int, use: Use) -> set[Any]:
-        """What three proposers are told of one register, while losses and restarts come between their questions."""
+        """Return the values that three proposers learn for one register under lost requests and restarts."""
         rng, now = random.Random(seed), 0.0
         members = [Member(use) for _ in range(3)]
         waiting: list[Deferred[None]] = []
@@ -90,13 +90,13 @@ class DecideTests(SynchronousTestCase):
         return told
 
     def test_one_value(self) -> None:
-        """Whatever is lost, late or restarted, all proposers are told the same value."""
+        """All proposers learn the same value under loss, reordering and restarts."""
         for use in (TAKE, LEASE):
             for seed in range(100):
                 self.assertEqual(len(self.decide(seed, use)), 1, (use.key, seed))
 
     def test_nothing_to_propose(self) -> None:
-        """A proposer without a value proposes nothing, and completes what another began."""
+        """A proposer without a value proposes none, and completes an accepted value of another proposer."""
         for use in (TAKE, LEASE):
             member = Member(use)
 

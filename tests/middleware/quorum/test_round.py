@@ -18,7 +18,7 @@ YES, NO = Reply(Kind.GRANTED), Reply(Kind.HELD, remaining=1.0)
 
 
 def decoded(place: int, answer: object) -> list[Reply] | None:
-    """As a claimant of a lease reads what comes."""
+    """Decode a reply like the proposer of a lease."""
     reply = unpack_reply(answer)
     return None if reply is None else [reply]
 
@@ -39,7 +39,7 @@ class RoundTests(SynchronousTestCase):
         self.asked[number][2].callback(pack_reply(reply))
 
     def test_decided_by_a_majority(self) -> None:
-        """The second yes of three, or the second no, decides it, and not before; a council of nobody says no."""
+        """The second grant or second rejection of three decides the round; a round without members is lost."""
         for reply, is_won in ((YES, True), (NO, False)):
             asked = self.round()
             self.answer(-3, reply)
@@ -50,7 +50,7 @@ class RoundTests(SynchronousTestCase):
         self.assertFalse(self.successResultOf(self.round(0).outcome).tally.is_won)
 
     def test_members_about_to_be_free_are_asked_again(self) -> None:
-        """A member where another's lease ends within 100 ms is asked again then; any other has said no."""
+        """A member with a lease that ends within 100 ms is queried again at its end; others count as rejections."""
         asked = self.round()
         self.answer(0, Reply(Kind.HELD, remaining=0.03))
         self.answer(1, NO)
@@ -62,7 +62,7 @@ class RoundTests(SynchronousTestCase):
         self.assertTrue(self.successResultOf(asked.outcome).tally.is_won)
 
     def test_news_that_a_member_has_not_heard(self) -> None:
-        """Where the lease was given back, who still counts it is asked again soon; who only looks takes it as it is."""
+        """After a release, members that still report a lease are queried again soon, except if ``short`` is 0."""
         asked = self.round(short=math.inf)
         self.answer(0, NO)
         self.answer(1, NO)
@@ -79,7 +79,7 @@ class RoundTests(SynchronousTestCase):
         self.assertFalse(self.successResultOf(looked.outcome).tally.is_won)
 
     def test_who_is_silent(self) -> None:
-        """Whoever answers anything is there; who does not is silent once it was asked three times, and not before."""
+        """A member with any reply counts as present; a member without one counts as silent after three requests."""
         asked = self.round()
         self.answer(1, NO)
         self.assertEqual((asked.answered, asked.silent), ([1], []))
@@ -89,7 +89,7 @@ class RoundTests(SynchronousTestCase):
         self.assertEqual((asked.answered, asked.silent), ([1, 0], [2]))
 
     def test_silent_members_are_asked_again(self) -> None:
-        """Who has not answered is asked each 100 ms until it is decided, and three times at least; who has, once."""
+        """A silent member is queried every 100 ms until the decision, and at least three times; others once."""
         self.round()
         self.answer(1, YES)
         self.answer(2, YES)
@@ -103,7 +103,7 @@ class RoundTests(SynchronousTestCase):
         self.assertEqual([member for _, member, _ in self.asked], [0, 1, 2] * 5)
 
     def test_patience(self) -> None:
-        """Where nobody answers it is over in time, and nothing is left on the clock."""
+        """Without replies the round ends at its timeout and leaves no timer."""
         asked = self.round()
         self.clock.advance(0.49)
         self.assertNoResult(asked.outcome)
@@ -112,7 +112,7 @@ class RoundTests(SynchronousTestCase):
         self.assertEqual(self.clock.getDelayedCalls(), [])
 
     def test_a_member_that_is_down_holds_nobody_up(self) -> None:
-        """Where a majority has answered and is divided, the last one is not waited for as long as that."""
+        """If the majority replied without a decision, the round does not wait its full timeout for the last member."""
         asked = self.round()
         self.answer(0, YES)
         self.answer(1, NO)
@@ -120,7 +120,7 @@ class RoundTests(SynchronousTestCase):
         self.assertFalse(self.successResultOf(asked.outcome).tally.is_won)
 
     def test_sent_at_counts_the_latest_majority(self) -> None:
-        """A majority's grants count from when the question was sent that its last needed member answered."""
+        """The grants count from the send time of the request that completed the majority."""
         asked = self.round()
         self.answer(0, YES)
         self.clock.advance(0.25)
@@ -135,7 +135,7 @@ class RoundTests(SynchronousTestCase):
         self.assertFalse(self.asked[first][2].called)
 
     def test_strange_and_late_answers(self) -> None:
-        """Silence and nonsense count for nothing; after the end nobody is asked, and answers change nothing."""
+        """Errors and invalid replies do not count; after ``close`` no request is sent and replies are ignored."""
         asked = self.round()
         self.answer(0, YES)
         self.clock.advance(PAUSE)
@@ -148,19 +148,19 @@ class RoundTests(SynchronousTestCase):
         self.assertEqual((self.clock.getDelayedCalls(), len(asked.tally.replies)), ([], 1))
 
     def test_answers_at_once(self) -> None:
-        """Members on this very node may answer before the question returns, or fail at once."""
+        """A member on the same node may reply or fail synchronously."""
         for answer, is_won in ((lambda: succeed(pack_reply(YES)), True), (lambda: fail(NoAnswer("x")), False)):
             asked = Round([Tally(3)], lambda _: answer(), decoded, self.clock, 0.5)  # noqa: B023
             self.clock.advance(1.0)
             self.assertEqual(self.successResultOf(asked.outcome).tally.is_won, is_won)
 
     def test_free_in(self) -> None:
-        """A majority may be free when the second shortest lease has run out, as counted on the members' clocks."""
+        """``free_in`` is the time until the second shortest lease ends, by the members' clocks."""
         asked = self.round()
         self.clock.advance(0.04)
         self.answer(0, Reply(Kind.HELD, remaining=0.2))
         self.answer(1, Reply(Kind.HELD, remaining=0.9))
-        # Of the third nothing is known; the second is needed; it counted half way from 0.00 to 0.04.
+        # The third member did not reply, so the second is needed; its lease counts from the middle of 0.00 and 0.04.
         self.assertAlmostEqual(asked.free_in(), 0.88)
         unheard = self.round()
         self.clock.advance(0.6)

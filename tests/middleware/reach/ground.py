@@ -1,4 +1,4 @@
-"""Ground: sites behind routers, one public node that all know, and nodes at the sites, on one turned clock."""
+"""Sites behind routers, with nodes at the sites and one public bootstrap node, in virtual time."""
 
 from __future__ import annotations
 
@@ -23,7 +23,11 @@ LINK = Weather(delay_s=0.015)
 
 
 class Ground:
-    """``weather`` is that of each site's uplink, ``nets`` the first bytes of the net outside and of those inside."""
+    """A network of sites.
+
+    ``weather`` applies to the uplink of each site; ``nets`` are the address prefixes of the public and the private
+    nets.
+    """
 
     def __init__(
         self,
@@ -45,14 +49,14 @@ class Ground:
         self.node("pub", self.public)
 
     def site(self, name: str, kind: str) -> None:
-        """A site named so, behind a router of that kind ("none": on the public net)."""
+        """Create a site behind a router of this NAT type ("none": on the public net)."""
         if kind != "none":
             host, rng = f"{self.outside}.{10 + len(self.routers)}", random.Random(f"{self.seed}/{name}")
             nat: NatKind = kind  # type: ignore[assignment]
             self.routers[name] = self.board.router(Nat(nat, host, rng, self.lifetime), self.weather)
 
     def node(self, name: str, address: Address, site: str = "") -> EntangledNode:
-        """A node, at a site or on the public net, started and joined by the public one."""
+        """Create and start a node at a site or on the public net; it joins through the public node."""
         identity = Identity(random.Random(f"{self.seed}/{name}").randbytes(32))
         network = self.board.network(*address, home=self.routers.get(site))
         rng = random.Random(f"{self.seed}/{name}/dice")
@@ -64,7 +68,7 @@ class Ground:
         return node
 
     def at(self, site: str, kind: str, host: int = 2) -> EntangledNode:
-        """The node ``site`` + number of a new or known site; it joins within half a second."""
+        """Create the node ``site`` + ``host`` at a new or existing site; it joins within half a second."""
         if site not in self.routers:
             self.site(site, kind)
         name = f"{site}{host}"
@@ -76,18 +80,18 @@ class Ground:
         return self.node(name, address)
 
     def met_at(self, of: EntangledNode) -> Contact:
-        """A node as the public one sees it."""
+        """Return the contact of a node as the public node sees it."""
         peer = self.nodes["pub"].endpoint.peers.known(of.identity.public)
         assert peer is not None and peer.session is not None
         return peer.session.contact
 
     def way(self, a: EntangledNode, b: EntangledNode) -> str:
-        """How ``a`` reaches ``b`` now."""
+        """Return the kind of the current path from ``a`` to ``b``."""
         kind = a.reach.ways.passage(b.contact).kind
         return kind if kind in ("none", "carried") else "direct"
 
     def call(self, a: EntangledNode, contact: Contact, timeout: float | None = None) -> tuple[Any, float]:
-        """What ``a`` is answered, and after how many seconds."""
+        """Call ``contact`` from ``a``; return the reply and its delay in seconds."""
         began, ended = self.clock.seconds(), [float("nan")]
         outcome: Deferred[Any] = a.call(contact, "echo", 7, timeout=timeout)
         outcome.addBoth(self._note, ended)
@@ -102,17 +106,17 @@ class Ground:
         return result
 
     def run(self, seconds: float) -> None:
-        """Let time pass."""
+        """Advance the clock."""
         self.clock.advance(seconds)
 
     def stop(self) -> None:
-        """End every node."""
+        """Stop every node."""
         for node in self.nodes.values():
             node.vanish()
 
 
 class GroundCase(SynchronousTestCase):
-    """A test with a ground; afterwards no timer of a node may be left."""
+    """A test case with sites that checks that no node leaves a timer after its stop."""
 
     def ground(
         self,
@@ -121,7 +125,7 @@ class GroundCase(SynchronousTestCase):
         lifetime: float = 30.0,
         nets: tuple[str, str] = ("203.0.113", "192.168"),
     ) -> Ground:
-        """A ground whose nodes end with the test."""
+        """Create sites that are stopped after the test."""
         ground = Ground(seed, weather, lifetime, nets)
         self.addCleanup(self._end, ground)
         return ground
@@ -133,5 +137,5 @@ class GroundCase(SynchronousTestCase):
 
 
 def _is_delivery(call: object) -> bool:
-    """Whether a call is a datagram on its way, which nobody can take back."""
+    """Return whether a call is the delivery of a datagram, which cannot be cancelled."""
     return getattr(getattr(call, "_function", None), "__self__", None).__class__ is Switchboard

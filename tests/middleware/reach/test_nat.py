@@ -1,4 +1,4 @@
-"""Tests of the routers in memory: each kind maps and lets in as it says."""
+"""Tests of the simulated NAT routers, which map and filter by their NAT type."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ A, A2, B = Address("203.0.113.1", 1), Address("203.0.113.1", 2), Address("203.0.
 
 
 def nat(kind: NatKind) -> Nat:
-    """A router of that kind."""
+    """Return a router of this NAT type."""
     return Nat(kind, HOST, random.Random(3))
 
 
@@ -25,7 +25,7 @@ class NatTests(SynchronousTestCase):
     """Behaviour of ``Nat``."""
 
     def test_what_each_kind_lets_in(self) -> None:
-        """After one datagram to A each kind lets in whom it should: A, its other port, another host."""
+        """After one datagram to A, each NAT type admits the right ones of A, A's other port and another host."""
         kinds: list[tuple[NatKind, list[bool]]] = [
             ("full", [True, True, True]),
             ("addr", [True, True, False]),
@@ -41,7 +41,7 @@ class NatTests(SynchronousTestCase):
             self.assertEqual([router.into(source, port, 0.0) == INSIDE for source in (A, A2, B)], expected, kind)
 
     def test_symmetric_ports_differ(self) -> None:
-        """A symmetric router shows another port to each target, and the same again; the others show one to all."""
+        """A symmetric router maps each destination to another, stable port; other types use one port for all."""
         kinds: list[tuple[NatKind, int]] = [("sym", 2), ("port", 1)]
         for kind, count in kinds:
             router = nat(kind)
@@ -49,7 +49,7 @@ class NatTests(SynchronousTestCase):
             self.assertEqual((a, len({a, b})), (again, count))
 
     def test_mappings_end(self) -> None:
-        """A mapping lives as long as something passes it, from either side; after a restart there is another one."""
+        """Traffic in either direction keeps a mapping alive; after a restart the router creates a new mapping."""
         router = Nat("port", HOST, random.Random(3), 10.0)
         outside = router.out(INSIDE, A, 0.0)
         assert outside is not None
@@ -62,7 +62,7 @@ class NatTests(SynchronousTestCase):
         self.assertNotEqual(router.out(INSIDE, A, 31.0), before)
 
     def test_leaky_ports_are_burnt(self) -> None:
-        """Whoever is written to after it knocked too early sees another port of a leaky router; others do not."""
+        """A leaky router changes the port for a destination that sent a datagram too early, and for no other."""
         router = nat("leaky")
         before = router.out(INSIDE, A, 0.0)
         assert before is not None
@@ -71,7 +71,7 @@ class NatTests(SynchronousTestCase):
         self.assertEqual(router.out(INSIDE, A, 1.0), before)
 
     def test_on_the_board(self) -> None:
-        """Behind one router neighbours reach each other by their own addresses, but not by its outer one."""
+        """Nodes behind one router reach each other by their private addresses, but not by the public one."""
         clock = HeapClock()
         board = Switchboard(clock, random.Random(1))
         router = board.router(nat("full"), Weather(delay_s=0.5))
@@ -93,7 +93,7 @@ class NatTests(SynchronousTestCase):
         self.assertEqual((board.counters["blocked"], board.counters["unheard"]), (1, 1))
 
     def test_further_ports_on_the_board(self) -> None:
-        """A further port is a mapping of its own; who comes in there first is answered from there."""
+        """An additional port has a separate mapping; replies to a source that used this port leave from it."""
         clock = HeapClock()
         board = Switchboard(clock, random.Random(1))
         router = board.router(nat("full"))

@@ -1,4 +1,4 @@
-"""Tests of carrying for others: what is carried, for whom, and how much."""
+"""Tests of the relay: permitted pairs of peers, rates and limits; and of upgrades to direct paths."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ from middleware.entangled.wire.session import Session
 
 
 class RelayTests(SynchronousTestCase):
-    """Behaviour of ``Relay``, with sessions made by hand."""
+    """Tests of ``Relay`` with artificial sessions."""
 
     def setUp(self) -> None:
-        """A relay with three peers."""
+        """Create a relay with three peers."""
         self.clock = HeapClock()
         self.counters: Counter[str] = Counter()
         self.sent: list[tuple[bytes, bytes]] = []
@@ -40,29 +40,29 @@ class RelayTests(SynchronousTestCase):
         self.relay = Relay(self.sessions.get, self.send, self.clock, self.counters)
 
     def session(self, number: int) -> Session:
-        """A session with a peer."""
+        """Create a session with a peer."""
         public = Identity(number.to_bytes(32)).public
         keys = TransportKeys(bytes(32), bytes(32), bytes(32))
         return Session(Contact(public, Address("203.0.113.1", 1 + number)), number, number, keys, 0.0, True)
 
     def send(self, session: Session, plain: bytes) -> None:
-        """Keep what is sent; it must fit into a datagram."""
+        """Record a sent message, which must fit into a datagram."""
         self.assertLessEqual(len(session.seal(plain)), MAX_CARRIED)
         self.sent.append((session.contact.node_id, plain))
 
     def carry(self, sender: bytes, to: bytes, inner: bytes = b"inner") -> int:
-        """How many datagrams come of one that ``sender`` wants carried."""
+        """Return the number of datagrams that the relay forwards for one from ``sender``."""
         before = len(self.sent)
         self.relay.on_carry(self.sessions[sender], bytes([CARRY]) + to + inner, Address("203.0.113.1", 1))
         return len(self.sent) - before
 
     def test_carries(self) -> None:
-        """What is carried comes with the id of its sender, whole datagrams included."""
+        """A forwarded datagram, up to the full size, carries the id of its sender."""
         self.assertEqual(self.carry(self.a, self.b, bytes(MAX_DATAGRAM)), 1)
         self.assertEqual(self.sent, [(self.b, bytes([CARRIED]) + self.a + bytes(MAX_DATAGRAM))])
 
     def test_what_is_not_carried(self) -> None:
-        """Nothing goes to strangers, to the sender itself, empty, too long, cut short, or over two nodes."""
+        """Datagrams to unknown nodes, to the sender, of invalid length or from a relayed session are not forwarded."""
         self.assertEqual(self.carry(self.a, bytes(20)), 0)
         self.assertEqual(self.carry(self.a, self.a), 0)
         self.assertEqual(self.carry(self.a, self.b, b""), 0)
@@ -74,7 +74,7 @@ class RelayTests(SynchronousTestCase):
         self.assertEqual(self.counters["uncarried"] + self.counters["malformed"], 6)
 
     def test_a_pair_has_its_share(self) -> None:
-        """A pair gets its burst at once and its rate for long; another pair is none the worse for it."""
+        """A pair gets its burst at once and its rate in the long run, without an effect on other pairs."""
         full = bytes(MAX_DATAGRAM)
         self.assertEqual(sum(self.carry(self.a, self.b, full) for _ in range(200)), PAIR_BURST // MAX_DATAGRAM)
         self.assertEqual(self.carry(self.b, self.a, full), 0)
@@ -86,7 +86,7 @@ class RelayTests(SynchronousTestCase):
         self.assertApproximates(carried / 100.0, PAIR_RATE, PAIR_RATE * 0.05)
 
     def test_one_sided_pairs_end(self) -> None:
-        """One who sends without a word from the other is not carried any more after two minutes; a word helps."""
+        """A pair with traffic in one direction only is blocked after two minutes, until the other peer sends."""
         for _ in range(int(ONE_SIDED_S)):
             self.assertEqual(self.carry(self.a, self.b), 1)
             self.clock.advance(1.0)
@@ -96,7 +96,7 @@ class RelayTests(SynchronousTestCase):
         self.assertEqual(self.carry(self.a, self.b), 1)
 
     def test_pairs_are_bounded(self) -> None:
-        """With as many pairs as there may be no other is carried for, until some have been idle."""
+        """At the limit of pairs a new pair is rejected until others are idle."""
         many = [self.session(number) for number in range(3, 4 + MAX_PAIRS)]
         self.sessions.update({session.contact.node_id: session for session in many})
         carried = [self.carry(self.a, session.contact.node_id) for session in many]
@@ -107,10 +107,10 @@ class RelayTests(SynchronousTestCase):
 
 
 class UpgradeTests(SynchronousTestCase):
-    """Behaviour of ``Upgrades``, with one carried peer."""
+    """Tests of ``Upgrades`` with one relayed peer."""
 
     def setUp(self) -> None:
-        """A session that others carry."""
+        """Create a relayed session."""
         clock, rng = HeapClock(), random.Random(1)
         peers = Peers([], clock, rng, Switchboard(clock, rng).network("10.0.0.1", 7), Counter())
         identity = Identity(b"p" * 32)
@@ -121,7 +121,7 @@ class UpgradeTests(SynchronousTestCase):
         self.upgrades = Upgrades(peers)
 
     def tried(self, until: float) -> list[float]:
-        """The moments at which the peer is tried, looked at every half second; it is heard all the time."""
+        """Return the times of the attempts while the peer is heard continuously, in steps of half a second."""
         moments = []
         for step in range(int(2 * until) + 1):
             self.session.heard_at = now = step / 2
@@ -129,9 +129,9 @@ class UpgradeTests(SynchronousTestCase):
         return moments
 
     def test_more_and_more_rarely(self) -> None:
-        """The pauses grow, and the last one is repeated; at another address of this node they begin anew."""
+        """The pauses grow up to the last one; after a change of the local address they start at the first."""
         self.upgrades.add(self.public, False, 0.0)
-        self.upgrades.add(self.public, False, 0.9)  # is known already
+        self.upgrades.add(self.public, False, 0.9)  # already known
         moments = self.tried(150.0)
         pauses = [after - before for before, after in zip([0.0, *moments], moments, strict=False)]
         self.assertEqual(pauses, [*PAUSES, PAUSES[-1]])
@@ -139,7 +139,7 @@ class UpgradeTests(SynchronousTestCase):
         self.assertEqual([step for _, step in self.upgrades.due(151.0)], [0])
 
     def test_only_one_of_the_two(self) -> None:
-        """Who is behind begins later than the other, and who hears that the other is at it waits for longer yet."""
+        """The node behind a NAT tries later than its peer, and waits longer while its peer tries."""
         self.upgrades.add(self.public, True, 0.0)
         self.assertEqual(self.tried(PAUSES[0] + TURN), [PAUSES[0] + TURN])
         now = PAUSES[0] + 2 * TURN
@@ -147,7 +147,7 @@ class UpgradeTests(SynchronousTestCase):
         self.assertEqual(self.tried(10.0)[0], now + PAUSES[1] + TURN)
 
     def test_no_longer_than_needed(self) -> None:
-        """A peer that is reached directly, or is silent for long, is tried no more."""
+        """A peer that is reached directly or silent for long is removed."""
         self.upgrades.add(self.public, False, 0.0)
         self.upgrades.drop(self.public)
         self.assertEqual(len(self.upgrades), 0)
