@@ -1,4 +1,4 @@
-"""Tests of how many questions are on their way at once, and what becomes of those that wait."""
+"""Tests of the limit on requests in flight, and of the queue of further requests."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SLOW_S = 0.2
 
 
 class TurnTests(EndpointCase):
-    """Behaviour of ``Asker`` with more questions than may be on their way."""
+    """Tests of ``Asker`` with more requests than may be in flight."""
 
     def setUp(self) -> None:
         """Open a session."""
@@ -28,23 +28,23 @@ class TurnTests(EndpointCase):
         self.got(self.a.ask(self.to_b, "echo", 1))
 
     def equip(self, endpoint: Any) -> None:
-        """Add a method that takes its time."""
+        """Register a slow method."""
         super().equip(endpoint)
         endpoint.expose("slow", self.slow)
 
     def slow(self, peer: Contact, value: int) -> Deferred[int]:
-        """Answer later."""
+        """Reply after a delay."""
         self.runs.append(value)
         answer: Deferred[int] = Deferred()
         self.clock.callLater(SLOW_S, answer.callback, value)
         return answer
 
     def flood(self, count: int, timeout: float | None = None) -> list[Deferred[Any]]:
-        """Ask many things at the same moment."""
+        """Send many requests at the same time."""
         return [self.a.ask(self.to_b, "slow", number, timeout=timeout) for number in range(count)]
 
     def test_the_rest_waits_in_order(self) -> None:
-        """No more are sent than may be on their way; the others follow in order, however long a live peer takes."""
+        """At most ``MAX_IN_FLIGHT`` requests are sent at once; the others follow in order when replies arrive."""
         sent = self.board.counters["sent"]
         asked = self.flood(12 * MAX_IN_FLIGHT)
         self.assertEqual(self.board.counters["sent"] - sent, MAX_IN_FLIGHT)
@@ -58,7 +58,7 @@ class TurnTests(EndpointCase):
         self.assertEqual(self.places(), (0, 0, 0))
 
     def test_a_dead_peer(self) -> None:
-        """What was sent gets no answer; what never had its turn is said to be crowded, and nothing stays."""
+        """For a dead peer sent requests fail with ``NoAnswer``, queued ones with ``Crowded``; no state remains."""
         self.board.kill(self.to_b.address)
         asked = self.flood(20 * MAX_IN_FLIGHT)
         self.clock.advance(30.0)
@@ -68,7 +68,7 @@ class TurnTests(EndpointCase):
         self.assertEqual(self.places(), (0, 0, 0))
 
     def test_a_time_out_holds_in_the_queue(self) -> None:
-        """Who gave a time-out is told in time, whether its question had its turn or not."""
+        """A timeout also applies to a queued request."""
         asked = self.flood(20 * MAX_IN_FLIGHT, timeout=0.5)
         self.clock.advance(0.5)
         self.assertTrue(all(one.called for one in asked))
@@ -76,7 +76,7 @@ class TurnTests(EndpointCase):
             one.addErrback(lambda failure: failure.trap(NoAnswer, Crowded))
 
     def test_cancelled_in_the_queue(self) -> None:
-        """What is cancelled before its turn is never sent, and what is cancelled after it makes room."""
+        """A request cancelled in the queue is never sent; cancelling a sent one lets the next one be sent."""
         asked = self.flood(MAX_IN_FLIGHT + 2)
         asked[-1].cancel()
         asked[0].cancel()
@@ -88,13 +88,13 @@ class TurnTests(EndpointCase):
         self.assertEqual(self.places(), (0, 0, 0))
 
     def test_long_questions_take_no_place(self) -> None:
-        """Questions with a long time-out, as many as there may be, do not keep short ones from their turn."""
+        """Requests with a long timeout do not block short ones."""
         for one in self.flood(2 * MAX_IN_FLIGHT, timeout=60.0):
             one.addErrback(lambda failure: None)
         self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 7), 2 * DELAY), 7)
 
     def test_the_queue_is_bounded(self) -> None:
-        """What finds the queue full is refused at once."""
+        """A request fails at once if the queue is full."""
         self.patch(asker, "MAX_QUEUED", 3)
         asked = self.flood(MAX_IN_FLIGHT + 5)
         for one in asked[-2:]:
@@ -104,7 +104,7 @@ class TurnTests(EndpointCase):
             self.successResultOf(one)
 
     def test_before_the_session(self) -> None:
-        """Questions that wait for a handshake keep their order and the bound."""
+        """Requests that wait for a handshake keep their order and the limit."""
         third, to_third = self.endpoint(3)
         self.equip(third)
         sent = self.board.counters["sent"]
@@ -115,7 +115,7 @@ class TurnTests(EndpointCase):
         self.assertEqual([self.successResultOf(one) for one in asked], self.runs)
 
     def test_restart_in_the_middle(self) -> None:
-        """A peer that restarts under a flood answers all of it."""
+        """A peer that restarts during many requests answers all of them."""
         asked = self.flood(4 * MAX_IN_FLIGHT)
         self.clock.advance(0.05)
         self.board.kill(self.to_b.address)
@@ -125,25 +125,25 @@ class TurnTests(EndpointCase):
         self.assertEqual([self.successResultOf(one) for one in asked], list(range(4 * MAX_IN_FLIGHT)))
 
     def places(self) -> tuple[int, int, int]:
-        """What is on its way, what waits, and what waits in all."""
+        """Return the number of requests in flight, in the peer's queue and in all queues."""
         at = self.a._peers.known(self.to_b.public)
         assert at is not None
         return at.in_flight, len(at.queue), self.a._asker._queued
 
 
 class GivenUpTests(EndpointCase):
-    """What becomes of a handshake whose questions are over before it is."""
+    """Handshakes that outlast their requests."""
 
     def inits(self) -> int:
-        """Handshakes that arrived at the other one, repeated ones as well."""
+        """Return the number of INITs that arrived at ``b``, including retransmissions."""
         return sum(datagram[0] == INIT for datagram, _ in self.taps[self.to_b.address].kept)
 
     def give_up(self, timeout: float) -> None:
-        """Ask, and wait in vain."""
+        """Send a request that times out."""
         self.failed(self.a.ask(self.to_b, "echo", 1, timeout=timeout), NoAnswer, timeout)
 
     def test_nothing_more_is_sent_for_nobody(self) -> None:
-        """When nobody waits for the answer any more, the handshake is not tried again, and soon forgotten."""
+        """After all its requests ended, a handshake is not retransmitted, and is soon removed."""
         self.board.kill(self.to_b.address)
         sent = self.board.counters["sent"]
         self.give_up(FIRST_GUESS / 2)
@@ -152,14 +152,14 @@ class GivenUpTests(EndpointCase):
         self.assertEqual(self.a.peers.peer(self.to_b).opening, None)
 
     def test_a_late_answer_opens_the_session(self) -> None:
-        """Over a way that is too long for the question the session stands all the same, for the next one."""
+        """A late handshake reply still opens the session for the next request."""
         self.board.weather = Weather(0.3)
         self.give_up(0.2)
         self.clock.advance(1.0)
         self.assertTrue(self.a.is_met(self.to_b))
 
     def test_who_asks_meanwhile_need_not_wait(self) -> None:
-        """A question that comes while the handshake rests sends it again at once."""
+        """A new request during a paused handshake retransmits it at once."""
         self.board.weather = Weather(DELAY, loss=1.0)
         self.give_up(FIRST_GUESS / 2)
         self.clock.advance(FIRST_GUESS)
@@ -168,7 +168,7 @@ class GivenUpTests(EndpointCase):
         self.assertEqual(self.inits(), 1)
 
     def test_two_handshakes_in_doubt(self) -> None:
-        """Beside a session that stands, a silent peer gets two INITs, however many questions find it silent."""
+        """A silent peer with a session gets at most ``DOUBTS`` INITs, for any number of requests."""
         self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 1), 5 * DELAY), 1)
         self.board.weather = Weather(DELAY, loss=1.0)
         sent: list[int] = []

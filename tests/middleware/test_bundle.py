@@ -1,4 +1,4 @@
-"""Tests of ``middleware.entangled.network.bundle``: tunnels of several connections, on a turned clock."""
+"""Tests of ``middleware.entangled.network.bundle``, tunnels over several connections, in virtual time."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ WHOLE = GREETING.replace(b"\r\n\r\n", b"\r\n" + TOKEN.encode() + b": %s\r\n\r\n"
 
 class BundleTests(TunnelCase):
     def talk(self, client: TunnelNetwork, served: Heard, seconds: float, size: int = 100) -> tuple[list[float], float]:
-        """Send ten datagrams a second; how often each that arrived did, and the longest gap in which none did."""
+        """Send ten datagrams per second; return the copies per arrived datagram and the longest gap."""
         number, last, gap = 0, self.clock.seconds(), 0.0
         served.clear()
         seen: dict[bytes, int] = {}
@@ -33,7 +33,7 @@ class BundleTests(TunnelCase):
         return [float(times) for times in seen.values()], max(gap, self.clock.seconds() - last)
 
     def three(self) -> tuple[TunnelNetwork, Heard, TunnelNetwork, Heard, Pipe]:
-        """Two ends whose tunnel has three connections, and that of these which stood still for a moment."""
+        """Return two ends with three connections, after a stall of the first one, and that connection."""
         client, came, server, served = self.pair()
         (first,) = self.pipes.streams
         first.is_still = True
@@ -46,7 +46,7 @@ class BundleTests(TunnelCase):
         return client, came, server, served, first
 
     def test_one_while_all_is_well(self) -> None:
-        """A tunnel in use, or idle, on a line that delays but loses nothing has one connection; all goes once."""
+        """A tunnel over a link with delay but no loss uses one connection and sends each datagram once."""
         client, _, _, served = self.pair()
         self.pipes.delay_s = 0.4
         self.talk(client, served, 1.0)
@@ -56,7 +56,7 @@ class BundleTests(TunnelCase):
         self.assertLess(gap, 2 * STEP)
         self.assertEqual((len(self.pipes.dialled), len(self.pipes.streams)), (1, 1))
         (only,) = self.pipes.streams
-        for _ in range(5):  # a short wait for one repetition after a silence is no reason for another one
+        for _ in range(5):  # a short wait for one retransmission after an idle period needs no other connection
             self.clock.advance(5.0)
             only.is_still = True
             client.send(b"x", PLAIN.address)
@@ -66,7 +66,7 @@ class BundleTests(TunnelCase):
         self.assertEqual(len(self.pipes.dialled), 1)
 
     def test_stream_that_stands_still(self) -> None:
-        """When a stream stands still two more are dialled, and in half a second all goes by two of those that move."""
+        """If a stream stalls, two more are dialled; within 0.5 s all datagrams go over two working streams."""
         client, _, server, served = self.pair()
 
         (address,) = server.peers
@@ -81,7 +81,7 @@ class BundleTests(TunnelCase):
         self.assertEqual((server.peers, client.peers), ([address], [PLAIN.address]))
 
     def test_dial_the_dead_anew(self) -> None:
-        """A connection that stands still while another moves is dialled anew soon; one that all share is left."""
+        """A connection that stalls while another works is soon replaced; a stall of all connections replaces none."""
         client, _, server, served = self.pair()
         (first,) = self.pipes.streams
         first.is_still = True
@@ -95,7 +95,7 @@ class BundleTests(TunnelCase):
         self.assertEqual(len(self.pipes.dialled), dialled)
 
     def test_way_back(self) -> None:
-        """What the server sends goes by two connections, too, and passes one that stands still on its side."""
+        """The server, too, sends over two connections and avoids a stalled one."""
         client, came, server, served, first = self.three()
         (address,) = server.peers
         first.other.is_still = True
@@ -106,7 +106,7 @@ class BundleTests(TunnelCase):
         self.assertEqual({source for _, source in came}, {PLAIN.address})
 
     def test_one_again(self) -> None:
-        """Half a minute after the last stream stood still there is one connection again, at both ends."""
+        """Half a minute after the last stall both ends use one connection again."""
         client, _, server, served, _ = self.three()
         self.talk(client, served, ROUGH_S - 4.0)
         self.assertEqual(len(self.pipes.streams), MOST)
@@ -116,7 +116,7 @@ class BundleTests(TunnelCase):
         self.assertEqual((set(times), len(times)), ({1.0}, 50))
 
     def test_little_waits_in_what_stands_still(self) -> None:
-        """A stream that stands still takes a few datagrams and drops the rest: it would all be late."""
+        """A stalled stream queues few datagrams and drops the others, which would arrive too late."""
         client, _, _, served = self.pair()
         (only,) = self.pipes.streams
         self.pipes.cut(HOST)
@@ -126,7 +126,7 @@ class BundleTests(TunnelCase):
         self.assertGreater(client.counters["dropped"], 20)
 
     def test_open_by_another(self) -> None:
-        """When a connection does not open another one is dialled beside it, and the tunnel opens by that."""
+        """If a connection does not open, another one is dialled and opens the tunnel."""
         _, served = self.made(is_plain=True)
         client, _ = self.made("10.0.0.2", PLAIN)
         self.pipes.cut(HOST)
@@ -139,7 +139,7 @@ class BundleTests(TunnelCase):
         self.assertEqual(len(self.pipes.streams), 1)
 
     def test_hard_to_open(self) -> None:
-        """Whose greeting had to be repeated has three connections from the beginning."""
+        """A client with a retransmitted greeting uses three connections from the start."""
         self.made(is_plain=True)
         client, _ = self.made("10.0.0.2", PLAIN)
         measured = client._carrier.strain
@@ -153,7 +153,7 @@ class BundleTests(TunnelCase):
         self.assertEqual(len(self.pipes.streams), MOST)
 
     def test_tokens(self) -> None:
-        """Connections that name one tunnel are one peer, at most three; others, and those without a name, are not."""
+        """Up to three connections with the same token are one peer; those without a token are separate peers."""
         server, served = self.made(is_plain=True)
         one, other = b"a" * 32, b"b" * 32
         crowd = [self.dribble(WHOLE % (1, token)) for token in (one, one, other, b"", b"", b"a" * 31)]
@@ -165,7 +165,7 @@ class BundleTests(TunnelCase):
         self.assertFalse(crowd[-1].is_lost)
 
     def test_caps_allow_for_it(self) -> None:
-        """A team behind one address has three connections each; those make room before a newcomer is turned away."""
+        """A team behind one address has three connections per member; they are reduced before a new one is rejected."""
         server, served = self.made()
         members = [self.member(server, served, "10.0.0.2") for _ in range(MAX_OF_HOST)]
         for member in members:
@@ -180,7 +180,7 @@ class BundleTests(TunnelCase):
         self.assertEqual(len(server.peers), MAX_LINKS - (MOST - 1) * MAX_OF_HOST + 10)
 
     def member(self, server: TunnelNetwork, served: Heard, host: str) -> TunnelNetwork:
-        """One more that the server answers."""
+        """Create a member and let the server answer it."""
         member, _ = self.made(host, URL)
         member._rng = random.Random(len(self.ends))
         member.send(b"m", URL.address)

@@ -1,4 +1,4 @@
-"""Tests of large messages: whole, through loss, within bounds, and under a slow receiver."""
+"""Tests of large messages: integrity, loss, limits and flow control."""
 
 from __future__ import annotations
 
@@ -33,21 +33,21 @@ LARGE = random.Random(5).randbytes(MIB)
 
 
 class ParcelCase(EndpointCase):
-    """``b`` takes and gives large values."""
+    """``b`` accepts and returns large values."""
 
     def equip(self, endpoint: Any) -> None:
-        """Add the methods."""
+        """Register the methods."""
         super().equip(endpoint)
         endpoint.expose("size", self.size, changes=True)
         endpoint.expose("large", lambda peer, size: LARGE[:size])
 
     def size(self, peer: Contact, value: bytes) -> int:
-        """Count a run."""
+        """Record the size of the value."""
         self.runs.append(len(value))
         return len(value)
 
     def part(self, number: int, total: int = MAX_MESSAGE, id_: int = 77, data: bytes | None = None) -> bytes:
-        """A PART of a question, as a member may make it."""
+        """Return a fragment of a request as a malicious member may create it."""
         data = bytes(min(PART_BYTES, total - number * PART_BYTES)) if data is None else data
         return (
             bytes([PART, 2])
@@ -58,7 +58,7 @@ class ParcelCase(EndpointCase):
         )
 
     def fire(self, plain: bytes) -> list[bytes]:
-        """Let ``a`` seal something for ``b``; what ``a`` gets back."""
+        """Send a message from ``a`` to ``b`` and return the replies."""
         session = next(iter(self.a._sessions.values()))
         got: list[bytes] = []
         receivers = self.taps[self.to_a.address]
@@ -74,10 +74,10 @@ class ParcelCase(EndpointCase):
 
 
 class ParcelTests(ParcelCase):
-    """Large questions and answers."""
+    """Large requests and replies."""
 
     def test_every_size(self) -> None:
-        """A value of any size up to 1 MiB travels both ways unchanged; a larger one fails before a byte is sent."""
+        """A value of up to 1 MiB arrives unchanged in both directions; one above the limit fails before it is sent."""
         self.failureResultOf(self.a.ask(self.to_b, "size", bytes(MAX_MESSAGE)), TooLarge)
         self.assertEqual(self.board.counters["sent"], 0)
         self.assertEqual(self.got(self.a.ask(self.to_b, "size", bytes(MIB + 4000), changes=True), 9), MIB + 4000)
@@ -86,14 +86,14 @@ class ParcelTests(ParcelCase):
             self.assertEqual(self.got(self.a.ask(self.to_b, "echo", LARGE[:size])), LARGE[:size], size)
 
     def test_loss(self) -> None:
-        """1 MiB there and back arrives unchanged under 5 % loss in 2 s, and under 30 % in 22 s."""
+        """1 MiB in each direction arrives unchanged under 5 % loss within 2 s, and under 30 % loss within 22 s."""
         for loss, longest in ((0.05, 2.0), (0.3, 22.0)):
             self.board.weather = Weather(DELAY, DELAY / 4, loss=loss, duplicate=0.02, reorder=0.05)
             asked = self.a.ask(self.to_b, "echo", LARGE)
             self.assertEqual(self.got(asked, longest), LARGE, loss)
 
     def test_large_changes_run_once(self) -> None:
-        """A large question that changes something runs once, whatever is lost and repeated."""
+        """A large request that changes state runs once under loss and duplication."""
         self.board.weather = Weather(DELAY, DELAY / 2, loss=0.2, duplicate=0.3, reorder=0.3)
         for number in range(30):
             asked = self.a.ask(self.to_b, "size", bytes(3000 + number), changes=True)
@@ -101,7 +101,7 @@ class ParcelTests(ParcelCase):
         self.assertEqual(self.runs, [3000 + number for number in range(30)])
 
     def test_silence_in_the_middle(self) -> None:
-        """A peer that falls silent in mid-transfer fails the question in time, and both sides let go of everything."""
+        """If a peer fails during a transfer, the request fails in time, and both sides release all buffers."""
         asked = self.a.ask(self.to_b, "echo", LARGE)
         self.clock.advance(1.5 * DELAY)
         self.assertEqual([len(d) for d, _ in self.kept(self.to_b, INIT)], [INIT_LEAST])
@@ -116,7 +116,7 @@ class ParcelTests(ParcelCase):
         self.assertEqual(self.clock.getDelayedCalls(), [])
 
     def test_a_short_break_is_survived(self) -> None:
-        """A transfer goes on after a break of a second, and after the peer lost its sessions."""
+        """A transfer continues after an interruption of one second, and after a restart of the peer."""
         self.got(self.a.ask(self.to_b, "echo", 1))
         asked = self.a.ask(self.to_b, "size", LARGE, changes=True)
         self.clock.advance(4 * DELAY)
@@ -132,7 +132,7 @@ class ParcelTests(ParcelCase):
         self.assertEqual(self.got(asked, 8.0), MIB)
 
     def test_back_pressure(self) -> None:
-        """Never more parts are under way to a receiver than the room that it gave."""
+        """The number of fragments in flight never exceeds the window of the receiver."""
         asked = self.a.ask(self.to_b, "echo", LARGE)
         most = 0
         while not asked.called:
@@ -143,7 +143,7 @@ class ParcelTests(ParcelCase):
         self.assertLessEqual(most, courier.ROOM_PARTS + 2)
 
     def test_small_talk_goes_on(self) -> None:
-        """While 4 MiB are under way a small question to the same peer is answered at once."""
+        """During transfers of 4 MiB a small request to the same peer is answered at once."""
         self.got(self.a.ask(self.to_b, "echo", 1))
         asked = [self.a.ask(self.to_b, "size", LARGE, changes=True) for _ in range(4)]
         self.clock.advance(4 * DELAY)
@@ -152,7 +152,7 @@ class ParcelTests(ParcelCase):
         self.assertEqual([self.successResultOf(one) for one in asked], [MIB] * 4)
 
     def test_room_is_reserved(self) -> None:
-        """Beyond the room for one peer a large question fails at once as ``Crowded``; later there is room again."""
+        """A large request beyond the limit for one peer fails at once with ``Crowded``; finished ones free space."""
         fitting = MAX_OUT_OF_PEER // (MIB + 60)
         asked = [self.a.ask(self.to_b, "size", LARGE, changes=True) for _ in range(fitting)]
         self.failureResultOf(self.a.ask(self.to_b, "size", LARGE, changes=True), Crowded)
@@ -162,7 +162,7 @@ class ParcelTests(ParcelCase):
         self.assertEqual(self.got(self.a.ask(self.to_b, "size", LARGE, changes=True), 9), MIB)
 
     def test_parcels_side_by_side(self) -> None:
-        """Several parcels to one peer take turns, and on a calm path none is sent twice, even with no delay at all."""
+        """Several messages to one peer share the path fairly; without loss no fragment is retransmitted."""
         for delay in (DELAY, 0.0):
             self.board.weather = Weather(delay)
             self.got(self.a.ask(self.to_b, "echo", 1))
@@ -175,7 +175,7 @@ class ParcelTests(ParcelCase):
 
 
 class HostileTests(ParcelCase):
-    """Parts that a member makes up."""
+    """Fragments that a malicious member creates."""
 
     def setUp(self) -> None:
         """Open a session."""
@@ -183,7 +183,7 @@ class HostileTests(ParcelCase):
         self.got(self.a.ask(self.to_b, "echo", 1))
 
     def test_late_parts_begin_nothing(self) -> None:
-        """A part of a question that was whole before, or of an answer that nobody waits for, begins no parcel."""
+        """A fragment of a completed request, or of a reply without a request, starts no assembly."""
         self.got(self.a.ask(self.to_b, "echo", LARGE[:5000]))
         key = next(iter(self.b._courier._completed))[1]
         got = self.fire(self.part(1, 5030, key.id))
@@ -193,7 +193,7 @@ class HostileTests(ParcelCase):
         self.assertEqual((counted, self.b._courier._assemblies), ([1, 1], {}))
 
     def test_a_parcel_must_be_what_it_says(self) -> None:
-        """A question under another id than its parcel's is dropped, and nothing runs."""
+        """A request with another id than its fragments is dropped and does not run."""
         message = encoded(Question(5, "add", (b"x" * 2000,)))
         for number in range(2):
             data = message[number * PART_BYTES : (number + 1) * PART_BYTES]
@@ -201,7 +201,7 @@ class HostileTests(ParcelCase):
         self.assertEqual((self.b.counters["malformed"], self.runs), (1, []))
 
     def test_receipts(self) -> None:
-        """A receipt says what is here and what is missing, whatever the order; its packing is minimal."""
+        """An acknowledgement lists the received fragments in any order, in minimal encoding."""
         assembly = Assembly.of(10 * PART_BYTES, 0.0)
         for number, is_urgent in ((0, False), (1, False), (4, True), (5, False), (4, True), (2, False)):
             part = Part(Key(False, 1), False, 10 * PART_BYTES, number, bytes(PART_BYTES))
@@ -214,7 +214,7 @@ class HostileTests(ParcelCase):
         self.assertFalse(assembly.is_whole)
 
     def test_receipts_for_nothing(self) -> None:
-        """Receipts for what was never sent, or beyond its end, change nothing."""
+        """Acknowledgements of unsent fragments have no effect."""
         for here in (1, 2**900, 0):
             self.fire(packed_receipt(Key(False, 1), False, 9, 3, here))
         asked = self.b.ask(Contact(self.to_a.public, self.to_a.address), "x", LARGE)

@@ -1,4 +1,4 @@
-"""Tests of ``middleware.entangled.kademlia.detour``: nodes to which UDP is blocked enter by tunnels, and leave them."""
+"""Tests of ``middleware.entangled.kademlia.detour``: nodes with blocked UDP join through tunnels, and return to UDP."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ BOOTSTRAP = 0
 
 
 class Site:
-    """A node and what lies between it and the world."""
+    """A node with its UDP network and its tunnel."""
 
     def __init__(self, world: TunnelWorld, place: int, urls: list[Url], is_served: bool = False) -> None:
         rng = world.rng(place)
@@ -36,12 +36,12 @@ class Site:
         self.node.endpoint.expose("who", lambda peer: place)
 
     def block(self, is_blocked: bool = True) -> None:
-        """Let no UDP pass, as a firewall does."""
+        """Block all UDP, like a firewall."""
         self.udp.is_deaf = self.udp.is_mute = is_blocked
 
 
 class TunnelWorld(World):
-    """A bootstrap node that serves tunnels, and others."""
+    """A bootstrap node that serves tunnels, and other nodes."""
 
     def __init__(self) -> None:
         super().__init__(1)
@@ -49,15 +49,15 @@ class TunnelWorld(World):
         self.sites: list[Site] = []
 
     def address(self, place: int) -> Address:
-        """Where the node of this place listens: each in a network of its own."""
+        """Return the address of this node; each node is in a separate network."""
         return Address(f"198.18.{place}.1", 7000)
 
     def url(self, place: int = BOOTSTRAP) -> Url:
-        """Where the tunnel of a node begins."""
+        """Return the tunnel URL of this node."""
         return Url("wss", f"10.2.0.{place}", 443)
 
     def add(self, place: int, is_blocked: bool = False, is_served: bool = False) -> tuple[Site, Deferred[None]]:
-        """A node that joins through the bootstrap, by whatever way."""
+        """Create a node that joins through the bootstrap node, by UDP or tunnel."""
         site = Site(self, place, [] if is_served else [self.url()], is_served)
         site.block(is_blocked)
         known = [] if is_served else [self.address(BOOTSTRAP)]
@@ -66,7 +66,7 @@ class TunnelWorld(World):
         return site, site.node.join(known)
 
     def stop(self) -> None:
-        """End every node."""
+        """Stop every node."""
         for site in self.sites:
             site.node.stop()
 
@@ -79,20 +79,20 @@ class DetourTests(SynchronousTestCase):
         self.world.run(0.1)
 
     def end(self) -> None:
-        """Stop all; nothing is left on the clock."""
+        """Stop all nodes and check that no timer is left."""
         self.world.stop()
         self.world.run(10.0)
         self.assertEqual(self.world.clock.getDelayedCalls(), [])
 
     def call(self, asker: Site, asked: Site) -> object:
-        """What one node is answered by another, whom it knows by whatever address."""
+        """Return the reply of ``asked`` to a call from ``asker``, which knows it by any address."""
         (contact,) = (c for c in asker.node.overlay.contacts() if c.public == asked.node.identity.public)
         answer = asker.node.call(contact, "who")
         self.world.run(2.0)
         return self.successResultOf(answer)
 
     def test_enter_by_tunnel(self) -> None:
-        """A node to which UDP is blocked is in within 2.5 s, answers and asks, at length too; others dial nothing."""
+        """A node with blocked UDP joins within 2.5 s and exchanges large messages; other nodes dial no tunnel."""
         _, joined = self.world.add(2)
         self.world.run(0.2)
         self.successResultOf(joined)
@@ -113,7 +113,7 @@ class DetourTests(SynchronousTestCase):
         self.assertEqual(self.successResultOf(answer), b"y" * 200_000)
 
     def test_others_are_told_no_tunnel(self) -> None:
-        """Third parties hear of a tunnelled member by the address that says: others carry; so does who lies."""
+        """A tunnelled member is announced to other nodes as relayed; tunnel addresses from peers are not used."""
         other, _ = self.world.add(2)
         site, _ = self.world.add(1, is_blocked=True)
         self.world.run(4.0)
@@ -129,7 +129,7 @@ class DetourTests(SynchronousTestCase):
             self.assertEqual(Contact(public, Address(host, 1)).packed(), [public, *relayed(told.node_id)])
 
     def test_everybody_reaches_everybody(self) -> None:
-        """Two blocked members and two others: each reaches each, 4 s after the last one began to join."""
+        """Two blocked members and two others all reach each other 4 s after the last one started to join."""
         sites = [self.bootstrap]
         for place, is_blocked in ((1, True), (2, False), (3, True), (4, False)):
             sites.append(self.world.add(place, is_blocked)[0])
@@ -141,11 +141,11 @@ class DetourTests(SynchronousTestCase):
                     self.assertEqual(self.call(asker, asked), self.sites_place(asked))
 
     def sites_place(self, site: Site) -> int:
-        """The place of a site."""
+        """Return the number of a site."""
         return [self.world.identity(place).public for place in range(5)].index(site.node.identity.public)
 
     def test_leave_the_tunnel(self) -> None:
-        """When UDP works again the session moves to it within 16 s, and the tunnel closes a minute later."""
+        """When UDP works again, the session moves to it within 16 s, and the tunnel closes a minute later."""
         site, _ = self.world.add(1, is_blocked=True)
         self.world.run(10.0)
         site.block(False)
@@ -160,7 +160,7 @@ class DetourTests(SynchronousTestCase):
         self.assertEqual(self.call(self.bootstrap, site), 1)
 
     def test_fall_back_when_contact_is_lost(self) -> None:
-        """A member to which UDP is blocked later on comes back by a tunnel when it has lost all contact."""
+        """A member with UDP blocked later returns through a tunnel after it lost all contacts."""
         site, _ = self.world.add(1)
         self.world.run(5.0)
         site.block()
@@ -170,7 +170,7 @@ class DetourTests(SynchronousTestCase):
         self.assertEqual(self.call(self.bootstrap, site), 1)
 
     def test_bootstrap_restarts(self) -> None:
-        """A bootstrap node that starts again waits for no tunnelled member; they, and newcomers, are in within 15 s."""
+        """A restarted bootstrap node does not wait for tunnelled members; they and new nodes join within 15 s."""
         site, _ = self.world.add(1, is_blocked=True)
         self.world.run(40.0)
         self.bootstrap.node.vanish()
@@ -186,7 +186,7 @@ class DetourTests(SynchronousTestCase):
             self.assertEqual(self.call(each, self.bootstrap), BOOTSTRAP)
 
     def test_tunnel_alone(self) -> None:
-        """A node that knows nothing but a tunnel enters by it at once, and never takes itself for the first."""
+        """A node that knows only a tunnel joins through it at once and never regards itself as the first."""
         site = Site(self.world, 3, [self.world.url()])
         site.block()
         self.world.sites.append(site)

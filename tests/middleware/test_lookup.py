@@ -1,4 +1,4 @@
-"""One iterative search, and the XOR metric of ids that it goes by."""
+"""Tests of one iterative lookup, and of the XOR metric."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ CROWD = closest([contact(i) for i in range(40)], TARGET, 40)
 
 class LookupTest(SynchronousTestCase):
     def test_asks_the_closest_first(self) -> None:
-        """At most alpha are asked at the same time, the closest first, and nobody twice."""
+        """At most alpha contacts are queried at the same time, closest first, each once."""
         lookup = Lookup(TARGET, 8, 3, reversed(CROWD[:8]))
         self.assertEqual(lookup.next(), CROWD[:3])
         self.assertEqual(lookup.next(), [])
@@ -36,14 +36,14 @@ class LookupTest(SynchronousTestCase):
         self.assertFalse(lookup.is_finished)
 
     def test_follows_what_it_hears(self) -> None:
-        """Closer contacts from an answer are asked before those known so far."""
+        """Closer contacts from a reply are queried before the contacts known so far."""
         lookup = Lookup(TARGET, 2, 1, CROWD[10:12])
         lookup.next()
         lookup.answered(CROWD[10], [CROWD[0], CROWD[5], CROWD[10]])
         self.assertEqual(lookup.next(), [CROWD[0]])
 
     def test_ends_when_the_k_closest_answered(self) -> None:
-        """The search is over as soon as the k closest have answered; those farther away are not asked."""
+        """The lookup ends when the k closest contacts have replied; farther ones are not queried."""
         lookup = Lookup(TARGET, 2, 3, CROWD[:5])
         self.assertEqual(lookup.next(), CROWD[:2])
         lookup.answered(CROWD[0], CROWD)
@@ -54,7 +54,7 @@ class LookupTest(SynchronousTestCase):
         self.assertEqual(lookup.closest(), CROWD[:2])
 
     def test_failed_is_replaced(self) -> None:
-        """The next closest takes the place of one that failed, and what failed is not found."""
+        """The next closest contact replaces a failed one, which is not in the result."""
         lookup = Lookup(TARGET, 2, 3, CROWD[:3])
         lookup.next()
         lookup.failed(CROWD[0])
@@ -66,7 +66,7 @@ class LookupTest(SynchronousTestCase):
         self.assertEqual(lookup.closest(), CROWD[1:3])
 
     def test_all_fail(self) -> None:
-        """A search that knows nobody, or in which everybody fails, is over, and found nobody."""
+        """A lookup without contacts, or with only failed ones, ends with an empty result."""
         for seeds in ([], CROWD[:2]):
             lookup = Lookup(TARGET, 8, 3, seeds)
             for known in lookup.next():
@@ -75,7 +75,7 @@ class LookupTest(SynchronousTestCase):
             self.assertEqual((lookup.next(), lookup.closest()), ([], []))
 
     def test_slow_frees_its_place(self) -> None:
-        """A slow contact lets others be asked, but the search waits for it; where it is lost, they take its place."""
+        """A slow contact permits further queries; the lookup still waits for it, and replaces it after a failure."""
         for is_lost in (False, True):
             lookup = Lookup(TARGET, 2, 2, CROWD[:4])
             self.assertEqual(lookup.next(), CROWD[:2])
@@ -93,7 +93,7 @@ class LookupTest(SynchronousTestCase):
             self.assertEqual(lookup.closest(), CROWD[1:3] if is_lost else CROWD[:2])
 
     def test_late_answer_counts(self) -> None:
-        """An answer that comes after all was lost hope of is believed."""
+        """A reply of a contact that counted as failed is accepted."""
         lookup = Lookup(TARGET, 2, 2, CROWD[:1])
         lookup.next()
         lookup.failed(CROWD[0])
@@ -102,7 +102,7 @@ class LookupTest(SynchronousTestCase):
         self.assertEqual(lookup.next(), [CROWD[1]])
 
     def test_never_oneself(self) -> None:
-        """The searching node is neither asked nor found, though others name it."""
+        """The searching node is neither queried nor in the result."""
         lookup = Lookup(TARGET, 8, 3, CROWD[:2], exclude=CROWD[0].node_id)
         self.assertEqual(lookup.next(), [CROWD[1]])
         lookup.answered(CROWD[1], CROWD[:1])
@@ -110,7 +110,7 @@ class LookupTest(SynchronousTestCase):
         self.assertTrue(lookup.is_finished)
 
     def test_strangers_do_not_count(self) -> None:
-        """Whoever was not asked cannot answer, fail or be slow."""
+        """Replies and failures of contacts that were not queried are ignored."""
         lookup = Lookup(TARGET, 8, 3, CROWD[:4])
         for stranger in (CROWD[0], CROWD[9]):
             lookup.answered(stranger, CROWD[4:])
@@ -120,7 +120,7 @@ class LookupTest(SynchronousTestCase):
         self.assertEqual(lookup.closest(), [])
 
     def test_an_answer_is_bounded(self) -> None:
-        """Of one answer at most the k closest are believed, however many it names."""
+        """At most the k closest contacts of one reply are used."""
         lookup = Lookup(TARGET, 2, 40, CROWD[39:])
         lookup.next()
         lookup.answered(CROWD[39], CROWD[:39])
@@ -133,7 +133,7 @@ class LookupTest(SynchronousTestCase):
     @settings(max_examples=30)
     @given(st.integers(0, 2**32), st.integers(2, 60), st.binary(min_size=20, max_size=20))
     def test_exact(self, seed: int, size: int, target: bytes) -> None:
-        """In a quiet network whose tables are whole the search finds exactly the k closest nodes in any order."""
+        """In a network without loss and with complete tables, the lookup finds exactly the k closest nodes."""
         rng = random.Random(seed)
         nodes = [contact(i) for i in range(size)]
         tables = {node.node_id: RoutingTable(node.node_id, 4) for node in nodes}
@@ -157,25 +157,25 @@ IDS = st.binary(min_size=ID_BYTES, max_size=ID_BYTES)
 class DistanceTest(SynchronousTestCase):
     @given(IDS, IDS, IDS)
     def test_metric(self, a: bytes, b: bytes, c: bytes) -> None:
-        """The distance is a metric: zero for one id only, the same both ways, and no way round is shorter."""
+        """The distance is a metric: zero only for equal ids, symmetric, and with the triangle inequality."""
         self.assertEqual(distance(a, b) == 0, a == b)
         self.assertEqual(distance(a, b), distance(b, a))
         self.assertLessEqual(distance(a, c), distance(a, b) + distance(b, c))
 
     @given(IDS, IDS)
     def test_bucket_holds_its_range(self, own: bytes, other: bytes) -> None:
-        """The bucket i of an id spans the distances from 2**i to below 2**(i+1)."""
+        """Bucket i of an id covers the distances from 2**i to below 2**(i+1)."""
         if own != other:
             index = bucket_index(own, other)
             self.assertLessEqual(2**index, distance(own, other))
             self.assertLess(distance(own, other), 2 ** (index + 1))
 
     def test_no_bucket_for_oneself(self) -> None:
-        """A node's own id has no bucket."""
+        """The node's own id has no bucket."""
         self.assertRaises(ValueError, bucket_index, b"\1" * ID_BYTES, b"\1" * ID_BYTES)
 
     def test_closest_first(self) -> None:
-        """The closest contacts come first, whatever the order they were given in, and no more than asked for."""
+        """``closest`` returns at most the requested number of contacts, closest first, for any input order."""
         contacts = [contact(i) for i in range(30)]
         target = contacts[7].node_id
         found = closest(contacts, target, 5)

@@ -1,4 +1,4 @@
-"""Tests of the ledger: what is kept of questions that may run only once."""
+"""Tests of the ledger, which stores the replies to requests that must run at most once."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ LIFE = 2**32
 
 
 class KindTests(SynchronousTestCase):
-    """Which kinds of arguments a ``Method`` admits."""
+    """Tests of the argument types that a ``Method`` accepts."""
 
     def test_annotations(self) -> None:
-        """Plain types are checked, as types and as names, unions included; any other annotation admits all."""
+        """Builtin types are checked, as types, names and unions; any other annotation accepts all values."""
         rows: list[tuple[object, tuple[object, ...], tuple[object, ...]]] = [
             ("dict[str, list[int | None]] | None", ({}, None), (1, [])),
             ("list[object]|float", ([], 1, 1.5), ("x", {})),
@@ -47,20 +47,20 @@ class KindTests(SynchronousTestCase):
 
 
 class LedgerTests(SynchronousTestCase):
-    """Behaviour of ``Ledger``."""
+    """Tests of ``Ledger``."""
 
     def setUp(self) -> None:
-        """An empty one."""
+        """Create an empty ledger."""
         self.ledger = Ledger()
 
     def run_one(self, public: bytes, number: int, oldest: int, now: float) -> None:
-        """Let a question come and end at once."""
+        """Begin and end a request at once."""
         self.ledger.settle(public, oldest, now)
         self.assertIsNotNone(self.ledger.begin(public, number, None, now, False))
         self.ledger.end(public, number, b"done", now)
 
     def test_what_the_asker_has_is_forgotten(self) -> None:
-        """Ended questions older than the oldest that is open go at once; that one and later ones stay."""
+        """Finished requests older than the caller's oldest open one are removed at once; later ones stay."""
         for number in range(10):
             self.run_one(ANN, number, 0, 1.0)
         self.run_one(BOB, 3, 3, 1.0)
@@ -71,13 +71,13 @@ class LedgerTests(SynchronousTestCase):
         self.assertEqual(len(self.ledger), 5)
 
     def test_word_that_was_overtaken(self) -> None:
-        """An older word on what is open, which comes later, brings nothing back."""
+        """A late message with a lower number of the oldest open request does not reopen settled requests."""
         self.ledger.settle(ANN, 7, 1.0)
         self.ledger.settle(ANN, 4, 1.0)
         self.assertTrue(self.ledger.is_settled(ANN, 5))
 
     def test_runs_on_though_given_up(self) -> None:
-        """A question that still runs when its asker has given it up is forgotten when it ends."""
+        """A running request that its caller gave up is removed when it ends."""
         self.ledger.begin(ANN, 1, None, 1.0, False)
         self.ledger.settle(ANN, 5, 1.0)
         self.assertIsNotNone(self.ledger.entry(ANN, 1))
@@ -85,7 +85,7 @@ class LedgerTests(SynchronousTestCase):
         self.assertEqual((self.ledger.entry(ANN, 1), len(self.ledger)), (None, 0))
 
     def test_another_life(self) -> None:
-        """A restarted asker, whose numbers begin lower, is heard; what its former life settled stays so."""
+        """A restarted caller may use lower request numbers; the settled requests of its former run stay settled."""
         self.run_one(ANN, 9 * LIFE + 5, 9 * LIFE + 5, 1.0)
         self.run_one(ANN, 2 * LIFE + 1, 2 * LIFE, 2.0)
         self.assertFalse(self.ledger.is_settled(ANN, 2 * LIFE + 1))
@@ -93,14 +93,14 @@ class LedgerTests(SynchronousTestCase):
         self.assertIsNotNone(self.ledger.entry(ANN, 9 * LIFE + 5))
 
     def test_lives_are_bounded(self) -> None:
-        """Of somebody who claims ever new lives only the last few are known."""
+        """The number of runs that the ledger remembers per caller is bounded."""
         for life in range(100):
             self.ledger.settle(ANN, life * LIFE + 7, 1.0)
         known = [life for life in range(100) if self.ledger.is_settled(ANN, life * LIFE)]
         self.assertEqual(known, list(range(100 - MAX_LIVES, 100)))
 
     def test_nothing_is_kept_for_ever(self) -> None:
-        """Accounts of peers that fell silent go, one or so for each that speaks; those with work under way stay."""
+        """Entries of silent peers are removed step by step with each request, except those with running requests."""
         rng = random.Random(3)
         for _ in range(50):
             self.run_one(rng.randbytes(32), 1, 1, 1.0)
@@ -112,15 +112,15 @@ class LedgerTests(SynchronousTestCase):
 
 
 class OnceTests(EndpointCase):
-    """Questions that run once, those that may run again, and how many of them there may be."""
+    """Requests that run once, requests that may run repeatedly, and the limit on their number."""
 
     def equip(self, endpoint: Any) -> None:
-        """Add a change that may run twice."""
+        """Register a change that may run twice."""
         super().equip(endpoint)
         endpoint.expose("note", self.add, changes=True, idempotent=True)
 
     def flood(self, name: str, count: int) -> int:
-        """How many of ``count`` questions, a few at a time, were answered; all those ran."""
+        """Send ``count`` requests, eight at a time; return the number of replies and check that these requests ran."""
         answered: list[int] = []
         for number in range(count):
             asked = self.a.ask(self.to_b, name, number, changes=True)
@@ -132,7 +132,7 @@ class OnceTests(EndpointCase):
         return len(answered)
 
     def test_honest_traffic_is_never_busy(self) -> None:
-        """Thousands of changes in a few seconds are all answered, and hardly anything is kept of them."""
+        """Thousands of changes within seconds are all answered, and the ledger stays small."""
         self.patch(method, "MAX_PER_PEER", 100)
         self.board.weather = Weather(DELAY / 4)
         self.assertEqual(self.flood("add", 3000), 3000)
@@ -141,7 +141,7 @@ class OnceTests(EndpointCase):
         self.assertEqual(sorted(self.runs), list(range(3000)))
 
     def test_what_may_run_again_is_not_kept(self) -> None:
-        """An idempotent change leaves nothing in the ledger, runs in a session only, and again where it is repeated."""
+        """An idempotent change needs no ledger entry, and may run again after a retransmission."""
         self.board.weather = Weather(DELAY / 4, loss=0.3)
         answered = self.flood("note", 500)
         self.assertGreater(answered, 450)
@@ -150,7 +150,7 @@ class OnceTests(EndpointCase):
         self.assertFalse(any(self.a._asker._inquiries))
 
     def test_a_question_that_was_given_up_does_not_run(self) -> None:
-        """A change that comes once more after its asker said that it has the answer is dropped, not run again."""
+        """A retransmitted change that arrives after its caller has the reply is dropped."""
         self.assertEqual([self.got(self.a.ask(self.to_b, "add", n, changes=True)) for n in (1, 2)], [1, 2])
         session = self.a._peers.known(self.to_b.public).session  # type: ignore[union-attr]
         assert session is not None
@@ -160,7 +160,7 @@ class OnceTests(EndpointCase):
         self.assertEqual((self.runs, self.b.counters["late"]), ([1, 2], 1))
 
     def test_in_rough_weather_still_once(self) -> None:
-        """With everything lost, doubled and overtaken, eight at a time, nothing runs twice."""
+        """Under loss, duplication and reordering no change runs twice."""
         self.board.weather = Weather(DELAY, DELAY, loss=0.2, duplicate=0.3, reorder=0.4)
         self.assertGreater(self.flood("add", 800), 700)
         self.assertEqual(len(self.runs), len(set(self.runs)))

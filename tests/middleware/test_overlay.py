@@ -1,4 +1,4 @@
-"""Tests of who a node knows, and of where records belong."""
+"""Tests of the overlay: the known members, and the holders of a key."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from tests.fleet import TEAM, FleetCase
 
 class OverlayTests(FleetCase):
     def test_who_has_not_met_its_team_has_no_majority(self) -> None:
-        """Of the few that a newcomer knows at first no majority is made, though all of them were to agree."""
+        """A new node that has not met its team has no majority, even if all members that it knows agree."""
         node = self.fleet(5).nodes[4]
         key, few = hashed_key("a"), [node.contact, node.overlay.roster.live()[0]]
         self.assertEqual(node.overlay.voters(key, few).size, 2)
@@ -45,7 +45,7 @@ class OverlayTests(FleetCase):
         self.assertEqual(node.overlay.voters(key, few).size, 2)
 
     def test_holders_are_the_closest_of_all(self) -> None:
-        """In a large network every node finds the same k holders of a key, the truly closest, in order."""
+        """In a large network every node finds the same k holders of a key, the closest ones, in order."""
         for n in (9, 20):
             fleet = self.fleet(n, seed=n)
             for key in map(hashed_key, "abc"):
@@ -57,7 +57,7 @@ class OverlayTests(FleetCase):
                     self.assertLessEqual(others, {c.node_id for c in node.overlay.keepers(key)})
 
     def test_one_sign_of_life_is_as_good_as_many(self) -> None:
-        """Who was heard a moment ago changes nothing when heard again, unless it is doubted or comes from elsewhere."""
+        """A repeated message from a fresh contact changes nothing, unless the contact is doubted or has moved."""
         fleet = self.fleet(3)
         overlay, other = fleet.nodes[0].overlay, fleet.nodes[1].contact
         seen: list[Contact] = []
@@ -76,7 +76,7 @@ class OverlayTests(FleetCase):
         self.assertEqual(seen, [other] * 3 + [moved])
 
     def test_the_found_are_kept_in_mind(self) -> None:
-        """A contact that is in the table but not there drives none of those that were found out of mind."""
+        """A contact in the routing table that is offline does not displace holders that a lookup found."""
         fleet = self.fleet(14, seed=2)
         node, key = fleet.nodes[0], hashed_key("a")
         node.overlay.is_whole = False
@@ -90,7 +90,7 @@ class OverlayTests(FleetCase):
         self.assertLessEqual(others, {c.node_id for c in node.overlay.keepers(key)})
 
     def test_the_silent_go(self) -> None:
-        """One that died without a word is out of every table after a while, one that left in order at once."""
+        """A node that fails is removed from every table after a while, a node that stops at once."""
         fleet = self.fleet(4)
         fleet.nodes[3].vanish()
         fleet.nodes[2].stop()
@@ -100,7 +100,7 @@ class OverlayTests(FleetCase):
         self.assertEqual([len(node.overlay.table) for node in fleet.nodes[:2]], [1, 1])
 
     def test_return_after_a_cut(self) -> None:
-        """Nodes behind a cut, of however long, are known to all again soon after, and know them."""
+        """Nodes behind a partition of any length rejoin soon after it heals."""
         for places, seconds, after in (((3,), 2.0, 6.0), ((3,), 6.0, 6.0), ((3,), 60.0, 6.0), ((0, 1), 3.0, 12.0)):
             fleet = self.fleet(4)
             fleet.board.partition([fleet.address(place) for place in places])
@@ -111,7 +111,7 @@ class OverlayTests(FleetCase):
 
 
 class NewcomerTests(SynchronousTestCase):
-    """A node that knows nobody yet, and asks nobody."""
+    """A node without contacts, which sends no requests."""
 
     def setUp(self) -> None:
         self.clock = HeapClock()
@@ -125,32 +125,32 @@ class NewcomerTests(SynchronousTestCase):
         self.addCleanup(self.chores.stop)
 
     def meet(self) -> None:
-        """One member of the team is heard."""
+        """Add one member of the team to the roster."""
         self.overlay.roster.heard(Contact(Identity(bytes([2]) * 32).public, Address("10.0.0.2", 2)), 0.0)
 
     def forget(self) -> None:
-        """Know nobody again."""
+        """Remove all members."""
         self.overlay.roster = Roster(self.me.node_id)
         self.overlay.is_whole = self.overlay.is_large = False
 
     def knows_all(self) -> None:
-        """The roster is that of the whole team."""
+        """Mark the roster as complete."""
         self.overlay.is_whole = True
 
     def knows_many(self) -> None:
-        """The team is too large for a roster."""
+        """Mark the team as too large for a roster."""
         self.overlay.is_large = True
 
     def holders(self) -> Deferred[list[Contact]]:
-        """Ask for the holders of a key."""
+        """Request the holders of a key."""
         return Deferred.fromCoroutine(self.overlay.holders(hashed_key("a")))
 
     def met(self) -> Deferred[None]:
-        """Ask to have met the team."""
+        """Wait for the team."""
         return Deferred.fromCoroutine(self.overlay.met())
 
     def look(self, work: Deferred[Any], news: Callable[[], None], step: float) -> bool:
-        """Whether ``work``, which waits, ends at the first look after ``news``."""
+        """Return whether ``work``, which waits, ends at the first check after ``news``."""
         self.clock.advance(3.5 * step)
         self.assertNoResult(work)
         news()
@@ -158,7 +158,7 @@ class NewcomerTests(SynchronousTestCase):
         return bool(work.called)
 
     def test_holders_wait_for_anybody(self) -> None:
-        """Who knows nobody waits a little with what it stores, until one member is heard or it is known to be alone."""
+        """A node without contacts delays a store until it hears a member, knows that it is alone, or times out."""
         for news in (self.meet, self.knows_all):
             self.forget()
             self.assertTrue(self.look(self.holders(), news, PLACING_STEP))
@@ -171,7 +171,7 @@ class NewcomerTests(SynchronousTestCase):
         self.assertEqual(self.successResultOf(alone), [self.me])
 
     def test_meeting_waits_for_the_team(self) -> None:
-        """What needs a majority waits until the team is known, whole or as too large, and not for one member only."""
+        """``met`` waits until the team is completely known or known to be large; one member is not enough."""
         for news in (self.knows_all, self.knows_many):
             self.forget()
             self.assertTrue(self.look(self.met(), news, MEETING_STEP))

@@ -1,4 +1,4 @@
-"""The routing table."""
+"""Tests of the routing table."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def contact(number: int, port: int = 7000) -> Contact:
 
 
 def of_bucket(index: int, count: int) -> list[Contact]:
-    """The first ``count`` contacts that belong into the bucket ``index`` of ``OWN``."""
+    """Return the first ``count`` contacts of bucket ``index`` of ``OWN``."""
     found: list[Contact] = []
     number = 0
     while len(found) < count:
@@ -39,14 +39,14 @@ class RoutingTableTest(SynchronousTestCase):
         self.near = of_bucket(157, 4)
 
     def fill(self) -> None:
-        """A full bucket of far contacts, and k nearer ones, so that no far newcomer is a neighbour."""
+        """Fill a bucket with far contacts, and add k nearer ones, which are the neighbours of the node."""
         for near in self.near:
             self.table.saw(near, 0.0)
         for moment, known in enumerate(self.old[:4]):
             self.assertIsNone(self.table.saw(known, float(moment)))
 
     def far(self) -> list[Contact]:
-        """The far contacts in the table."""
+        """Return the far contacts in the table."""
         return [known for known in self.table.contacts() if known in self.old]
 
     def miss(self, missing: Contact, times: int) -> None:
@@ -54,7 +54,7 @@ class RoutingTableTest(SynchronousTestCase):
             self.table.failed(missing, 100.0)
 
     def test_never_oneself(self) -> None:
-        """A node is no contact of its own, whoever tells it so."""
+        """A node is never a contact of itself."""
         self.assertIsNone(self.table.saw(OWN, 0.0))
         self.table.failed(OWN, 0.0)
         self.table.remove(OWN)
@@ -63,14 +63,14 @@ class RoutingTableTest(SynchronousTestCase):
         self.assertIsNone(self.table.get(OWN.node_id))
 
     def test_address_moves(self) -> None:
-        """A contact that proved its key from another address counts once, there; silence at the old one does not."""
+        """A contact with a verified new address is listed once, at that address, and its failures are cleared."""
         self.table.saw(contact(1), 0.0)
         self.table.saw(contact(1, port=7001), 1.0)
         self.miss(contact(1), DROPPED_AFTER)
         self.assertEqual((len(self.table), self.table.contacts()), (1, [contact(1, port=7001)]))
 
     def test_full_bucket_keeps_the_old(self) -> None:
-        """A newcomer to a full bucket displaces nobody; the least recently seen contact is to be pinged."""
+        """A new contact does not displace one of a full bucket; the least recently seen one is returned for a ping."""
         self.fill()
         self.assertEqual(self.table.saw(self.new[0], 10.0), self.old[0])
         self.assertEqual(self.far(), self.old[:4])
@@ -81,14 +81,14 @@ class RoutingTableTest(SynchronousTestCase):
         self.assertEqual(self.table.saw(self.new[0], 30.0), self.old[2])
 
     def test_no_flood_of_pings(self) -> None:
-        """However many newcomers come at once, the old contact is handed out to be pinged once in a while only."""
+        """For many new contacts the old contact is returned for a ping only once per ``PATIENCE``."""
         self.fill()
         asked = [self.table.saw(newcomer, 10.0) for newcomer in self.new]
         self.assertEqual(asked, [self.old[0]] + [None] * 7)
         self.assertEqual(self.table.saw(self.new[0], 10.0 + PATIENCE), self.old[0])
 
     def test_replaced_from_the_cache(self) -> None:
-        """After three misses in a row the newcomer that was seen last takes the place."""
+        """After ``STALE_AFTER`` failures in a row the most recent waiting contact replaces the old one."""
         self.fill()
         for newcomer in self.new[:2]:
             self.table.saw(newcomer, 10.0)
@@ -99,7 +99,7 @@ class RoutingTableTest(SynchronousTestCase):
         self.assertEqual(len(self.table), 8)
 
     def test_cache_is_bounded(self) -> None:
-        """At most k newcomers wait, and the longest unseen leave the queue."""
+        """At most k contacts wait; the least recently seen ones leave the queue."""
         self.fill()
         for newcomer in self.new:
             self.table.saw(newcomer, 10.0)
@@ -108,7 +108,7 @@ class RoutingTableTest(SynchronousTestCase):
         self.assertEqual(sorted(self.far(), key=self.old.index), self.new[4:])
 
     def test_silent_newcomer_leaves_the_cache(self) -> None:
-        """A waiting newcomer that does not answer waits no longer."""
+        """A waiting contact that fails is removed from the queue."""
         self.fill()
         self.table.saw(self.new[0], 10.0)
         self.table.failed(self.new[0], 11.0)
@@ -116,7 +116,7 @@ class RoutingTableTest(SynchronousTestCase):
         self.assertIn(self.old[0], self.table.contacts())
 
     def test_stale_gives_way_at_once(self) -> None:
-        """A stale contact stays while nobody wants its place, and goes as soon as somebody does."""
+        """A stale contact stays until a new contact needs its place."""
         self.fill()
         self.miss(self.old[2], STALE_AFTER)
         self.assertIn(self.old[2], self.table.contacts())
@@ -125,7 +125,7 @@ class RoutingTableTest(SynchronousTestCase):
         self.assertEqual(len(self.table), 8)
 
     def test_dropped_after_five(self) -> None:
-        """A contact is dropped after five misses in a row; a sign of life clears them, those of others do not count."""
+        """A contact is dropped after five failures in a row; a message from it resets the count."""
         for moment in (0.0, 200.0):
             self.table.saw(contact(1), moment)
             self.miss(contact(1), DROPPED_AFTER - 1)
@@ -136,7 +136,7 @@ class RoutingTableTest(SynchronousTestCase):
         self.assertEqual(len(self.table), 0)
 
     def test_goodbye(self) -> None:
-        """Who says goodbye goes at once, and whoever waits for the place gets it."""
+        """A contact that says goodbye is removed at once, and a waiting contact replaces it."""
         self.fill()
         self.table.saw(self.new[0], 10.0)
         self.table.saw(self.new[1], 10.0)
@@ -147,7 +147,7 @@ class RoutingTableTest(SynchronousTestCase):
         self.table.remove(contact(999_999))
 
     def test_closest_passes_over_the_stale(self) -> None:
-        """Stale contacts are named only where there are not enough others, and then in their place by distance."""
+        """``closest`` returns stale contacts only if there are too few others, then in the order of distance."""
         for known in self.old[:4]:
             self.table.saw(known, 0.0)
         nearest = closest(self.old[:4], self.old[0].node_id, 4)
@@ -157,7 +157,7 @@ class RoutingTableTest(SynchronousTestCase):
         self.assertEqual(self.table.closest(self.old[0].node_id), nearest)
 
     def test_the_neighbourhood_is_known_whole(self) -> None:
-        """The k closest to the node are in the table and named first, however many share a range and came before."""
+        """The k contacts closest to the node are always in the table and listed first."""
         for moment, known in enumerate([*self.old[:4], *self.near]):
             self.table.saw(known, float(moment))
         self.assertEqual(self.table.contacts(), [*self.near, *self.old[:4]])
@@ -171,7 +171,7 @@ class RoutingTableTest(SynchronousTestCase):
         self.assertLess(len(self.table), 40)
 
     def test_buckets_to_refresh(self) -> None:
-        """Buckets without a lookup for long are named, from the nearest filled one outwards, empty ones too."""
+        """``stale_buckets`` returns buckets without a recent lookup, also empty ones beyond the nearest contact."""
         self.table.saw(of_bucket(156, 1)[0], 0.0)
         self.table.saw(self.old[0], 50.0)
         self.assertEqual(self.table.stale_buckets(60.0, 60.0), [156, 157, 158])
@@ -182,7 +182,7 @@ class RoutingTableTest(SynchronousTestCase):
 
     @given(st.integers(0, 159), st.integers())
     def test_refresh_target_lies_in_its_bucket(self, index: int, seed: int) -> None:
-        """The id to look up for a bucket belongs into it, and follows from the seed."""
+        """The lookup target for a bucket lies in it and is determined by the seed."""
         table = RoutingTable(OWN.node_id)
         target = table.refresh_target(index, random.Random(seed))
         self.assertEqual(bucket_index(OWN.node_id, target), index)
@@ -191,7 +191,7 @@ class RoutingTableTest(SynchronousTestCase):
     @settings(max_examples=50)
     @given(st.lists(st.tuples(st.sampled_from(["saw", "failed", "remove"]), st.integers(0, 40)), max_size=200))
     def test_invariants(self, events: list[tuple[str, int]]) -> None:
-        """Whatever happens, no bucket holds more than k, nobody is there twice, and the length is what it holds."""
+        """In every state each bucket has at most k contacts, each contact occurs once, and the length is correct."""
         table = RoutingTable(OWN.node_id, k=3)
         for moment, (event, number) in enumerate(events):
             getattr(table, event)(contact(number), float(moment))

@@ -1,4 +1,4 @@
-"""What becomes of a store whose file has rotted, or is of an older schema."""
+"""Tests of corrupted store files and of files of an older schema."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class RottenFileTest(SynchronousTestCase):
         self.fill()
 
     def fill(self) -> None:
-        """Leave a file with 200 records and a note."""
+        """Create a file with 200 records and a note."""
         self.path = self.mktemp()
         store = SqliteStore.open(self.path, 0.0)
         self.epoch = store.epoch
@@ -47,7 +47,7 @@ class RottenFileTest(SynchronousTestCase):
             file.write(what)
 
     def opened_anew(self, number: int = 1) -> SqliteStore:
-        """The store that takes the place of the rotten one, which must be set aside unchanged."""
+        """Open the new store that replaces the corrupted one, which must be kept unchanged under another name."""
         rotten = Path(self.path).read_bytes()
         store = SqliteStore.open(self.path, 0.0)
         self.addCleanup(store.close)
@@ -73,17 +73,17 @@ class RottenFileTest(SynchronousTestCase):
         self.overwrite(4096 * (page - 1) + 4000, bytes(range(96)))
 
     def test_damage(self) -> None:
-        """However a file is damaged it is set aside, not served with holes; the notes that are whole are saved."""
+        """A damaged file is set aside and replaced by an empty one; its readable notes are copied."""
         saved, lost = "its notes were saved (identity", "nothing in it could be saved"
         damages: tuple[tuple[Callable[[], object], str], ...] = (
-            (lambda: self.overwrite(0, b"\x5a" * 100), lost),  # its header
-            (lambda: self.overwrite(0, random.Random(1).randbytes(4096)), ""),  # its first page
-            (lambda: self.overwrite(68, b"\1\2\3\4"), saved),  # the header does not say that it is ours
+            (lambda: self.overwrite(0, b"\x5a" * 100), lost),  # the header
+            (lambda: self.overwrite(0, random.Random(1).randbytes(4096)), ""),  # the first page
+            (lambda: self.overwrite(68, b"\1\2\3\4"), saved),  # the header has another application id
             (lambda: self.overwrite(4096 * 12, b"\xff" * 4096 * 4), saved),
             (lambda: os.truncate(self.path, os.path.getsize(self.path) // 2), ""),
-            (lambda: Path(self.path).write_bytes(bytes(40_960)), lost),  # what a card leaves that lost its pages
+            (lambda: Path(self.path).write_bytes(bytes(40_960)), lost),  # a card that lost its pages leaves zeros
             (self.drop_table, ""),
-            (self.rot_index, saved),  # it would still answer, but write wrongly
+            (self.rot_index, saved),  # reads would succeed, but writes would damage the file
         )
         for damage, said in damages:
             self.fill()
@@ -95,7 +95,7 @@ class RottenFileTest(SynchronousTestCase):
                 self.assertEqual(store.noted("identity"), DOG.seed if said == saved else None)
 
     def test_again(self) -> None:
-        """A second rotten file does not take the name of the first, and the notes live on."""
+        """A second corrupted file gets another name than the first one, and the notes are kept."""
         self.overwrite(68, b"\1\2\3\4")
         self.opened_anew().close()
         self.overwrite(68, b"\1\2\3\4")
@@ -106,7 +106,7 @@ class RottenFileTest(SynchronousTestCase):
             self.assertEqual(kept.origin, "kept")
 
     def test_with_its_log(self) -> None:
-        """A file that a killed node left with its log, and that rotted since, leaves nothing in the new one."""
+        """A corrupted file and its write-ahead log, left by a killed node, do not affect the new file."""
         with closing(SqliteStore.open(self.path, 0.0)) as store:
             store.put(record("late"), FOREVER)
             store.flush()
@@ -122,7 +122,7 @@ class RottenFileTest(SynchronousTestCase):
             self.assertEqual((store.origin, len(store)), ("kept", 0))
 
     def test_parts(self) -> None:
-        """What belongs to a file is set aside with it, under a name that nothing bears yet."""
+        """A file is set aside together with its -wal and -shm files under an unused name."""
         path = self.mktemp()
         for part in ("", "-wal", "-shm"):
             Path(path + part).write_text(part)
@@ -133,7 +133,7 @@ class RottenFileTest(SynchronousTestCase):
             self.assertFalse(Path(path + part).exists())
 
     def test_anywhere(self) -> None:
-        """Whichever part of a file is overwritten, it opens with nothing that was not put, or is set aside."""
+        """A file overwritten at any position opens without false records, or is set aside."""
         whole = Path(self.path).read_bytes()
         rng = random.Random(5)
         put = {record(str(number)).slot for number in range(200)}
@@ -148,7 +148,7 @@ class RottenFileTest(SynchronousTestCase):
                 self.assertEqual([r for r in store.records() if r.value != bytes(500)], [])
                 self.assertIn(store.noted("identity"), (DOG.seed, None))
                 seen.add(f"{store.origin}, {store.rotten > 0}")
-                # What is lost without a word would be answered as if it had never been.
+                # A record that is lost without a report would look as if it had never been written.
                 lost = 200 - len(store)
                 self.assertTrue(not lost or store.origin == "replaced" or store.rotten >= lost, (lost, store.rotten))
         self.assertEqual(seen, {"kept, False", "kept, True", "replaced, False"})
@@ -177,7 +177,7 @@ class OldSchemaTest(SynchronousTestCase):
             connection.execute("INSERT INTO notes VALUES ('identity', ?)", (DOG.seed,))
 
     def test_migrates(self) -> None:
-        """A file of the schema before this one is taken over whole, once, and its bad rows are set aside."""
+        """A file of the previous schema is migrated once, and its invalid rows are kept in another table."""
         for _ in range(2):
             with closing(SqliteStore.open(self.path, 0.0)) as store:
                 self.assertEqual(store.get(KEY, tombstones=True), self.kept)
@@ -191,7 +191,7 @@ class OldSchemaTest(SynchronousTestCase):
         self.assertEqual(names, [("notes",), ("records",), ("rotten",)])
 
     def test_all_or_nothing(self) -> None:
-        """A migration for which there is no room leaves the old file as it was, to be taken over later."""
+        """A migration that runs out of space leaves the old file unchanged and can be repeated."""
         with closing(sqlite3.connect(self.path, isolation_level=None)) as connection:
             connection.text_factory = bytes
             connection.execute("PRAGMA max_page_count = 1")

@@ -1,4 +1,4 @@
-"""Tests of the whole node: a team of them on simulated time and a switchboard."""
+"""Tests of whole nodes: a team in virtual time on a switchboard."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ROUGH = Weather(delay_s=0.01, jitter_s=0.01, loss=0.3)
 
 class SwarmNodeTests(FleetCase):
     def names(self, fleet: SwarmFleet, place: int = 0) -> list[tuple[str, int]]:
-        """Names and places of the devices as one node sees them."""
+        """Return the names and numbers of the devices as seen by one node."""
         records = self.done(fleet, fleet.nodes[place].entangled.get(DEVICES), 2.0)
         return [(device.name, device.joined) for device, _ in devices_of(records)]
 
@@ -33,14 +33,14 @@ class SwarmNodeTests(FleetCase):
         return fleet.nodes[1].entangled.endpoint.ask(to, method, *arguments, changes=True)
 
     def test_order_of_joining(self) -> None:
-        """Who comes later has a higher number, and every node sees the same."""
+        """Devices are numbered in the order of joining, and every node sees the same numbers."""
         fleet = self.swarm(4)
         expected = [(f"dog{n}", n + 1) for n in range(4)]
         for place in range(4):
             self.assertEqual(self.names(fleet, place), expected)
 
     def test_joining_at_the_same_moment(self) -> None:
-        """Those that come at one moment get different numbers, a crowd in a second, and also in rough weather."""
+        """Devices that join at the same time get different numbers, also under loss."""
         for n, seed, weather, seconds in (
             (21, 1, Weather(0.005), 1.0),
             (5, 2, Weather(0.005, 0.005), 20.0),
@@ -53,7 +53,7 @@ class SwarmNodeTests(FleetCase):
             self.assertEqual(len({place for place in places if place > 0}), n, places)
 
     def test_place_is_kept(self) -> None:
-        """A device that changes what it says of itself keeps its number; its messages reach everybody."""
+        """A device that changes its presence keeps its number, and its messages reach all nodes."""
         fleet = self.swarm(2)
         fleet.nodes[1].presence.say(5.0, "hello")
         fleet.run(1.0)
@@ -62,7 +62,7 @@ class SwarmNodeTests(FleetCase):
         self.assertEqual((device.joined, device.messages, device.address), (2, ((5.0, "hello"),), "10.0.0.1:7001"))
 
     def test_vanish_and_leave(self) -> None:
-        """A device is gone with its node, at once when it leaves in order, within its lease when it does not."""
+        """A device disappears at once if its node stops, and within its lease if its node fails."""
         fleet = self.swarm(4)
         told: list[list[Record]] = []
         fleet.nodes[0].watch_devices(told.append)
@@ -75,7 +75,7 @@ class SwarmNodeTests(FleetCase):
         self.assertEqual(len(told[-1]), 2)
 
     def test_task_and_its_end(self) -> None:
-        """A task is seen by all with its council; reports go with their node, the outcome stays."""
+        """All nodes see a task with its council; reports disappear with their nodes, the result stays."""
         fleet = self.swarm(4)
         task = self.submitted(fleet)
         self.assertEqual(len(task.council), 3)
@@ -113,7 +113,7 @@ class SwarmNodeTests(FleetCase):
         self.assertEqual(len(fleet.nodes[3].store.get(TASKS)), 1)
 
     def test_strange_tasks(self) -> None:
-        """A claim on a task whose ttl or token no council grants is refused, not an accident."""
+        """A claim for a task with an invalid TTL or council is rejected without an exception."""
         fleet = self.swarm(2)
         task = self.submitted(fleet)
         for strange in (replace(task, lease_ttl=999.0), replace(task, lease_ttl=1), replace(task, council=())):
@@ -126,7 +126,7 @@ class SwarmNodeTests(FleetCase):
         self.assertEqual(self.flushLoggedErrors(), [])
 
     def test_claims_from_the_wire(self) -> None:
-        """Claims with a wrong name, configuration, ballot, token or duration are refused, and crafted councils."""
+        """Lease requests with an invalid name, configuration, ballot, token, duration or council are rejected."""
         fleet = self.swarm(2)
         good = ["t", 1, 1, 1.0]
         wrong: list[tuple[int, Any]] = [(0, "t" * 65), (0, 5), (1, 0), (2, -1), (2, 2**62), (2, True)]
@@ -151,7 +151,7 @@ class SwarmNodeTests(FleetCase):
             self.failureResultOf(asked, Refused)
 
     def test_operator(self) -> None:
-        """A text from an operator is delivered and shown; a wish to leave is carried out after its answer."""
+        """A message from an operator is delivered and shown; a disconnect order is executed after its reply."""
         fleet = self.swarm(2)
         texts: list[str] = []
         gone: list[float] = []
@@ -174,7 +174,7 @@ class SwarmNodeTests(FleetCase):
             self.failureResultOf(asked, Refused)
 
     def test_stopped_before_the_wish(self) -> None:
-        """A node that is stopped right after an operator's wish to leave leaves nothing on the clock."""
+        """A node that stops right after a disconnect order leaves no timer."""
         fleet = self.swarm(2)
         gone: list[float] = []
         fleet.nodes[0].on_disconnect(gone.append)
@@ -186,7 +186,7 @@ class SwarmNodeTests(FleetCase):
         self.assertEqual(gone, [])
 
     def test_contact_of(self) -> None:
-        """A device is reached where it says; a crafted address is no contact and no accident."""
+        """``contact_of`` returns the announced address of a device, and None for an invalid one."""
         fleet = self.swarm(1)
         node: SwarmNode = fleet.nodes[0]
         rows = {
@@ -205,7 +205,7 @@ class SwarmNodeTests(FleetCase):
         self.assertIsNone(node.contact_of(replace(record, value=b"?")))
 
     def test_too_much_to_say(self) -> None:
-        """A device that cannot be squeezed into a record is logged, and the node lives on."""
+        """A presence that exceeds a record is logged as an error, and the node continues to run."""
         fleet = self.swarm(1)
         fleet.nodes[0].presence.change(capabilities={"arm": {"kind": "x" * 2000}})
         fleet.run(1.0)

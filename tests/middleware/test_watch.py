@@ -1,4 +1,4 @@
-"""Tests of views and watches, and of who asks whom to push."""
+"""Tests of views and watches, and of subscriptions at the replicas."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ KEY = hashed_key("devices")
 
 
 def record(owner: Identity, sequence: int = 1, value: bytes | None = b"v", lifetime: Lifetime = "leased") -> Record:
-    """A record of ``owner``; views do not look at signatures."""
+    """Return a record of ``owner``; views do not verify signatures."""
     return Record(KEY, "state", owner.public, sequence, lifetime, 1.0, value, bytes(64))
 
 
@@ -29,7 +29,7 @@ class ViewTests(SynchronousTestCase):
         self.view = View(ME.node_id)
 
     def test_any_replica_suffices(self) -> None:
-        """A slot is there while one replica still says so, and gone with the last one."""
+        """A slot is visible while at least one replica reports it."""
         self.view.replace(CAT.node_id, [record(DOG)])
         self.view.add(ME.node_id, record(DOG))
         self.view.remove(CAT.node_id, record(DOG).slot)
@@ -38,7 +38,7 @@ class ViewTests(SynchronousTestCase):
         self.assertEqual(self.view.merged(), [])
 
     def test_the_stronger_record_holds(self) -> None:
-        """Of two opinions on a slot the higher sequence is shown, whoever speaks first; a replica never goes back."""
+        """The record with the higher sequence wins in any order of arrival; a replica never returns to a lower one."""
         for order in ((1, 2), (2, 1)):
             view = View()
             for replica, sequence in zip((CAT, ME), order, strict=True):
@@ -49,20 +49,20 @@ class ViewTests(SynchronousTestCase):
         self.assertEqual(self.view.merged(), [record(DOG, 2)])
 
     def test_tombstone_hides(self) -> None:
-        """A newer tombstone of one replica hides what others still hold."""
+        """A newer tombstone at one replica hides an older record at other replicas."""
         self.view.replace(CAT.node_id, [record(DOG)])
         self.view.replace(ME.node_id, [record(DOG, 2, None, "team")])
         self.assertEqual(self.view.merged(), [])
 
     def test_nobody_testifies_for_its_own_lease(self) -> None:
-        """What a node says of its own lease does not count, its team records do."""
+        """The report of an owner does not count for its leased record, but counts for its team record."""
         self.view.replace(DOG.node_id, [record(DOG)])
         self.assertEqual(self.view.merged(), [])
         self.view.replace(DOG.node_id, [record(DOG, lifetime="team")])
         self.assertEqual(len(self.view.merged()), 1)
 
     def test_digest(self) -> None:
-        """The digest is equal for the same records in any order, and another one for any other set."""
+        """Equal sets of records have the same digest in any order; different sets have different digests."""
         records = [record(DOG), record(CAT)]
         self.view.replace(ME.node_id, records)
         self.assertEqual(self.view.digest(ME.node_id), digest_of(records[::-1]))
@@ -78,7 +78,7 @@ class WatchTests(SynchronousTestCase):
         self.watch = Watch(KEY, self.told.append, self.ended.append)
 
     def test_tell_changes_only(self) -> None:
-        """The subscriber hears each change once and no repetition."""
+        """The subscriber receives each change once."""
         self.watch.settle()
         self.watch.view.replace(CAT.node_id, [record(DOG)])
         self.watch.settle()
@@ -90,7 +90,7 @@ class WatchTests(SynchronousTestCase):
         self.assertEqual(self.told, [[record(DOG)], []])
 
     def test_stop(self) -> None:
-        """After the end nothing is told, and whoever renews knows."""
+        """After a stop the subscriber receives no change, and the renewal is ended."""
         self.watch.stop()
         self.watch.view.replace(CAT.node_id, [record(DOG)])
         self.watch.settle()
@@ -102,7 +102,7 @@ COUNT = 10
 
 class SubscriberTests(FleetCase):
     def asked(self, fleet: Fleet) -> list[tuple[int, float | None]]:
-        """Which holder is asked from now on, and for how many seconds, where it is told."""
+        """Record the holders that receive watch requests from now on, with the requested TTL if any."""
         asked: list[tuple[int, float | None]] = []
         for place, node in enumerate(fleet.nodes):
 
@@ -114,14 +114,14 @@ class SubscriberTests(FleetCase):
         return asked
 
     def large(self, fleet: Fleet, seconds: float) -> None:
-        """Let time pass for nodes that take their network for a large one."""
+        """Advance the clock for nodes that regard their network as large."""
         for _ in range(round(seconds / 0.5)):
             for node in fleet.nodes:
                 node.overlay.is_large = True
             fleet.run(0.5)
 
     def test_small_team(self) -> None:
-        """In a team that is known whole every holder is asked every two seconds."""
+        """In a small team every holder is queried every two seconds."""
         fleet = self.fleet(3)
         fleet.run(3.0)
         asked = self.asked(fleet)
@@ -132,7 +132,7 @@ class SubscriberTests(FleetCase):
         self.assertEqual({ttl for _, ttl in asked}, {None})
 
     def test_large_network(self) -> None:
-        """In a large one three holders are asked, seldom, other watchers ask other ones, and all hear at once."""
+        """In a large network a watcher subscribes rarely and at three holders, which differ between watchers."""
         fleet = self.fleet(COUNT)
         self.large(fleet, 3.0)
         asked = self.asked(fleet)
@@ -148,7 +148,7 @@ class SubscriberTests(FleetCase):
         self.assertEqual([mine[-1][0].value for mine in told if mine], [b"x"] * COUNT)
 
     def test_a_holder_dies_in_a_large_network(self) -> None:
-        """When those that pushed die, others are asked as soon as that is known, and what is new is heard."""
+        """If the holders that push fail, the watcher subscribes at others, and new records arrive."""
         fleet = self.fleet(COUNT)
         self.large(fleet, 3.0)
         asked = self.asked(fleet)
@@ -165,7 +165,7 @@ class SubscriberTests(FleetCase):
         self.assertEqual(sorted(r.value or b"" for r in told[-1]), [b"x", b"y"])
 
     def test_where_all_are_full(self) -> None:
-        """Who comes when a key has as many watchers as there may be reads it every two seconds instead."""
+        """A watcher beyond the limit of a key reads it every two seconds instead."""
         fleet = self.fleet(COUNT)
         fleet.run(3.0)
         dice = random.Random(1)
@@ -181,7 +181,7 @@ class SubscriberTests(FleetCase):
         self.assertEqual([record.value for record in told[-1]], [b"x"])
 
     def test_many_changes_for_many_watchers(self) -> None:
-        """Where a key has many watchers, changes of one moment go out together, and the last word of a slot holds."""
+        """For a key with many watchers simultaneous changes are sent together, with the latest record of each slot."""
         fleet = self.fleet(3)
         fleet.run(3.0)
         dice = random.Random(1)

@@ -1,4 +1,4 @@
-"""Tests of ``control.command``: command lines in, requests out, answers as text and as JSON."""
+"""Tests of ``control.command``: command lines, requests, and replies as text and JSON."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ RECORD = {"owner": "ab" * 32, "name": "", "sequence": 1, "lifetime": "team", "va
 
 class CommandTests(SynchronousTestCase):
     def setUp(self) -> None:
-        # Trial's own folders are deeper than the path of a socket may be.
+        # The folders of trial are too deep for the path of a Unix socket.
         runtime = Path(tempfile.mkdtemp())
         self.addCleanup(shutil.rmtree, runtime)
         self.patch(os, "environ", {**os.environ, "XDG_RUNTIME_DIR": str(runtime)})
@@ -38,7 +38,7 @@ class CommandTests(SynchronousTestCase):
         yield from self.replies
 
     def run_command(self, line: str, *replies: dict[str, Any]) -> tuple[int, str]:
-        """Exit code and output of ``swarm LINE`` where the node says ``replies``."""
+        """Return the exit code and output of ``swarm LINE`` for these replies of the node."""
         self.replies = list(replies) or [{"answer": None}]
         group, *words = line.split()
         output, complaint = io.StringIO(), io.StringIO()
@@ -52,7 +52,7 @@ class CommandTests(SynchronousTestCase):
         return self.requests[-1]
 
     def test_requests(self) -> None:
-        """Each command line makes the request that it reads like."""
+        """Each command line produces the corresponding request."""
         for line, verb, given in (
             ("dht get a", "dht get", {"key": "a", "concern": "majority"}),
             ("dht find id:00 --node a", "dht find", {"key": "id:00"}),
@@ -70,7 +70,7 @@ class CommandTests(SynchronousTestCase):
         self.assertEqual((put["lifetime"], put["concern"], put["expect"], put["value"]), ("leased", "all", 3, "red"))
 
     def test_value_from_a_file(self) -> None:
-        """``@FILE`` sends the bytes of a file; a file that is not there is exit code 2."""
+        """``@FILE`` sends the bytes of a file; a missing file is exit code 2."""
         path = Path(self.mktemp())
         path.write_bytes(b"\xff")
         self.assertEqual(self.request(f"dht put a @{path}")["with"]["value"], {"base64": "/w=="})
@@ -78,7 +78,7 @@ class CommandTests(SynchronousTestCase):
         self.assertEqual(self.said, "swarm dht: /nowhere/at/all cannot be read: No such file or directory\n")
 
     def test_answers_for_people_and_programs(self) -> None:
-        """An answer is lines for a person, and one line of JSON with ``--json``."""
+        """A reply is printed as lines of text, or as one line of JSON with ``--json``."""
         self.assertEqual(self.run_command("dht get a", {"answer": [RECORD]}), (0, "ababababab  -  red\n"))
         code, output = self.run_command("dht get a --json", {"answer": [RECORD]})
         self.assertEqual((code, json.loads(output)), (0, [RECORD]))
@@ -93,7 +93,7 @@ class CommandTests(SynchronousTestCase):
             self.assertEqual(self.run_command(line, {"answer": answer}), (0, shown))
 
     def test_words_of_others_cannot_move_the_cursor(self) -> None:
-        """Names, values, fields and complaints of other nodes reach the terminal without their control characters."""
+        """Control characters in names, values, fields and errors of other nodes are not printed."""
         evil = "red\x1b[2J\x9b2J\n\u202e"
         record = {**RECORD, "name": evil, "value": evil}
         for line, answer in (
@@ -115,12 +115,12 @@ class CommandTests(SynchronousTestCase):
             self.assertEqual(self.said.count("\n"), 1)
 
     def test_events_are_printed_as_they_come(self) -> None:
-        """A watch prints each change, with a blank line behind it."""
+        """A watch prints each change, followed by a blank line."""
         code, output = self.run_command("dht watch a", {"event": [RECORD]}, {"event": []}, {"answer": None})
         self.assertEqual((code, output), (0, "ababababab  -  red\n\n\n"))
 
     def test_exit_codes(self) -> None:
-        """1: nothing found, or refused; 2: wrong. The reason is one line."""
+        """Exit code 1 means not found or rejected, 2 an invalid command; the reason is one line."""
         self.assertEqual(self.run_command("dht get a", {"answer": []})[0], 1)
         self.assertEqual(self.run_command("tuple get _", {"answer": None})[0], 1)
         self.assertEqual(self.run_command("dht put a b", {"error": "Unavailable", "text": "1 of 3 answered"})[0], 1)
@@ -134,7 +134,7 @@ class CommandTests(SynchronousTestCase):
         self.assertEqual(self.run_command("dht get a", {"event": []})[0], 1)
 
     def test_wrong_command_lines(self) -> None:
-        """Command lines that make no sense end with exit code 2 before any node is asked."""
+        """Invalid command lines end with exit code 2 before a request is sent."""
         complaint = io.StringIO()
         for line in ("dht", "dht fly", "dht get", "dht put a", "tuple get", "dht put a b --expect x", "rpc h:1"):
             group, *words = line.split()
@@ -145,7 +145,7 @@ class CommandTests(SynchronousTestCase):
         self.assertTrue(complaint.getvalue().endswith("the following arguments are required: method\n"))
 
     def test_node_that_does_not_answer(self) -> None:
-        """A socket behind which nobody is, and one that speaks another language, are named."""
+        """A socket without a server, and a server with another protocol, give an error that names the cause."""
         path = made("gone")
         said = str(self.assertRaises(NoControl, list, asked(path, {})))
         self.assertIn("does not answer (No such file or directory); start it, or remove that file", said)

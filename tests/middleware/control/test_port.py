@@ -1,4 +1,4 @@
-"""Tests of ``control.port`` and ``control.verb``: requests of lines of JSON against a team in memory."""
+"""Tests of ``control.port`` and ``control.verb``: requests as lines of JSON to a simulated team."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Listener:
         self.factory: Any = None
 
     def listenUNIX(self, path: str, factory: Any, mode: int, wantPID: bool) -> Listener:  # noqa: N802, N803
-        """Listen, or refuse as for a path in use."""
+        """Listen, or raise an error like for a path in use."""
         if self.refuses:
             raise CannotListenError("unix", path, OSError("in use"))
         self.listening.append(path)
@@ -70,13 +70,13 @@ class ControlTests(SynchronousTestCase):
         return line["answer"]
 
     def refusal(self, verb: object, **given: Any) -> str:
-        """The text of the refusal of one request that is wrong."""
+        """Return the text of the rejection of one invalid request."""
         line = self.ask(verb, **given)
         self.assertEqual(line.get("error"), "BadRequest", line)
         return str(line["text"])
 
     def test_dht(self) -> None:
-        """Put, get, find and remove do what they say, text and bytes alike."""
+        """Put, get, find and remove work for text and bytes."""
         self.assertGreaterEqual(self.answer("dht put", key="a", value="red")["replicas"], 3)
         self.answer("dht put", key="a", value={"base64": "/wA="}, name="other")
         (other, red) = sorted(self.answer("dht get", key="a"), key=lambda r: str(r["value"]), reverse=True)
@@ -90,12 +90,12 @@ class ControlTests(SynchronousTestCase):
         self.assertEqual(self.answer("dht get", key=f"id:{key}"), [])
 
     def test_compare_and_set(self) -> None:
-        """A put that expects another sequence than there is is refused by name."""
+        """A put that expects another sequence than the current one fails with ``Conflict``."""
         self.answer("dht put", key="a", value="1", expect=0)
         self.assertEqual(self.ask("dht put", key="a", value="2", expect=0)["error"], "Conflict")
 
     def test_watch_tells_until_it_is_closed(self) -> None:
-        """A watch tells each change as an event; closing the connection ends it."""
+        """A watch sends each change as an event until the connection closes."""
         connection, transport = self.opened()
         connection.dataReceived(b'{"verb": "dht watch", "with": {"key": "a"}}\n')
         self.fleet.run(1.0)
@@ -109,7 +109,7 @@ class ControlTests(SynchronousTestCase):
         self.assertEqual(len(self.lines(transport)), told)
 
     def test_keywords(self) -> None:
-        """What was published under words is found by all of them, until it is removed."""
+        """A published name is found by all of its words until it is removed."""
         self.answer("keyword publish", name="red_target-3.jpg", value="here")
         self.assertEqual([m["value"] for m in self.answer("keyword search", words="target red")], ["here"])
         self.assertEqual(self.answer("keyword search", words="target blue"), [])
@@ -117,7 +117,7 @@ class ControlTests(SynchronousTestCase):
         self.assertEqual(self.answer("keyword search", words="target"), [])
 
     def test_tuples(self) -> None:
-        """A tuple that was put is read, found by template, and taken once."""
+        """A tuple can be read repeatedly, matched by a template, and taken once."""
         for number in (1, 2):
             self.answer("tuple put", fields=["job", number, {"base64": "/w=="}])
         every = [{"any": True}] * 3
@@ -130,7 +130,7 @@ class ControlTests(SynchronousTestCase):
         self.assertEqual(self.ask("tuple read", template=every, wait=1)["error"], "NoTuple")
 
     def test_rpc(self) -> None:
-        """A method of a peer is called by the peer's address or the beginning of its id; its refusal has a name."""
+        """A method of a peer is called by the peer's address or the prefix of its id; errors name the cause."""
         peer = self.fleet.nodes[2]
         peer.endpoint.expose("add", lambda _, a, b: [a + b, b"\xff"])
         where = f"{peer.contact.address.host}:{peer.contact.address.port}"
@@ -144,7 +144,7 @@ class ControlTests(SynchronousTestCase):
             self.assertTrue(told.endswith(": the port must be 1 to 65535"), told)
 
     def test_wrong_requests(self) -> None:
-        """What is wrong is said with the argument's name, and nothing is done."""
+        """An invalid request is rejected with the name of the argument."""
         for verb, given, said in (
             ("dht fly", {}, "dht get"),
             (None, {}, "no verb"),
@@ -169,7 +169,7 @@ class ControlTests(SynchronousTestCase):
         self.assertEqual(self.ask("keyword search", words="")["error"], "BadName")
 
     def test_lines_that_are_no_request(self) -> None:
-        """Bytes that are no JSON object, or too many, are refused; what comes behind a request is not read."""
+        """Input that is not a JSON object, or is too long, is rejected; bytes after a request are ignored."""
         for line in (b"\xff\n", b"[]\n", b"nonsense\n", b"[" * 100_000 + b"\n", b'{"verb": "dht get", "with": []}\n'):
             connection, transport = self.opened()
             connection.dataReceived(line)
@@ -181,7 +181,7 @@ class ControlTests(SynchronousTestCase):
         self.assertEqual([each["error"] for each in self.lines(transport)], ["BadRequest"])
 
     def test_request_in_pieces(self) -> None:
-        """A request may come in any pieces."""
+        """A request may arrive in any number of segments."""
         connection, transport = self.opened()
         for byte in b'{"verb": "dht find", "with": {"key": "a"}}\n':
             connection.dataReceived(bytes([byte]))
@@ -189,7 +189,7 @@ class ControlTests(SynchronousTestCase):
         self.assertEqual(len(self.lines(transport)[0]["answer"]), 3)
 
     def test_connections_are_bounded(self) -> None:
-        """One connection too many is told so; when others have gone there is room again."""
+        """A connection beyond the limit gets the error ``Busy``; closed connections free their places."""
         connections = [self.opened() for _ in range(MAX_CONNECTIONS)]
         _, transport = self.opened()
         self.assertEqual(self.lines(transport)[0]["error"], "Busy")
@@ -198,14 +198,14 @@ class ControlTests(SynchronousTestCase):
         self.assertEqual(len(self.answer("dht find", key="a")), 3)
 
     def test_verbs_are_made_when_somebody_asks(self) -> None:
-        """A node that nobody speaks to does not load the verbs; one that somebody speaks to loads them once."""
+        """The verbs are loaded with the first request, and only once."""
         self.assertEqual(self.made, 0)
         self.answer("dht find", key="a")
         self.answer("dht find", key="b")
         self.assertEqual(self.made, 1)
 
     def test_node_lives_without_a_socket(self) -> None:
-        """Where the path is in use the log says so and the node lives on; a service that stops closes all."""
+        """If the path is in use, the node logs it and continues to run; a service that stops closes all connections."""
         port = ControlPort(Listener(refuses=True), Path("/run/a.control"), self.verbs)
         port.startService()
         self.successResultOf(port.stopService())

@@ -1,4 +1,4 @@
-"""Tests of ``middleware.entangled.quorum.acceptor``: the table row by row, and every state that can be reached."""
+"""Tests of ``middleware.entangled.quorum.acceptor``: each row of its state table, and all reachable states."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ GIVEN_BACK = {"promised": MID, "spent": HIGH}
 
 class TableTests(SynchronousTestCase):
     def test_every_row(self) -> None:
-        """Each state, event and stand of a ballot gives the answer and the next state of its row."""
+        """Each combination of state, event and relation of the ballot gives the reply and next state of its row."""
         for (state, event, stand), (kind, after) in TABLE.items():
             if state is State.UNKNOWN:
                 continue
@@ -61,7 +61,7 @@ class TableTests(SynchronousTestCase):
             self.assertEqual((reply.kind, state_of(register)), (kind, after), (state, event, stand))
 
     def test_unknown(self) -> None:
-        """What was never prepared accepts and gives back nothing where that has to come first, and takes no room."""
+        """An unprepared register rejects an accept that needs a promise, and a release, and takes no space."""
         for use in (TAKE, LEASE):
             member = Member(use)
             ballot = use.ballot(1, 0)
@@ -73,7 +73,7 @@ class TableTests(SynchronousTestCase):
             self.assertEqual(Member(use).prepare(ballot, 0.0).kind, Kind.GRANTED)
 
     def test_no_row_is_missing(self) -> None:
-        """Every state has a row for every event and every stand that can be found for it."""
+        """The table has a row for each state, event and possible relation of a ballot."""
         found = {stand for _, event, stand in TABLE if event is not Event.RELEASE}
         released = {Stand.FOREIGN, Stand.LOWER, Stand.HELD, Stand.FREE}
         wanted = {(s, e, st) for s in State for e in Event for st in (released if e is Event.RELEASE else found)}
@@ -82,14 +82,14 @@ class TableTests(SynchronousTestCase):
 
 
 class ReachableTests(SynchronousTestCase):
-    """What holds in every state that a few proposers can bring about."""
+    """Invariants in all states that a few proposers can reach."""
 
     def test_take(self) -> None:
-        """Two takers, three ballots each: promises and acceptances never fall, and are never for two."""
+        """For two takers with three ballots, promises and acceptances never decrease and never conflict."""
         self.assertGreater(self.explore(TAKE, tuple(self.questions(TAKE))), 300)
 
     def test_lease(self) -> None:
-        """Two holders, also in a second life: never two at a time, no lower token, nothing after a change."""
+        """For two holders with restarts there is one lease at a time, no lower token, and no grant after a change."""
         self.assertGreater(self.explore(LEASE, tuple(self.questions(LEASE))), 2000)
 
     def questions(self, use: Use) -> Iterator[tuple[str, Any, int]]:
@@ -107,7 +107,7 @@ class ReachableTests(SynchronousTestCase):
                     yield "lease", ballot, token
 
     def explore(self, use: Use, questions: tuple[tuple[str, Any, int], ...]) -> int:
-        """Ask everything in every state that can be reached in five steps of a third of a ttl; how many there are."""
+        """Send all requests in all states reachable in five time steps; return the number of states."""
         start = (Member(use).acceptor.log.blank(0.0), 0)
         states, seen = [start], {self.digest(*start)}
         for register, step in states:
@@ -128,13 +128,13 @@ class ReachableTests(SynchronousTestCase):
         return len(states)
 
     def digest(self, register: Register, step: int) -> tuple[Any, ...]:
-        """What tells two states apart: periods that have ended are alike."""
+        """Return the distinguishing features of a state; periods that have ended are equal."""
         now = step * 0.4 * TTL
         told = register.promised, register.holder, register.spent, register.accepted, register.token, register.grantee
         return (*told, max(0.0, register.until - now), max(0.0, register.reserved_until - now), step)
 
     def ask(self, member: Member, event: str, ballot: Any, token: int, now: float) -> Reply:
-        """Ask one thing; the value says under which ballot it was asked for."""
+        """Send one request; the accepted value depends on the ballot."""
         match event:
             case "prepare":
                 return member.prepare(ballot, now)
@@ -157,12 +157,12 @@ class ReachableTests(SynchronousTestCase):
         now: float,
         reply: Reply,
     ) -> None:
-        """The invariants of one step, by their names in ``docs/explanation/quorum.md``."""
+        """Check the invariants of one step, with the names of ``docs/explanation/quorum.md``."""
         case = event, ballot, token, now, before
         lives = use.codec.lives
         is_held = before.until > now and not ballot.is_kin(before.holder, lives)
         if reply.kind not in (Kind.GRANTED, Kind.SEALED):
-            self.assertEqual(self.digest(before, 0), self.digest(after, 0), case)  # a refusal changes nothing
+            self.assertEqual(self.digest(before, 0), self.digest(after, 0), case)  # a rejection changes nothing
         self.assertGreaterEqual(after.promised, before.promised, case)  # P1
         self.assertGreaterEqual(after.accepted, before.accepted, case)  # A1
         self.assertGreaterEqual(after.token, before.token, case)  # T1
@@ -192,7 +192,7 @@ class ReachableTests(SynchronousTestCase):
 
 class NumberTests(SynchronousTestCase):
     def test_numbers_are_bounded(self) -> None:
-        """The highest ballots and tokens there are get no promise, so that others can still propose (N1)."""
+        """The highest ballots and tokens get no promise, which leaves room for other proposers (N1)."""
         for use in (TAKE, LEASE):
             member, huge = Member(use), use.ballot(ROOM + 1, 0)
             self.assertEqual(member.prepare(huge, 0.0).kind, Kind.OUTBID)
@@ -202,14 +202,14 @@ class NumberTests(SynchronousTestCase):
             self.assertEqual(member.prepare(huge, 1.0).kind, Kind.GRANTED)
 
     def test_another_life(self) -> None:
-        """A proposer in another life waits for the lease of its former one, whose device may still move (L2)."""
+        """A restarted proposer waits for the lease of its former run, as its device may still act (L2)."""
         member = Member(LEASE)
         member.lease(LOW, 1, 0.0)
         self.assertEqual(member.prepare(MID, 1.0).kind, Kind.GRANTED)
         self.assertEqual(member.prepare(MID._replace(counter=MID.counter + 1), 1.0).kind, Kind.HELD)
 
     def test_restart(self) -> None:
-        """Another process has promised, leased and accepted what the one before it had (D1, R2)."""
+        """A restarted acceptor keeps its promises, leases and accepted values (D1, R2)."""
         for use in (TAKE, LEASE):
             member, first, second = Member(use), use.ballot(1, 0), use.ballot(2, 1)
             member.prepare(second, 0.0)

@@ -1,4 +1,4 @@
-"""Tests of what nodes may do to each other by introductions, and of those that need none."""
+"""Tests of the limits of introductions between nodes, and of nodes that need none."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ INTRODUCE, MEET = "reach.introduce", "reach.meet"
 
 
 class QuietTests(GroundCase):
-    """Who needs no help causes no traffic."""
+    """Nodes with direct paths cause no traffic for introductions."""
 
     def test_neighbours_ask_nobody(self) -> None:
-        """On one LAN nobody is introduced, mirrored or carried, also when a node dies, and nobody ticks for it."""
+        """Nodes on one LAN use no introduction, address probe, relay or timer, even if a node fails."""
         ground = self.ground(weather=Weather(delay_s=0.001))
         asked: list[bytes] = []
         ground.nodes["pub"].vanish()
@@ -42,7 +42,7 @@ class QuietTests(GroundCase):
             self.assertEqual(len(node.reach.relay), 0)
 
     def test_answered_at_once(self) -> None:
-        """Whoever answers at once is never introduced, however far away."""
+        """A node that replies at once is never introduced, at any distance."""
         ground = self.ground()
         a = ground.at("a", "none")
         b = ground.at("b", "none")
@@ -53,23 +53,23 @@ class QuietTests(GroundCase):
 
 
 class HostileTests(GroundCase):
-    """What members who lie, and those who overdo it, can do."""
+    """Attacks by members that lie or send too many requests."""
 
     def setUp(self) -> None:
-        """A public node and two that know it."""
+        """Create a public node and two nodes that know it."""
         self.g = self.ground()
         self.a, self.b = self.g.at("a", "none"), self.g.at("b", "none")
         self.g.run(3.0)
 
     def asked(self, method: str, *arguments: object) -> Any:
-        """What ``a`` gets when it asks ``b``."""
+        """Return the result of a request from ``a`` to ``b``."""
         got: list[Any] = []
         self.a.call(self.g.met_at(self.b), method, *arguments, changes=True).addBoth(got.append)
         self.g.run(1.5)
         return getattr(got[0], "value", got[0])
 
     def test_odd_questions(self) -> None:
-        """What makes no sense is refused by name or answered with nothing, and raises nothing."""
+        """Invalid requests are rejected or get an empty result, without an exception."""
         stranger = Identity(b"s" * 32)
         odd: list[tuple[object, ...]] = [(b"", [], 0), (b"x", [], 0), (bytes(20), "x", 0), (bytes(20), [], None)]
         for arguments in odd:
@@ -86,7 +86,7 @@ class HostileTests(GroundCase):
         self.assertEqual(self.asked("echo", 3), 3)
 
     def test_liars_are_outdone(self) -> None:
-        """An introducer that makes up addresses keeps nobody from those that the others tell."""
+        """An introducer with false addresses does not prevent a connection through other introducers."""
         made_up = [[f"203.0.114.{n}", 7000] for n in range(20)]
         self.a.endpoint.expose(INTRODUCE, lambda peer, *rest: [made_up, [], True], changes=True)
         c = self.g.at("c", "port")
@@ -98,7 +98,7 @@ class HostileTests(GroundCase):
         self.assertEqual(self.g.call(c, contact)[0], 7)
 
     def test_nobody_to_ask(self) -> None:
-        """A carried way that nobody knows fails as any silence does, and leaves nothing behind."""
+        """A call to an unknown relayed node fails like any call without a reply and leaves no state."""
         stranger = Identity(b"s" * 32)
         answer, seconds = self.g.call(self.a, Contact(stranger.public, relayed(stranger.node_id)))
         self.assertIn("no answer", str(answer))
@@ -109,7 +109,7 @@ class HostileTests(GroundCase):
         self.assertEqual(len(self.a.endpoint.peers._openings), 0)
 
     def test_outside(self) -> None:
-        """Behind a symmetric router two peers see two ports, behind others one and the same."""
+        """Behind a symmetric router two peers see two ports, behind other types the same port."""
         for site, kind, ports in (("c", "port", 1), ("d", "sym", 2)):
             c = self.g.at(site, kind)
             self.g.run(2.0)
@@ -121,15 +121,15 @@ ASKER, OTHER, STRANGER = b"a" * 32, b"o" * 32, b"s" * 32
 
 
 class AllowanceTests(SynchronousTestCase):
-    """Behaviour of ``Allowance``."""
+    """Tests of ``Allowance``."""
 
     def setUp(self) -> None:
-        """An allowance of which nobody has used anything."""
+        """Create an unused allowance."""
         self.clock = HeapClock()
         self.allowance = Allowance(self.clock)
 
     def test_each_peer_has_its_own(self) -> None:
-        """Who has used up its introductions waits for the next one, and keeps nobody else from any."""
+        """A peer that used its introductions waits for the next one; other peers are not affected."""
         granted = [self.allowance.may_introduce(ASKER) for _ in range(int(2 * INTRODUCTIONS) + 1)]
         self.assertEqual((sum(granted), granted[-1]), (2 * INTRODUCTIONS, False))
         self.assertTrue(self.allowance.may_introduce(OTHER))
@@ -138,7 +138,7 @@ class AllowanceTests(SynchronousTestCase):
         self.assertEqual([self.allowance.may_introduce(ASKER) for _ in range(2)], [True, False])
 
     def test_who_is_met_does_not_count(self) -> None:
-        """What an introducer used up comes back once for each peer that answers, and at the pace of strangers else."""
+        """Each peer that answers restores one use of its introducer; other uses return at a fixed rate."""
         while self.allowance.may_meet(ASKER):
             self.allowance.introduced(STRANGER, ASKER)
         for public, again in ((OTHER, False), (STRANGER, True), (STRANGER, False)):
@@ -150,17 +150,17 @@ class AllowanceTests(SynchronousTestCase):
 
 
 class CandidateTests(SynchronousTestCase):
-    """Behaviour of the functions of ``candidate``."""
+    """Tests of the functions of ``candidate``."""
 
     def test_there_and_back(self) -> None:
-        """Addresses of both families come back as they went, each once, and no more than there may be."""
+        """IPv4 and IPv6 addresses survive packing without duplicates, up to ``MAX_CANDIDATES``."""
         addresses = [Address("203.0.113.1", 7000), Address("2001:db8::1", 1), Address("192.168.1.2", 65535)]
         self.assertEqual(unpacked(packed([*addresses, *addresses])), addresses)
         many = [Address("203.0.113.1", port) for port in range(1, 50)]
         self.assertEqual(unpacked([list(address) for address in many]), many[:MAX_CANDIDATES])
 
     def test_what_no_peer_can_have(self) -> None:
-        """Groups, any, all, names, carried ways, odd ports and what is no list at all are left out."""
+        """Multicast, wildcard, broadcast, host name and relay addresses, invalid ports and other input are dropped."""
         hosts = ["224.0.0.1", "ff02::1", "0.0.0.0", "::", "255.255.255.255", "localhost", "~" + "0" * 40, "", "1" * 99]
         for host in hosts:
             self.assertEqual(unpacked([[host, 7000]]), [], host)
@@ -170,7 +170,7 @@ class CandidateTests(SynchronousTestCase):
         self.assertEqual(unpacked([["203.0.113.1", 65536], [b"203.0.113.1", 1], ["203.0.113.1", True]]), [])
 
     def test_near(self) -> None:
-        """One machine and one site's own network are near; public hosts, other sites and other families are not."""
+        """Hosts on one machine or one private network are near; public hosts and other networks are not."""
         near = [("127.0.0.1", "192.168.1.2"), ("192.168.1.9", "192.168.1.2"), ("10.0.7.1", "10.0.9.1")]
         near += [("203.0.113.1", "203.0.113.1"), ("fe80::1", "fe80::2"), ("fd00::1", "fd00::2")]
         far = [("203.0.113.1", "203.0.113.2"), ("192.168.1.2", "10.0.0.1"), ("192.168.1.2", "192.169.1.2")]
