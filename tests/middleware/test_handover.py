@@ -1,4 +1,4 @@
-"""Tests of how what is held reaches those who should hold it, and of what two nodes tell each other of it."""
+"""Tests of the hand-over of records to new holders, and of the reconciliation between two replicas."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ HOUR = 3600.0
 
 
 def counted(node: EntangledNode) -> Counter[str]:
-    """The methods that ``node`` asks of others from now on, and under ``records`` how many records it gives them."""
+    """Return a counter of the later requests of ``node`` by method, and of the records that it stores."""
     seen: Counter[str] = Counter()
     ask = node.overlay.ask
 
@@ -34,16 +34,16 @@ def counted(node: EntangledNode) -> Counter[str]:
 
 
 class LifeTests(FleetCase):
-    """How long a record lives where it was handed on by others than its owner."""
+    """The remaining TTL of records that other nodes than their owner forwarded."""
 
     def left(self, fleet: Fleet, place: int, name: str = "a") -> float:
-        """Seconds left to the record of node 0 at another node."""
+        """Return the remaining seconds of a record of node 0 at another node."""
         slot = Record(KEY, name, fleet.identity(0).public, 1, "team", 1.0, b"").slot
         expiry = fleet.stores[place].expiry(slot)
         return 0.0 if expiry is None else expiry - fleet.clock.seconds()
 
     def newcomer_that_meets_a_liar(self, told: float) -> Fleet:
-        """Five nodes; the last came while it saw only node 1, which names ``told`` seconds for whatever it gives on."""
+        """Return five nodes; the last joined through node 1 alone, which forwards records with a TTL of ``told``."""
         fleet = self.fleet(4)
         for number in range(40):
             fleet.nodes[0].put(KEY, "a" if not number else f"other {number}", b"x", "team", "all")
@@ -58,13 +58,13 @@ class LifeTests(FleetCase):
         return fleet
 
     def test_a_liar_shortens_no_life(self) -> None:
-        """A newcomer that was given a record with a short life learns the longer one from an honest holder."""
+        """A new node that received a record with a false, short TTL learns the longer one from an honest replica."""
         fleet = self.newcomer_that_meets_a_liar(2 * HOUR)
         fleet.run(30.0)
         self.assertGreater(self.left(fleet, 4), TEAM_TTL - 60.0)
 
     def test_nor_behind_records_of_its_own(self) -> None:
-        """Longer lives of the liar's own records, at the newcomer only, do not hide what it shortened."""
+        """Records of the malicious node with long TTLs do not hide the TTLs that it shortened."""
         fleet = self.newcomer_that_meets_a_liar(2 * HOUR)
         liar = fleet.identity(1)
         for number in range(60):
@@ -76,7 +76,7 @@ class LifeTests(FleetCase):
         self.assertLessEqual(self.left(fleet, 4), TEAM_TTL)
 
     def test_lives_do_not_creep(self) -> None:
-        """Whoever compares lives again and again makes none longer: an owner that is gone is outlived by one ttl."""
+        """Repeated reconciliation extends no TTL: a record expires at most one TTL after its owner failed."""
         fleet = self.fleet(4)
         self.done(fleet, fleet.nodes[0].put(KEY, "a", b"x", "team", "all"), 1.0)
         fleet.nodes[0].vanish()
@@ -86,7 +86,7 @@ class LifeTests(FleetCase):
             self.assertLess(self.left(fleet, place) + fleet.clock.seconds() - began, TEAM_TTL + 1.0)
 
     def test_a_life_names_the_very_record(self) -> None:
-        """A longer life that is named for another record of the slot, or beyond the ttl, makes nothing longer."""
+        """A TTL for another record of the slot is ignored, and one beyond the record's TTL is reduced to it."""
         fleet = self.fleet(2)
         self.done(fleet, fleet.nodes[0].put(KEY, "a", b"x", "team", "all"), 1.0)
         handover: Any = fleet.nodes[1]._handover
@@ -99,10 +99,10 @@ class LifeTests(FleetCase):
 
 
 class GivingTests(FleetCase):
-    """What is given to those who should hold it, by one who should not."""
+    """Records that a node hands over to their holders."""
 
     def test_only_what_is_lacking(self) -> None:
-        """Who holds records that belong to others gives each of them what it lacks, once, and then is silent."""
+        """A node hands over only missing records, each once, and then sends no more."""
         fleet = self.fleet(12)
         stranger = fleet.identity(99)
         made = [
@@ -124,7 +124,7 @@ class GivingTests(FleetCase):
         seen = counted(giver)
         self.reconcile(fleet, handover, peer)
         self.assertEqual((seen["records"], seen["lacking"]), (0, 0))
-        # Another record more: it alone is given.
+        # An additional record is handed over alone.
         more = Record(there[0].key, "b", stranger.public, 1, "team", HOUR, b"x").signed(stranger)
         giver.replica.keep(more)
         self.reconcile(fleet, handover, peer)
@@ -137,10 +137,10 @@ class GivingTests(FleetCase):
 
 
 class ManyTests(FleetCase):
-    """Thousands of own records at once, and reads of many."""
+    """Thousands of own records at once, and reads of many records."""
 
     def test_a_holder_reads_no_record_again(self) -> None:
-        """A majority read at a holder moves digests where the others hold the same, and records where they do not."""
+        """A majority read at a replica transfers only digests if the replicas agree, otherwise records."""
         fleet = self.fleet(5)
         for number in range(300):
             fleet.nodes[0].put(KEY, str(number), b"x" * 100, "team", "all")
@@ -157,11 +157,11 @@ class ManyTests(FleetCase):
         for place in (0, 2, 3, 4):
             fleet.nodes[place].replica.keep(newer)
         self.assertGreater(cost(301), 60)
-        fleet.run(40.0)  # it was mended meanwhile
+        fleet.run(40.0)  # meanwhile the replicas were reconciled
         self.assertLess(cost(301), 25)
 
     def test_newcomers_get_all_leases(self) -> None:
-        """Two thousand own leases all arrive at newcomers, and nothing is given up because too much is on its way."""
+        """Two thousand leased records reach each new node, and none is dropped because of congestion."""
         fleet = self.fleet(1)
         owner = fleet.nodes[0]
         for number in range(MANY):
@@ -176,7 +176,7 @@ class ManyTests(FleetCase):
         self.assertEqual(owner.endpoint.counters["crowded"], 0)
 
     def test_what_is_owed_is_paced(self) -> None:
-        """Two thousand own records that no one else could take at first are all there soon after others are."""
+        """Two thousand records that were written during a partition are replicated soon after it heals."""
         fleet = self.fleet(3)
         owner = fleet.nodes[0]
         fleet.board.partition([fleet.address(0)])
@@ -191,7 +191,7 @@ class ManyTests(FleetCase):
         self.assertEqual(owner.endpoint.counters["crowded"], 0)
 
     def test_paced(self) -> None:
-        """So many are at work at a time, what fails does not stop the others, and nothing is begun ahead."""
+        """``paced`` runs a limited number of coroutines; an error does not stop the others, and none starts early."""
         begun: list[int] = []
         waiting: dict[int, Deferred[None]] = {}
 
@@ -230,7 +230,7 @@ class OverlapTests(FleetCase):
         return self.done(self.whole, self.whole.nodes[1].endpoint.ask(to, method, *arguments), 0.1)
 
     def places(self, group: int) -> list[list[Any]]:
-        """All places of a part, page by page."""
+        """Return all places of a group, page by page."""
         found: list[list[Any]] = []
         while True:
             page = self.ask("places", group, found[-1][:3] if found else [])
@@ -239,7 +239,7 @@ class OverlapTests(FleetCase):
                 return found
 
     def test_every_place_is_listed_once(self) -> None:
-        """The pages of all parts have each record once, in order, without what came in between."""
+        """The pages of all groups list each record once, in order."""
         self.ask("digests", 7, 2)
         found = [self.places(group) for group in range(GROUPS)]
         for part in found:
@@ -249,7 +249,7 @@ class OverlapTests(FleetCase):
         self.assertEqual(self.places(-1), [])
 
     def test_who_pages_sees_one_moment(self) -> None:
-        """What is stored after the digests were given is listed after the next ones, or when the list is old."""
+        """Records stored after a digest request are listed after the next request, or when the list is old."""
         late = hashed_key("late")
         group = late[0] * GROUPS >> 8
         self.ask("digests", 7, 2)
@@ -260,7 +260,7 @@ class OverlapTests(FleetCase):
         self.assertIn(late, [place[0] for place in self.places(group)])
 
     def test_records_come_in_pages(self) -> None:
-        """A page has records until it is full, the first one however large, and None for what is not there."""
+        """A page contains records up to its size limit, at least one, and None for each missing record."""
         node = self.whole.nodes[0]
         large = hashed_key("large")
         for name in "abc":
@@ -274,7 +274,7 @@ class OverlapTests(FleetCase):
         self.assertEqual(self.ask("fetch", []), [])
 
     def test_wrong_questions(self) -> None:
-        """Parts, cursors and slots that cannot be are refused."""
+        """Invalid groups, cursors and slots are rejected."""
         to, asker = self.whole.nodes[2].contact, self.whole.nodes[1].endpoint
         wrong: list[tuple[object, ...]] = [
             ("digests", BITS, 2),
@@ -293,10 +293,10 @@ class OverlapTests(FleetCase):
 
 
 class JoinTests(FleetCase):
-    """What joining costs before the first read, and what follows."""
+    """The cost of joining until the first read, and the hand-over afterwards."""
 
     def test_a_newcomer_reads_at_once(self) -> None:
-        """In a team of 20 the first read of an old key needs few datagrams, whether its first contact has it or not."""
+        """In a team of 20 the first read of a new node needs few datagrams, for any bootstrap node."""
         fleet = self.fleet(20)
         keys = [hashed_key(str(number)) for number in range(6)]
         for key in keys:
@@ -315,7 +315,7 @@ class JoinTests(FleetCase):
             fleet.run(3.0)
 
     def test_a_newcomer_takes_over(self) -> None:
-        """Seconds later it knows everybody, is sure, and holds what belongs to it; nobody compares with it again."""
+        """Within a second a new node knows all members, is ``SURE`` and holds its records."""
         fleet = self.fleet(10)
         keys = [hashed_key(str(number)) for number in range(60)]
         for key in keys:
@@ -330,7 +330,7 @@ class JoinTests(FleetCase):
         self.assertEqual([key for key in keys if newcomer.replica.held(key)], belongs)
 
     def test_a_newcomer_writes_to_the_right_nodes(self) -> None:
-        """A majority write right after joining, before everybody is known, is found by a majority read elsewhere."""
+        """A majority write directly after joining is found by a majority read at another node."""
         fleet = self.fleet(20)
         for number in range(6):
             newcomer = fleet.made(len(fleet.nodes))

@@ -1,4 +1,4 @@
-"""Tests of a network that is too large to be known whole; here it is so from thirteen nodes on."""
+"""Tests of networks that are too large for a roster, with a limit of twelve members."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class LargeTests(FleetCase):
         return fleet
 
     def pings(self, node: EntangledNode) -> Counter[bytes]:
-        """Whom a node asks from now on whether it is there, and how often."""
+        """Return a counter of the later pings of a node by target."""
         asked: Counter[bytes] = Counter()
         ask, greet = node.overlay.ask, node.endpoint.greet
 
@@ -57,28 +57,28 @@ class LargeTests(FleetCase):
         return asked
 
     def far(self, node: EntangledNode) -> Contact:
-        """A contact of the node that is none of its neighbours."""
+        """Return a contact of the node that is not one of its neighbours."""
         near = node.overlay.neighbours()
         return next(c for c in reversed(node.overlay.contacts()) if c not in near)
 
     def found(self, fleet: Fleet, node: EntangledNode, target: bytes) -> list[Contact]:
-        """What a node finds closest to an id."""
+        """Return the contacts that a node finds closest to an id."""
         return self.done(fleet, node.find_node(target), 2.0)
 
     def test_a_lookup_finds_who_let_go_of_the_session(self) -> None:
-        """Lookups are exact over long ways, too, while some let go of sessions that the others have yet."""
+        """Lookups over slow paths are exact, also if some nodes have closed sessions that their peers still have."""
         fleet = self.large(weather=Weather(0.08))
         node, target = fleet.nodes[0], self.far(fleet.nodes[0]).node_id
         others = [other.contact for other in fleet.nodes[1:]]
         self.assertEqual(self.found(fleet, node, target), closest(others, target, K))
-        self.patch(node.endpoint, "let_go", lambda seconds: None)  # its own turn to look comes a little later
+        self.patch(node.endpoint, "let_go", lambda seconds: None)  # prevents the periodic cleanup by this node
         fleet.run(SESSION_S)
         for other in fleet.nodes[1:]:
             other.endpoint.let_go(SESSION_S)
         self.assertEqual(self.found(fleet, node, target), closest(others, target, K))
 
     def far_from(self, fleet: Fleet, key: bytes) -> tuple[EntangledNode, EntangledNode]:
-        """Who is the farthest from a key, of whose holders it knows none, and whom it asks first."""
+        """Return the node farthest from a key, with no holder as a contact, and the contact that it queries first."""
         order = closest([node.contact for node in fleet.nodes], key, len(fleet.nodes))
         reader, first = (fleet.nodes[contact.address.port - 7000] for contact in (order[-1], order[K]))
         for contact in order[:K]:
@@ -88,18 +88,18 @@ class LargeTests(FleetCase):
         return reader, first
 
     def test_a_fast_read_goes_past_who_wrote(self) -> None:
-        """What all have written under one key is read whole, though who is asked first still has its own record."""
+        """A fast read of a key with many writers is complete although the first queried node has one old record."""
         fleet = self.large()
         key = hashed_key("all write here")
         for node in fleet.nodes:
             self.done(fleet, node.put(key, "x", b"here", "leased", lease=30.0))
         reader, first = self.far_from(fleet, key)
         own = Record(key, "x", first.identity.public, 1, "leased", 30.0, b"here").signed(first.identity)
-        first.replica.keep(own)  # from when it was one of the closest
+        first.replica.keep(own)  # from a time when the node was one of the closest
         self.assertEqual(len(self.done(fleet, reader.get(key, "fast"))), len(fleet.nodes))
 
     def test_a_fast_read_takes_what_is_left(self) -> None:
-        """What only a node has that is not among the closest any more is read all the same: nobody knows better."""
+        """A fast read returns a record that only a node outside the k closest still has."""
         fleet = self.large()
         key = hashed_key("left behind")
         reader, first = self.far_from(fleet, key)
@@ -108,11 +108,11 @@ class LargeTests(FleetCase):
         self.assertEqual(self.done(fleet, reader.get(key, "fast")), [record])
 
     def test_many_lookups_that_meet_the_same_strangers(self) -> None:
-        """Where one handshake has to do for many questions at the same moment, all lookups are exact all the same."""
+        """Concurrent lookups that share one handshake per node are exact."""
         fleet = self.large()
         node, dice = fleet.nodes[0], random.Random(4)
         others = [other.contact for other in fleet.nodes[1:]]
-        for other in others[::3]:  # within the time of a question for one round trip, and not for two
+        for other in others[::3]:  # a request has time for one such round trip, not for two
             fleet.board.set_weather(node.contact.address, other.address, Weather(0.13))
         for each in fleet.nodes:
             each.endpoint.let_go(0.0)
@@ -123,7 +123,7 @@ class LargeTests(FleetCase):
             self.assertEqual(self.successResultOf(one), closest(others, target, K))
 
     def test_neighbours_are_asked_often_and_others_rarely(self) -> None:
-        """No neighbour is silent for much longer than twelve seconds; of the others one is asked when its time came."""
+        """Neighbours are pinged at least about every twelve seconds, other contacts rarely."""
         fleet = self.large()
         node = fleet.nodes[0]
         near = {contact.node_id for contact in node.overlay.neighbours()}
@@ -138,15 +138,15 @@ class LargeTests(FleetCase):
         far = [contact.node_id for contact in node.overlay.contacts() if contact.node_id not in near]
         self.assertTrue(far and all(asked[node_id] <= 5 for node_id in far), asked)
         self.assertGreater(sum(asked[node_id] for node_id in far), 0)
-        self.assertFalse(any(each.overlay.is_complete for each in fleet.nodes))  # nobody takes those for the team
+        self.assertFalse(any(each.overlay.is_complete for each in fleet.nodes))  # the contacts are not the team
         routed = self.far(node)
         node._membership.sounding.needs_use = lambda contact: contact == routed
         asked.clear()
         fleet.run(FIRST)
-        self.assertGreater(asked[routed.node_id], 1)  # whose way is open for only so long as it is used
+        self.assertGreater(asked[routed.node_id], 1)  # a path through a NAT stays open only while it is used
 
     def test_the_dead_cost_no_handshakes(self) -> None:
-        """A far contact that died is let go of after one question, and no handshake is tried with it."""
+        """A failed far contact is removed after one request, without a handshake."""
         fleet = self.large()
         node = fleet.nodes[0]
         far = self.far(node)
@@ -164,7 +164,7 @@ class LargeTests(FleetCase):
         self.assertNotIn(far.address, knocked)
 
     def test_one_without_a_radio_keeps_its_contacts(self) -> None:
-        """Who hears nobody at all for a while takes itself for out of touch, and not all others for dead."""
+        """A node that hears no other node regards itself as disconnected and keeps its contacts."""
         fleet = self.large()
         before = len(fleet.nodes[5].overlay.contacts())
         fleet.nodes[5]._membership.sounding.pace.wait = 1.0
@@ -178,7 +178,7 @@ class LargeTests(FleetCase):
         self.assertEqual(self.found(fleet, fleet.nodes[5], target), closest(others, target, K))
 
     def test_silent_sessions_are_let_go_and_come_back(self) -> None:
-        """A session on which nothing was heard for long is forgotten; a question opens another one, and is answered."""
+        """A session without traffic for a long time is closed; the next request opens a new one and is answered."""
         fleet = self.large()
         node = fleet.nodes[0]
         fleet.run(FIRST)
@@ -194,7 +194,7 @@ class LargeTests(FleetCase):
         self.assertTrue(node.endpoint.is_met(far))
 
     def test_a_stranger_without_a_place_is_let_be(self) -> None:
-        """Who asks, and would find no place among the contacts, is not asked in turn."""
+        """A node does not ping a stranger that would find no place in the routing table."""
         fleet = self.large()
         node = fleet.nodes[0]
         asked = self.pings(node)
@@ -207,7 +207,7 @@ class LargeTests(FleetCase):
         self.assertIn(stranger.node_id, asked)
 
     def test_a_newcomer_says_what_it_was_told(self) -> None:
-        """Who knows few hands on for how long others' word holds that there are many; a newcomer hears it at once."""
+        """A node forwards the remaining time for which the network counts as large; a new node learns it at once."""
         fleet = self.large()
         node = fleet.nodes[3]
         answer = node._membership._answer_members
@@ -223,12 +223,12 @@ class LargeTests(FleetCase):
         self.assertEqual((newcomer.overlay.is_large, newcomer.overlay.is_placed), (True, False))
 
     def test_who_failed_a_lookup_is_asked_at_once(self) -> None:
-        """A far contact that did not answer a lookup is passed over, and back in its place as soon as it answers."""
+        """A far contact that failed in a lookup is excluded, and included again as soon as it answers."""
         fleet = self.large()
         node = fleet.nodes[0]
         far = self.far(node)
         for bucket in node.overlay.table._buckets:
-            bucket.waiting.clear()  # else one of them takes its place
+            bucket.waiting.clear()  # otherwise a waiting contact would replace it
         node.overlay.missed(far)
         self.assertNotIn(far, node.overlay.table.closest(far.node_id))
         fleet.run(3.0)
@@ -236,7 +236,7 @@ class LargeTests(FleetCase):
         self.assertIn(far, node.overlay.table.closest(far.node_id))
 
     def test_strangers_are_given_the_time_that_others_take(self) -> None:
-        """Where answers take long, a stranger of a large network is not asked again sooner than they take."""
+        """In a slow network a request to a stranger is not retransmitted before the usual round-trip time."""
         fleet = self.large()
         node, stranger = fleet.nodes[0], Contact(fleet.identity(99).public, Address("10.0.0.9", 9))
         for _ in range(9):
@@ -250,7 +250,7 @@ class LargeTests(FleetCase):
         self.assertIsNone(node.overlay.patience_of_lookups)
 
     def test_a_network_that_shrank_is_known_whole_again(self) -> None:
-        """When nobody has seen many for two minutes, each begins to know all members, as in any small team."""
+        """Two minutes after the network shrank below the limit, each node starts to learn all members."""
         fleet = self.large(16)
         for place in range(8, 16):
             fleet.nodes[place].stop()
@@ -261,7 +261,7 @@ class LargeTests(FleetCase):
         self.assertEqual({len(node.overlay.roster) for node in fleet.nodes[:8]}, {7})
 
     def test_values_are_kept(self) -> None:
-        """What was stored is read by others after a quarter of the nodes is gone, and others hold it now."""
+        """After a quarter of the nodes failed, a stored record is readable and held by the new closest nodes."""
         fleet = self.large()
         key = fleet.nodes[2].identity.node_id
         self.assertGreaterEqual(self.done(fleet, fleet.nodes[1].put(key, "a", b"1"), 2.0), 5)
@@ -282,7 +282,7 @@ class PaceTests(SynchronousTestCase):
         self.pace = Pace()
 
     def test_within_bounds(self) -> None:
-        """Where nobody goes contacts are asked ever more rarely, where all go ever more often, both within bounds."""
+        """Without failures the ping interval grows up to its maximum, with only failures it falls to its minimum."""
         self.assertEqual(self.pace.wait, FIRST)
         for _ in range(100):
             self.pace.answered()
@@ -292,7 +292,7 @@ class PaceTests(SynchronousTestCase):
         self.assertEqual(self.pace.wait, LEAST)
 
     def test_it_follows_what_is_seen(self) -> None:
-        """With sessions of any usual length it settles where about one in twenty of those asked is gone."""
+        """For usual session lengths the interval adapts until about one in twenty pinged contacts is gone."""
         dice = random.Random(1)
         for stay in (600.0, 1500.0, 4000.0):
             gone = asked = 0

@@ -1,4 +1,4 @@
-"""Tests of what a node does for the records of others: one replica, asked by hand."""
+"""Tests of one replica, which stores records for other nodes."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def record(
 
 
 class Alone:
-    """The neighbours of a node that knows nobody."""
+    """The overlay of a node that knows no other node."""
 
     is_responsible = staticmethod(lambda key: True)
     nearest = staticmethod(lambda target: list[Contact]())
@@ -87,7 +87,7 @@ class ReplicaTests(SynchronousTestCase):
         return answers
 
     def test_the_stronger_record_is_kept(self) -> None:
-        """A newer record is taken, the same one again too, and against an older one the number that holds is told."""
+        """A newer record and a repeated one are accepted; an older one is rejected with the current sequence number."""
         self.assertEqual(self.stored(record(sequence=5)), [0])
         self.assertEqual(self.stored(record(sequence=5)), [0])
         self.assertEqual(self.stored(record(sequence=4)), [5])
@@ -97,7 +97,7 @@ class ReplicaTests(SynchronousTestCase):
         self.assertEqual(self.stored(weaker), [1])
 
     def test_holds(self) -> None:
-        """What is held is that very record as a replica: no older one, no copy from the path and no keepsake."""
+        """``holds`` is true for exactly the stored record, not for an older one, a cached copy or a watched copy."""
         self.stored(record(sequence=5))
         self.assertTrue(self.replica.holds(record(sequence=5)))
         self.assertFalse(self.replica.holds(record(sequence=4)))
@@ -109,13 +109,13 @@ class ReplicaTests(SynchronousTestCase):
         self.assertEqual([held.name for held in self.replica.held(KEY)], [record(sequence=5).name])
 
     def test_who_may_store(self) -> None:
-        """A lease comes from its owner only, a team record from anybody; signed, unless the owner's session vouches."""
+        """A leased record is accepted only from its owner, a team record from any node, with a valid signature."""
         forged = Record(KEY, "f", DOG.public, 1, "team", 1.0, b"v", bytes(64))
         self.assertEqual(self.stored(record(lifetime="leased"), record("t"), forged, peer=self.cat), [-1, 0, -1])
         self.assertEqual(self.stored(record(lifetime="leased"), forged), [0, 0])
 
     def test_acknowledged_once_written(self) -> None:
-        """Who stores gets its answer when the record is written, and a named no where it cannot be."""
+        """A store request is answered after the record is written, and is rejected with the reason if that fails."""
         writing: list[Deferred[None]] = []
         self.store.written = lambda: writing.append(Deferred()) or writing[-1]  # type: ignore[method-assign,func-returns-value]
         peer = Contact(ME.public, Address("10.0.0.1", 1))
@@ -134,7 +134,7 @@ class ReplicaTests(SynchronousTestCase):
                 self.assertIn("the disk is full", str(self.failureResultOf(answer, Refused).value))
 
     def test_lease_runs_out(self) -> None:
-        """A lease ends one ttl after the last sign of its owner; a team record makes nobody silent."""
+        """A leased record expires one TTL after its last renewal; only the end of a lease marks its owner as silent."""
         self.stored(record(lifetime="leased"), record("t"))
         self.clock.advance(0.8)
         self.replica.answer_alive(self.dog, 1.0, digest_of([record(lifetime="leased")]))
@@ -144,7 +144,7 @@ class ReplicaTests(SynchronousTestCase):
         self.assertEqual(self.told[3:], [("gone", "state"), ("silent", DOG.public)])
 
     def test_strange_leases(self) -> None:
-        """However long a lease an owner claims, it is bounded; a wrong number changes nothing."""
+        """The duration of a lease is bounded, and an invalid duration in a renewal has no effect."""
         self.stored(record(lifetime="leased"))
         for lease in (float("nan"), -5.0, 5, float("inf")):
             self.replica.answer_alive(self.dog, lease, b"")
@@ -154,14 +154,14 @@ class ReplicaTests(SynchronousTestCase):
         self.assertEqual(self.store.get(KEY), [])
 
     def test_goodbye(self) -> None:
-        """A goodbye ends the leases and the watches of the peer, not its team records."""
+        """A goodbye ends the leases and watches of the peer but keeps its team records."""
         self.stored(record(lifetime="leased"), record("t"))
         self.replica.answer_goodbye(self.dog)
         self.assertEqual([r.name for r in self.store.get(KEY)], ["t"])
         self.assertEqual(self.told[2:], [("gone", "state"), ("silent", DOG.public)])
 
     def test_missing(self) -> None:
-        """An owner that names other leases than are held is told so the second time, and at once where all ran out."""
+        """An owner with a different digest gets the held leases after its second renewal, or at once if all expired."""
         held = record(lifetime="leased")
         self.stored(held)
         for told in ([], [("missing", [digest_of([held])])]):
@@ -175,7 +175,7 @@ class ReplicaTests(SynchronousTestCase):
         self.assertEqual(self.heard[1:], [("missing", [])])
 
     def test_let_go(self) -> None:
-        """The owner can take a lease away from here, nobody else can, and never a team record."""
+        """Only the owner can remove a leased record from a replica; a team record is not removed."""
         held, team = record(lifetime="leased"), record("t")
         self.stored(held, team)
         marks: list[object] = [digest_of([held]), digest_of([team]), 5, None]
@@ -186,7 +186,7 @@ class ReplicaTests(SynchronousTestCase):
         self.assertEqual(self.told[2:], [("gone", "state")])
 
     def test_pages(self) -> None:
-        """A key with many records is read page by page, each record once, tombstones included."""
+        """A key with many records is read in pages with each record once, including tombstones."""
         records = [record(f"{n:02}", value=None if n % 3 else b"v" * 2000) for n in range(30)]
         for one in records:
             self.stored(one)
@@ -202,7 +202,7 @@ class ReplicaTests(SynchronousTestCase):
         self.assertGreaterEqual(pages, 2)
 
     def test_pages_are_full(self) -> None:
-        """Each page takes records until the next one does not fit, the second as the first; a large one goes alone."""
+        """Each page is filled up to its size limit; an oversized record gets a separate page."""
         records = [record(f"{n}", value=b"v" * 1500) for n in range(30)]
         pages = list(pages_of(records))
         self.assertEqual([one for page in pages for one in page], records)
@@ -214,7 +214,7 @@ class ReplicaTests(SynchronousTestCase):
         self.assertEqual(list(pages_of([])), [])
 
     def test_bad_cursors_and_keys(self) -> None:
-        """A cursor that is none, or a key of another length, is refused in one line."""
+        """An invalid cursor and a key of wrong length are rejected."""
         self.stored(record())
         for after in ([], [1, 2], ["x", "y"], [b"x"], [b"x", "y", 1]):
             self.assertRaises(Refused, self.replica.answer_find_value, self.dog, KEY, after)
@@ -223,7 +223,7 @@ class ReplicaTests(SynchronousTestCase):
         self.assertEqual(self.replica.answer_find_value(self.dog, KEY, [b"\xff" * 32, ""]), [[], None, SURE])
 
     def test_watch(self) -> None:
-        """A watcher gets the first page unless it is up to date, then each change, until it asks no more."""
+        """A watcher with an old digest gets the first page, and then each change until its watch expires."""
         self.stored(record())
         page = self.replica.answer_watch(self.cat, KEY, b"")
         self.assertEqual(page, [0, [[record().packed()], None]])
@@ -240,7 +240,7 @@ class ReplicaTests(SynchronousTestCase):
         self.assertEqual(self.replica.pusher._watchers, {})
 
     def test_too_many_watchers(self) -> None:
-        """Watchers are bounded, and one that is in already may stay."""
+        """The number of watchers is bounded, and an existing watcher can renew its watch."""
         peers = [Contact(bytes([n % 256, n >> 8] * 16), Address("10.0.0.9", 1 + n)) for n in range(1001)]
         for peer in peers[:1000]:
             self.replica.answer_watch(peer, KEY, b"")
@@ -253,7 +253,7 @@ RECORD = Record(bytes(20), "x", bytes(32), 7, "team", 60.0, b"\xc0", bytes(64))
 
 class StoreReplyTests(SynchronousTestCase):
     def test_round_trip(self) -> None:
-        """Each reply that a replica can give is read as it was meant; the codes are those of the protocol."""
+        """Each reply survives encoding and decoding, with the codes of the protocol."""
         replies = [StoreReply(each) for each in Outcome if each is not Outcome.SUPERSEDED]
         for reply in [*replies, StoreReply(Outcome.SUPERSEDED, 7), StoreReply(Outcome.SUPERSEDED, MAX_SEQUENCE - 1)]:
             self.assertEqual(decode_reply(reply.encode(), RECORD), reply)
@@ -261,7 +261,7 @@ class StoreReplyTests(SynchronousTestCase):
 
     @given(st.integers() | st.booleans() | st.none() | st.floats() | st.text() | st.binary())
     def test_total(self, foreign: Any) -> None:
-        """What no replica says is no reply: a lower sequence than that of the record, or anything foreign."""
+        """Any other reply, such as a lower sequence than the record's, decodes to None."""
         reply = decode_reply(foreign, RECORD)
         is_valid = type(foreign) is int and (-4 <= foreign <= 0 or 7 <= foreign < MAX_SEQUENCE)
         self.assertEqual(reply is not None, is_valid)

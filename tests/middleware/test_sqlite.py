@@ -1,4 +1,4 @@
-"""The data store with a file behind it, and the thread that writes it."""
+"""Tests of the SQLite store and of its writer thread."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class SqliteStoreTest(StoreContract, SynchronousTestCase):
         store.flush()
 
     def test_after_close(self) -> None:
-        """A closed store takes nothing more."""
+        """A closed store rejects puts and notes."""
         self.store.close()
         self.assertRaises(NotRunning, self.store.put, record(), FOREVER)
         self.assertRaises(NotRunning, self.store.note, "seed", b"")
@@ -58,7 +58,7 @@ class ReopenTest(SynchronousTestCase):
         return self.reopened(now)
 
     def after_a_kill(self, durable: Durable, late: str = "") -> SqliteStore:
-        """The store that another process left, killed when it had flushed 300 records and done ``late``."""
+        """Return the store of a process that was killed after it flushed 300 records and ran ``late``."""
         self.store.close()
         child = (
             "import os, sys\n"
@@ -75,7 +75,7 @@ class ReopenTest(SynchronousTestCase):
         return self.reopened(0.0)
 
     def test_what_comes_back(self) -> None:
-        """After a restart notes, team records and tombstones are back, to live a whole ttl from then; no lease is."""
+        """A restart keeps notes, team records and tombstones with a full TTL, but no leased records."""
         kept = [record("a"), record("b", sequence=3, value=None), record("c", value=b"")]
         for one in kept:
             self.store.put(one, 1.0)
@@ -90,23 +90,23 @@ class ReopenTest(SynchronousTestCase):
         self.assertEqual(store.expire(160.0), kept)
 
     def test_what_left_stays_away(self) -> None:
-        """What ran out, or lost against a newer record, is not back after a restart; what was put again is."""
+        """A record that expired or lost is absent after a restart; one that was put again is present."""
         for name in "ac":
             self.store.put(record(name), 1.0)
         self.store.put(record("b"), FOREVER)
         self.store.put(record("b", sequence=2), FOREVER)
         self.store.expire(1.0)
-        self.store.put(record("c"), FOREVER)  # before anything was written
+        self.store.put(record("c"), FOREVER)  # before the first write
         self.assertEqual(self.after_restart().get(KEY), [record("b", sequence=2), record("c")])
 
     def test_many_changes(self) -> None:
-        """More changes than fit in one commit all arrive."""
+        """Changes that exceed one commit are all written."""
         for number in range(1000):
             self.store.put(record(str(number), value=None), FOREVER)
         self.assertEqual(len(self.after_restart()), 1000)
 
     def test_rotten_rows(self) -> None:
-        """A row in which anything was changed is counted, set aside and absent; the others are back."""
+        """A changed row is counted, moved to another table and not returned; the other rows are loaded."""
         changes = (
             "sequence = 'x'",
             "sequence = sequence + 1",
@@ -138,7 +138,7 @@ class ReopenTest(SynchronousTestCase):
         self.assertEqual((store.rotten, store.records()), (0, [whole, record("r0")]))
 
     def test_rotten_rows_do_not_pile_up(self) -> None:
-        """Of the rows that are set aside the last few are kept."""
+        """The table of corrupted rows is bounded and keeps the last ones."""
         for number in range(MAX_ROTTEN + 5):
             self.store.put(record(str(number)), FOREVER)
         self.store.close()
@@ -149,7 +149,7 @@ class ReopenTest(SynchronousTestCase):
             self.assertEqual(connection.execute("SELECT count(*) FROM rotten").fetchone(), (MAX_ROTTEN,))
 
     def test_rotten_note(self) -> None:
-        """A note that rotted is absent, be it the identity, and counted."""
+        """A corrupted note is counted and not returned, even if it is the identity."""
         self.store.note("identity", DOG.seed)
         self.store.note("contacts", b"some")
         self.store.close()
@@ -159,7 +159,7 @@ class ReopenTest(SynchronousTestCase):
         self.assertEqual((store.noted("identity"), store.noted("contacts"), store.rotten), (None, b"some", 1))
 
     def test_epoch(self) -> None:
-        """The epoch lasts as long as the file, and another file has another one."""
+        """The epoch of a file is constant and differs from the epoch of another file."""
         epoch = self.store.epoch
         store = self.after_restart()
         self.assertEqual((store.epoch, store.origin), (epoch, "kept"))
@@ -169,7 +169,7 @@ class ReopenTest(SynchronousTestCase):
             self.assertEqual(told.epoch, b"12345678")
 
     def test_large_values(self) -> None:
-        """Values as large as a record carries come back byte by byte, and are counted to the byte."""
+        """Values of the maximum size survive a restart, and their bytes are counted."""
         owners = (DOG, DOG, CAT, CAT)
         kept = [record(str(n), value=bytes([n]) * MAX_VALUE, owner=owner) for n, owner in enumerate(owners)]
         for one in kept:
@@ -179,7 +179,7 @@ class ReopenTest(SynchronousTestCase):
         self.assertEqual(store.usage.bytes, sum(map(weight, kept)))
 
     def test_killed_in_the_middle(self) -> None:
-        """What was flushed is there after the process was killed with more on its way, disk waited for or not."""
+        """Flushed records survive a kill during later writes, at each durability level."""
         late = "for number in range(300): store.put(record('late' + str(number), value=None), 9e9)\n"
         levels: tuple[Durable, ...] = ("power", "crash")
         for durable in levels:
@@ -187,7 +187,7 @@ class ReopenTest(SynchronousTestCase):
                 self.assertLessEqual({str(number) for number in range(300)}, {r.name for r in store.records()})
 
     def test_how_durable(self) -> None:
-        """The store waits for the disk at each commit unless a crash is all that it is to outlive."""
+        """The store waits for the disk at each commit, except at the durability level ``crash``."""
         asked: dict[Durable, str] = {"power": "2", "crash": "1"}
         for durable, synchronous in asked.items():
             with closing(SqliteStore.open(self.mktemp(), 0.0, durable=durable)) as store:
@@ -196,13 +196,13 @@ class ReopenTest(SynchronousTestCase):
         self.assertEqual(self.store._connection.execute("PRAGMA synchronous").fetchone(), (2,))
 
     def test_one_node_a_file(self) -> None:
-        """A second node is kept off a file that is in use, and let in when the first has gone."""
+        """A second node cannot open a file in use, and can open it after the first one closed it."""
         error = self.assertRaises(BadStore, SqliteStore.open, self.path, 0.0)
         self.assertIn(f"another node uses it (process {os.getpid()})", str(error))
         self.after_restart()
 
     def test_only_for_its_owner(self) -> None:
-        """Nobody else may read the file or its log, for the seed of the identity lies in it."""
+        """Only the owner can read the file and its log, as they contain the seed of the identity."""
         self.store.put(record(), FOREVER)
         self.store.flush()
         for path in (self.path, self.path + "-wal", self.path + "-shm"):
@@ -215,20 +215,20 @@ class ReopenTest(SynchronousTestCase):
 
 class FullDiskTest(SynchronousTestCase):
     def setUp(self) -> None:
-        # Only a flush commits, so that no commit fails between two changes.
+        # Only a flush commits, which prevents a commit between two changes.
         self.patch(writer, "COMMIT_AFTER", 60.0)
         self.store = SqliteStore.open(self.mktemp(), 0.0)
         self.addCleanup(self.store.close)
         self.store.put(record("a"), FOREVER)
         self.store.flush()
-        # No page more than there are: SQLite then says that the disk is full.
+        # With no free page SQLite reports a full disk.
         self.limit(1)
         for number in range(40):
             self.store.put(record(str(number), value=bytes(900)), FOREVER)
         self.fail_to_flush()
 
     def fail_to_flush(self) -> None:
-        """Flush until a commit has failed."""
+        """Flush until a commit fails."""
         for _ in range(100):
             self.assertRaises(BadStore, self.store.flush, 0.1)
             if self.store.trouble:
@@ -239,7 +239,7 @@ class FullDiskTest(SynchronousTestCase):
         self.store._connection.execute(f"PRAGMA max_page_count = {pages}").fetchone()
 
     def test_refuses_by_name(self) -> None:
-        """On a full disk a node refuses new records with the reason, and still answers, extends and lets go."""
+        """On a full disk a node rejects new records with the reason, and still reads, extends and expires records."""
         error = self.assertRaises(Unwritable, self.store.put, record("b"), FOREVER)
         self.assertIn("full", str(error))
         self.assertFalse(self.store.put(record("a"), FOREVER))
@@ -248,7 +248,7 @@ class FullDiskTest(SynchronousTestCase):
         self.limit(10_000)
 
     def test_who_waits_is_told(self) -> None:
-        """Who waits for an acknowledgement is refused it as soon as a commit fails, and at once while none succeeds."""
+        """A pending acknowledgement fails with the first failed commit, and new ones fail until a commit succeeds."""
         self.failureResultOf(self.store.written(), Unwritable)
         self.limit(10_000)
         self.store.flush()
@@ -263,10 +263,10 @@ class FullDiskTest(SynchronousTestCase):
         self.store.flush()
         self.assertEqual(self.store.trouble, "")
         self.successResultOf(self.store.written())
-        self.assertEqual(len(read_records(self.store._path, KEY)), 61)  # what was owed, too
+        self.assertEqual(len(read_records(self.store._path, KEY)), 61)  # including the pending changes
 
     def test_read_only(self) -> None:
-        """A file that comes to be read-only is like a full disk: refused by name, and well again afterwards."""
+        """A file that becomes read-only rejects records like a full disk, and recovers."""
         self.limit(10_000)
         self.store.flush()
         self.store._connection.execute("PRAGMA query_only = 1")
@@ -278,7 +278,7 @@ class FullDiskTest(SynchronousTestCase):
         self.assertTrue(self.store.put(record("y"), FOREVER))
 
     def test_ends_all_the_same(self) -> None:
-        """A node whose disk stays full ends without waiting for it, and the log says what was lost."""
+        """A store with a full disk closes without waiting and logs the number of lost changes."""
         lost: list[object] = []
 
         @implementer(ILogObserver)
@@ -293,7 +293,7 @@ class FullDiskTest(SynchronousTestCase):
 
 class BadFileTest(SynchronousTestCase):
     def refusal(self, path: str) -> str:
-        """The one line by which the store at ``path`` is refused."""
+        """Return the one-line error for the store at ``path``."""
         line = str(self.assertRaises(BadStore, SqliteStore.open, path, 0.0))
         self.assertNotIn("\n", line)
         self.assertIn(path, line)
@@ -301,7 +301,7 @@ class BadFileTest(SynchronousTestCase):
         return line
 
     def test_no_store(self) -> None:
-        """A directory, a file in a folder that is none, and another kind of file are refused; the file is as it was."""
+        """A directory, a path below a file, and a file of another type are rejected and not changed."""
         folder, path = self.mktemp(), self.mktemp()
         os.mkdir(folder)
         self.assertIn("is a directory", self.refusal(folder))
@@ -313,12 +313,12 @@ class BadFileTest(SynchronousTestCase):
         self.assertIn("not a database", self.refusal(path))
         self.assertEqual(Path(path).read_text(), text)
         self.assertEqual(stat.S_IMODE(os.stat(path).st_mode), 0o640)
-        os.remove(path)  # no lock was left behind
+        os.remove(path)  # the test leaves no lock on it
         with closing(SqliteStore.open(path, 0.0)) as store:
             self.assertEqual((store.origin, len(store)), ("new", 0))
 
     def test_of_another_program(self) -> None:
-        """A database of another program is refused, be it known by its id, its version or its tables."""
+        """A database of another program is rejected by its application id, version or tables."""
         for statement in ("PRAGMA application_id = 7", "PRAGMA user_version = 1", "CREATE TABLE letters(text)"):
             path = self.mktemp()
             with closing(sqlite3.connect(path)) as connection:
@@ -326,7 +326,7 @@ class BadFileTest(SynchronousTestCase):
             self.assertIn("another program", self.refusal(path))
 
     def test_newer_schema(self) -> None:
-        """A store of a newer version of this program is refused."""
+        """A store of a newer schema version is rejected."""
         path = self.mktemp()
         SqliteStore.open(path, 0.0).close()
         with closing(sqlite3.connect(path)) as connection:
@@ -336,7 +336,7 @@ class BadFileTest(SynchronousTestCase):
 
 class ReadRecordsTest(SynchronousTestCase):
     def test_beside_a_running_node(self) -> None:
-        """A page reads the live records of a key in order, while the node holds the file."""
+        """``read_records`` returns the live records of a key in order while a node has the file open."""
         path = Path(self.mktemp() + " what?#")
         store = SqliteStore.open(path, 0.0)
         self.addCleanup(store.close)
@@ -348,7 +348,7 @@ class ReadRecordsTest(SynchronousTestCase):
         self.assertEqual(read_records(path, KEY), sorted(live, key=lambda r: (r.owner, r.name)))
 
     def test_no_such_file(self) -> None:
-        """Where there is no store the page learns so in one line, and none is made."""
+        """A missing file raises ``BadStore`` and is not created."""
         path = self.mktemp()
         error = self.assertRaises(BadStore, read_records, path, KEY)
         self.assertIn(path, str(error))
@@ -362,13 +362,13 @@ class SlowDiskTest(SynchronousTestCase):
         self.store = SqliteStore.open(path, 0.0, deliver=self.news.append)
         self.addCleanup(self.store.close)
         self.store.flush()
-        # Whoever holds the file's write lock stalls every commit.
+        # A process that holds the write lock of the file blocks every commit.
         self.other = sqlite3.connect(path, isolation_level=None)
         self.addCleanup(self.other.close)
         self.other.execute("BEGIN IMMEDIATE")
 
     def test_nobody_waits_for_a_commit(self) -> None:
-        """While a commit stalls all is answered, taken and let go of, but nothing is acknowledged before its end."""
+        """During a blocked commit reads, puts and expiry work, but nothing is acknowledged before its end."""
         self.store.put(record("a"), FOREVER)
         first = self.store.written()
         for number in range(500):
@@ -385,7 +385,7 @@ class SlowDiskTest(SynchronousTestCase):
         self.successResultOf(later)
 
     def test_news_are_delivered(self) -> None:
-        """An acknowledgement comes in the caller's thread, by way of ``deliver``."""
+        """An acknowledgement fires in the caller's thread, through ``deliver``."""
         self.store.put(record("a"), FOREVER)
         waiting = self.store.written()
         self.other.execute("COMMIT")
@@ -400,7 +400,7 @@ class SlowDiskTest(SynchronousTestCase):
             tell()
 
     def test_who_stops_waiting(self) -> None:
-        """Who no longer waits for an acknowledgement does no harm to others that do."""
+        """Cancelling one acknowledgement does not affect others."""
         self.store.put(record("a"), FOREVER)
         one, other = self.store.written(), self.store.written()
         one.cancel()

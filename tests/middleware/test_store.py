@@ -1,4 +1,4 @@
-"""What every data store does, and the one in memory."""
+"""The contract of all data stores, and tests of the store in memory."""
 
 from __future__ import annotations
 
@@ -38,22 +38,22 @@ def record(
 
 
 class StoreContract(_Case):
-    """What every store does; a test case mixes it in and makes the store."""
+    """The contract of every store; a test case mixes it in and creates the store."""
 
     store: Store
 
     def make(self, max_rows: int, max_bytes: int = MAX_BYTES, hold: float = 30.0) -> Store:
-        """An empty store with room for that much; the test case closes it."""
+        """Create an empty store with these limits; the test case closes it."""
         raise NotImplementedError
 
     def settle(self, store: Store) -> None:
-        """Let the store write what it has to."""
+        """Wait until the store has written its changes."""
 
     def setUp(self) -> None:
         self.store = self.make(100)
 
     def test_empty(self) -> None:
-        """A new store says that it is new, holds nothing and has nothing to let go of."""
+        """A new store reports that it is new and is empty."""
         self.assertEqual((self.store.origin, self.store.rotten, len(self.store.epoch)), ("new", 0, 8))
         self.assertEqual(len(self.store), 0)
         self.assertEqual(self.store.get(KEY), [])
@@ -66,7 +66,7 @@ class StoreContract(_Case):
         self.assertIsNone(self.store.noted("seed"))
 
     def test_order_of_a_key(self) -> None:
-        """The records of a key come in the order of owner and name, however they were put."""
+        """The records of a key are sorted by owner and name."""
         records = [record("b", owner=CAT), record("a"), record("c", owner=CAT), record("b")]
         for one in records:
             self.store.put(one, FOREVER)
@@ -75,9 +75,9 @@ class StoreContract(_Case):
         self.assertEqual(self.store.owned(DOG.public), [record("a"), record("b")])
 
     def test_put_and_remove(self) -> None:
-        """What was put is found under its key and in its slot; a tombstone empties it to readers, and older ones lose.
+        """A record is found by its key and slot; a tombstone hides it from readers and wins over older records.
 
-        A reader that changes a list that it got does not change the store.
+        Changing a returned list does not change the store.
         """
         self.assertTrue(self.store.put(record(), FOREVER))
         self.store.get(KEY, tombstones=True).clear()
@@ -92,14 +92,14 @@ class StoreContract(_Case):
         self.assertFalse(self.store.put(record(), FOREVER))
 
     def test_loser_extends_nothing(self) -> None:
-        """A record that loses against the held one does not extend its life."""
+        """A record that loses against the stored one does not extend its lifetime."""
         self.store.put(record(sequence=2), 1.0)
         self.store.put(record(sequence=1), 5.0)
         self.store.put(replace(record(sequence=2), value=b"else"), 5.0)
         self.assertEqual(self.store.expire(1.0), [record(sequence=2)])
 
     def test_goodbye(self) -> None:
-        """When an owner says goodbye its leased records leave; its team records stay."""
+        """A goodbye removes the leased records of the owner and keeps its team records."""
         leased = [record(name, lifetime="leased") for name in "ba"]
         for one in (*leased, record("c"), record("a", owner=CAT, lifetime="leased")):
             self.store.put(one, FOREVER)
@@ -109,7 +109,7 @@ class StoreContract(_Case):
         self.assertEqual(self.store.drop_leased(DOG.public), [])
 
     def test_full(self) -> None:
-        """A full store refuses new slots, still takes new records for those it has, and has room again after losses."""
+        """A full store rejects new slots, accepts new records for existing slots, and has room after expiry."""
         store = self.make(2)
         store.put(record("a"), 1.0)
         store.put(record("b"), FOREVER)
@@ -121,7 +121,7 @@ class StoreContract(_Case):
         self.assertTrue(store.put(record("c"), FOREVER))
 
     def test_delete_always_fits(self) -> None:
-        """A full store takes tombstones even of slots it does not have, but not without end."""
+        """A full store accepts a limited number of tombstones, also for new slots."""
         store = self.make(1)
         store.put(record("a"), FOREVER)
         self.assertTrue(store.put(record("b", value=None), FOREVER))
@@ -129,7 +129,7 @@ class StoreContract(_Case):
         self.assertTrue(store.put(record("a", sequence=2, value=None), FOREVER))
 
     def test_bytes_are_counted(self) -> None:
-        """The bytes held are those of the fields of all records, whatever came, changed and went."""
+        """The byte count is the sum of the field sizes of all stored records, after any changes."""
         self.assertEqual(self.store.usage, (0, 100, 0, MAX_BYTES))
         held = [record("a", value=bytes(1000)), record("ä" * 3, value=None), record("c", value=b"", owner=CAT)]
         for one in held:
@@ -145,7 +145,7 @@ class StoreContract(_Case):
         self.assertEqual(self.store.usage[::2], (0, 0))
 
     def test_full_of_bytes(self) -> None:
-        """A quota of bytes is kept to the byte, for new slots and for those that grow; what shrinks always fits."""
+        """The byte quota is exact for new and growing records; a shrinking record always fits."""
         small, large = record("b", value=b""), record("a", value=bytes(500))
         store = self.make(100, weight(large) + weight(small))
         store.put(large, FOREVER)
@@ -158,7 +158,7 @@ class StoreContract(_Case):
         self.assertRaises(Full, store.put, record("c", value=bytes(600)), FOREVER)
 
     def test_one_owner_leaves_as_much_as_it_has(self) -> None:
-        """Alone an owner gets half of the rows and bytes; the next one half of the rest, and a few whatever happens."""
+        """An owner may use half of the free rows and bytes, and in any case a small number."""
         for rows, octets, value in ((1000, MAX_BYTES, b""), (10_000, 1_000_000, bytes(10_000))):
             store = self.make(rows, octets)
             shares = [self.fill(store, owner, value) for owner in (DOG, CAT)]
@@ -169,7 +169,7 @@ class StoreContract(_Case):
             self.assertTrue(store.put(record("1", sequence=2, value=b""), FOREVER))
 
     def test_room_of_an_owner_comes_back(self) -> None:
-        """Tombstones count for their owner; old ones of its own make room for it, those of others do not."""
+        """Tombstones count for their owner; only the owner's old tombstones make room for its new records."""
         store = self.make(1000, hold=30.0)
         store.put(record("old", value=None, owner=CAT), 60.0)
         for number in range(499):
@@ -183,7 +183,7 @@ class StoreContract(_Case):
         self.assertTrue(store.put(record("y"), FOREVER))
 
     def fill(self, store: Store, owner: Identity, value: bytes) -> int:
-        """Put records of an owner until it is refused; how many were taken."""
+        """Put records of an owner until one is rejected; return the number of accepted ones."""
         for number in range(100_000):
             try:
                 store.put(replace(record("", value=value), name=str(number), owner=owner.public), FOREVER)
@@ -192,7 +192,7 @@ class StoreContract(_Case):
         return -1
 
     def test_order_of_eviction(self) -> None:
-        """Old tombstones go, the oldest first; what is no tombstone stays."""
+        """Old tombstones are evicted first, oldest first; other records are not evicted."""
         store = self.make(3, hold=30.0)
         old, older = record("old", value=None), record("older", value=None)
         store.put(older, 60.0)
@@ -213,7 +213,7 @@ class StoreContract(_Case):
         self.assertEqual(store.expire(31.0), [older, old])
 
     def test_young_tombstones_stay(self) -> None:
-        """A tombstone that has not been held for long enough makes room for nobody."""
+        """A tombstone younger than the hold time is not evicted."""
         store = self.make(1, hold=30.0)
         store.put(record("a", value=None), 60.0)
         store.expire(29.9)
@@ -222,20 +222,20 @@ class StoreContract(_Case):
         self.assertTrue(store.put(record("b"), FOREVER))
 
     def test_refusal_changes_nothing(self) -> None:
-        """Where all that may go would not be enough, nothing goes."""
+        """If eviction would not free enough space, nothing is evicted."""
         store = self.make(100, 3 * weight(record("a")))
         store.put(record("a"), FOREVER)
         store.put(record("b", value=None), 60.0)
         before = store.usage
         store.expire(59.0)
         self.assertRaises(Full, store.put, record("c", value=bytes(400)), FOREVER)
-        grown = record("b", 2, value=bytes(weight(record("a")) + 5))  # a byte more than there is room for
+        grown = record("b", 2, value=bytes(weight(record("a")) + 5))  # one byte too large
         self.assertRaises(Full, store.put, grown, FOREVER)
         self.assertEqual(store.usage, before)
         self.assertEqual(store.slot(record("b").slot), record("b", value=None))
 
     def test_written(self) -> None:
-        """What was put is acknowledged in the end, and at once where nothing is left to be written."""
+        """A put is acknowledged after the write, and at once if nothing is pending."""
         self.store.put(record(), FOREVER)
         acknowledged = self.store.written()
         self.settle(self.store)
@@ -244,7 +244,7 @@ class StoreContract(_Case):
         self.assertEqual(self.store.trouble, "")
 
     def test_notes(self) -> None:
-        """A note is kept under its name, and the last one counts; a store may be closed again."""
+        """The last value of a note is returned; a store can be closed twice."""
         for value in (b"one", b"two", b"two"):
             self.store.note("seed", value)
         self.store.note("contacts", b"")
@@ -258,7 +258,7 @@ class MemoryStoreTest(StoreContract, SynchronousTestCase):
         return MemoryStore(max_rows, max_bytes, hold)
 
     def test_expiries_do_not_pile_up(self) -> None:
-        """However often slots come and go, the store remembers little more of their expiry than it holds."""
+        """The heap of expiry times stays proportional to the number of stored records."""
         store = MemoryStore()
         for sequence in range(1, 1001):
             store.put(record(sequence=sequence), FOREVER - sequence)
@@ -270,7 +270,7 @@ class MemoryStoreTest(StoreContract, SynchronousTestCase):
     @settings(max_examples=100)
     @given(st.lists(st.tuples(st.sampled_from("ppedxg"), st.integers(0, 3), st.integers(1, 4), st.integers(0, 30))))
     def test_like_the_obvious_one(self, events: list[tuple[str, int, int, int]]) -> None:
-        """Any series of puts, extensions, goodbyes and sweeps leaves what a plain dictionary of slots would hold."""
+        """Any sequence of puts, extensions, goodbyes and sweeps gives the same result as a plain dictionary."""
         store, plain = MemoryStore(), dict[Slot, tuple[Record, float]]()
         for verb, number, sequence, moment in events:
             lifetime: Lifetime = "leased" if number % 2 else "team"
@@ -308,7 +308,7 @@ class MemoryStoreTest(StoreContract, SynchronousTestCase):
         )
     )
     def test_quotas_hold(self, puts: list[tuple[int, int, int | None, int]]) -> None:
-        """Whatever comes, the quotas hold, the count of bytes is exact, and nothing but tombstones gives way."""
+        """For any sequence of puts the quotas hold, the byte count is exact, and only tombstones are evicted."""
         store, now = MemoryStore(5, 1200, hold=20.0), 0.0
         for number, sequence, size, step in puts:
             now += step / 10

@@ -1,4 +1,4 @@
-"""Tests of the ways between two nodes behind routers, over routers in memory."""
+"""Tests of the paths between two nodes behind simulated routers."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ UNPUNCHABLE = {frozenset({"port", "sym"}), frozenset({"sym"})}
 
 
 def ways(ground: Ground, one: str, other: str) -> tuple[str, float]:
-    """How two nodes behind routers of these kinds reach each other at first, and how long after either knew the other.
+    """Return the first path between nodes behind routers of these types, and its delay after they met.
 
-    They come one after the other and meet as members of any team do: by the list of the public node.
+    The nodes join one after the other and learn of each other from the member list of the public node.
     """
     a = ground.at("a", one)
     ground.run(2.0)
@@ -42,10 +42,10 @@ def ways(ground: Ground, one: str, other: str) -> tuple[str, float]:
 
 
 class WayTests(GroundCase):
-    """What comes of each pair of routers."""
+    """The path between each pair of router types."""
 
     def test_punchable_pairs_are_direct(self) -> None:
-        """13 of the 15 pairs of routers are punched within a second, and calls go straight from then on."""
+        """13 of the 15 pairs of router types are punched within a second and use direct paths from then on."""
         for one in KINDS:
             for other in KINDS:
                 if frozenset({one, other}) not in UNPUNCHABLE:
@@ -54,7 +54,7 @@ class WayTests(GroundCase):
                     self.assertLess(seconds, 1.0, f"{one} and {other}")
 
     def test_other_pairs_are_carried(self) -> None:
-        """Where no hole can be punched the public node carries, after 1.5 s at most."""
+        """If hole punching is impossible, the public node relays, after at most 1.5 s."""
         for one, other in (("port", "sym"), ("sym", "port"), ("sym", "sym")):
             ground = self.ground()
             way, seconds = ways(ground, one, other)
@@ -66,10 +66,10 @@ class WayTests(GroundCase):
 
 
 class WeatherTests(GroundCase):
-    """Ways in bad weather and behind bad routers."""
+    """Paths under loss and behind difficult routers."""
 
     def test_lossy_links(self) -> None:
-        """With 30 % loss on both links each of 40 pairs reaches each other within 5 s, punched or carried."""
+        """At 30 % loss on both links, at least 38 of 40 pairs connect within 5 s, punched or relayed."""
         late = []
         pairs = [("port", "port"), ("full", "addr"), ("port", "sym"), ("none", "port")]
         for seed in range(10):
@@ -81,7 +81,7 @@ class WeatherTests(GroundCase):
         self.assertLessEqual(len(late), 2, late)
 
     def test_leaky_routers(self) -> None:
-        """Routers that early knocks spoil are reached within 5 s, punched from fresh ports, however far one of them."""
+        """Routers that block a port after early datagrams are punched within 5 s from fresh ports."""
         for one, other in (("leaky", "leaky"), ("leaky", "port"), ("port", "leaky")):
             for delay_s in (0.015, 0.25):
                 ground = self.ground()
@@ -95,7 +95,7 @@ class WeatherTests(GroundCase):
                     self.assertEqual((one, other, way), (one, other, "direct"))
 
     def test_late_words(self) -> None:
-        """One side hears half a second late of the other: reached at once by who carries, and directly later on."""
+        """If one side is notified half a second late, the pair is relayed at first and has a direct path later."""
         for one, other in (("leaky", "port"), ("port", "leaky")):
             for late in "ab":
                 ground = self.ground()
@@ -113,13 +113,13 @@ class WeatherTests(GroundCase):
                 self.assertEqual((one, other, late, ways_seen), (one, other, late, {"direct"}))
 
     def test_routers_within_a_private_net(self) -> None:
-        """Routers whose outside is a private net too, of the same first bytes as the inside, are punched as others."""
+        """Routers with a public side in a private network with the same prefix are punched like others."""
         for one, other, way in (("port", "port", "direct"), ("sym", "full", "direct"), ("sym", "sym", "carried")):
             ground = self.ground(nets=("10.0.9", "10.0"))
             self.assertEqual((one, other, ways(ground, one, other)[0]), (one, other, way))
 
     def test_a_router_restarts(self) -> None:
-        """Whose router forgot all, and shows another port from now on, is reached again within 5 s, though idle."""
+        """A node behind a router that restarts with new ports is reachable again within 5 s, also without traffic."""
         for one, other in (("port", "port"), ("full", "addr"), ("sym", "sym"), ("port", "none"), ("leaky", "port")):
             ground = self.ground()
             a = ground.at("a", one)
@@ -130,7 +130,7 @@ class WeatherTests(GroundCase):
             self.assertLess(_reached_again(ground, a, b), 5.0, f"{one} and {other}")
 
     def test_mappings_are_held(self) -> None:
-        """Behind routers that forget after 15 s two idle nodes stay in touch: the first call is answered at once."""
+        """Behind routers with a mapping lifetime of 15 s two idle nodes keep their path open."""
         for one, other in (("port", "port"), ("sym", "sym")):
             ground = self.ground(lifetime=15.0)
             a, b = ground.at("a", one), ground.at("b", other)
@@ -142,7 +142,7 @@ class WeatherTests(GroundCase):
             self.assertLess(seconds, 0.2)
 
     def test_everybody_hears_of_it(self) -> None:
-        """In a team where pings are rare, too, everybody has the new address of an idle node after 5 s."""
+        """In a large team, too, all members have the new address of an idle node after 5 s."""
         ground = self.ground()
         others = [ground.node(f"x{n}", Address(f"203.0.113.{150 + n}", 7000)) for n in range(32)]
         a = ground.at("a", "port")
@@ -154,7 +154,7 @@ class WeatherTests(GroundCase):
         self.assertNotEqual(seen, {Address(ground.routers["a"].host, 7000)})
 
     def test_fresh_ports_are_quiet(self) -> None:
-        """Two who met at fresh ports stay there: no handshake follows, and it is no sign of another address."""
+        """Two nodes that met at fresh ports keep their session, and their ports do not count as new addresses."""
         ground = self.ground()
         ways(ground, "leaky", "leaky")
         a, b = ground.nodes["a2"], ground.nodes["b2"]
@@ -174,7 +174,7 @@ class WeatherTests(GroundCase):
         self.assertEqual(ground.networks["a2"].local(at_b).port, port)
 
     def test_direct_before_carried(self) -> None:
-        """A session that others carry does not take the place of a direct one that works, and does when it is dead."""
+        """A relayed session does not replace a working direct one, but replaces a dead one."""
         ground = self.ground()
         a, b = ground.at("a", "none"), ground.at("b", "none")
         ground.run(3.0)
@@ -191,7 +191,7 @@ class WeatherTests(GroundCase):
             self.assertEqual(ground.way(a, b), way)
 
     def test_another_address(self) -> None:
-        """A node that moves to another network keeps its key, and is reached there within 5 s."""
+        """A node that moves to another network keeps its key and is reachable within 5 s."""
         ground = self.ground()
         a, b = ground.at("a", "port"), ground.at("b", "port")
         ground.run(5.0)
@@ -203,10 +203,10 @@ class WeatherTests(GroundCase):
 
 
 class CarriedTests(GroundCase):
-    """Pairs that others carry for."""
+    """Pairs of nodes with a relayed path."""
 
     def carried(self, ground: Ground) -> tuple[EntangledNode, EntangledNode]:
-        """Two nodes that cannot reach each other directly, and have been carried for some seconds."""
+        """Return two nodes that have no direct path and have been relayed for some seconds."""
         a = ground.at("a", "sym")
         ground.run(1.0)
         b = ground.at("b", "sym")
@@ -215,7 +215,7 @@ class CarriedTests(GroundCase):
         return a, b
 
     def test_direct_as_soon_as_it_can_be(self) -> None:
-        """A carried pair can say much to each other, and goes direct by itself when its routers get better."""
+        """A relayed pair can exchange large messages, and gets a direct path when its routers permit it."""
         ground = self.ground()
         a, b = self.carried(ground)
         session = a.endpoint.peers.session(b.identity.public)
@@ -234,7 +234,7 @@ class CarriedTests(GroundCase):
         self.assertEqual(ground.nodes["pub"].endpoint.counters["carried"], carried)
 
     def test_any_member_carries(self) -> None:
-        """When the node that carries dies, whatever is under way, another member carries on within 5 s."""
+        """If the relay fails at any moment, another member relays within 5 s."""
         for moment in range(8):
             ground = self.ground()
             ground.node("other", Address("203.0.113.200", 7000))
@@ -249,7 +249,7 @@ class CarriedTests(GroundCase):
             self.assertLess(ground.clock.seconds() - began, 5.0)
 
     def test_who_hears_of_it_reaches_it(self) -> None:
-        """A carried peer that others are told of is reached by them: directly where they can be seen, else carried."""
+        """Other nodes reach a relayed peer directly if possible, otherwise through a relay."""
         ground = self.ground()
         _, b = self.carried(ground)
         for site, kind, way in (("c", "none", "direct"), ("d", "sym", "carried")):
@@ -258,7 +258,7 @@ class CarriedTests(GroundCase):
             self.assertEqual((kind, ground.way(c, b)), (kind, way))
 
     def test_who_named_it_is_asked(self) -> None:
-        """Of a peer that is known by its carried way alone, the one who named it is asked, and it is met."""
+        """For a peer with a relay address only, the caller asks the node that announced it for an introduction."""
         ground = self.ground()
         others = [ground.node(f"x{n}", Address(f"203.0.113.{150 + n}", 7000)) for n in range(16)]
         a = ground.at("a", "sym")
@@ -286,7 +286,7 @@ def _peer(of: EntangledNode, other: EntangledNode) -> Peer | None:
 
 
 def _listening(node: EntangledNode, asked: list[bytes]) -> Any:
-    """The node's method, which notes that it was asked."""
+    """Return the node's method, wrapped to record its calls."""
     answer = node.reach.introducer.answer_introduce
 
     def introduce(peer: Contact, wanted: bytes, candidates: list[object], order: int) -> Any:
@@ -297,7 +297,7 @@ def _listening(node: EntangledNode, asked: list[bytes]) -> Any:
 
 
 def _reached_again(ground: Ground, asked: EntangledNode, asker: EntangledNode) -> float:
-    """Seconds until a call of ``asker`` to where it knows ``asked`` is answered, asked anew each second."""
+    """Return the seconds until a call from ``asker`` to the known address of ``asked`` is answered."""
     began = ground.clock.seconds()
     while ground.clock.seconds() < began + 20.0:
         contact = asker.overlay.roster.get(asked.identity.node_id) or ground.met_at(asked)
@@ -308,10 +308,10 @@ def _reached_again(ground: Ground, asked: EntangledNode, asker: EntangledNode) -
 
 
 class FreshPortTests(GroundCase):
-    """Behaviour of ``FreshPorts``, of a node that nobody needs one for."""
+    """Tests of ``FreshPorts`` on a node that does not need them."""
 
     def test_so_many_and_no_more(self) -> None:
-        """Where all are open there is another one only when the oldest is of no use any more, in its place."""
+        """At the limit a new port is opened only in place of the oldest one, after its hold time."""
         ground = self.ground()
         ports = ground.at("a", "none").reach._ports
         opened = [ports.open() for _ in range(MAX_FRESH)]
@@ -324,7 +324,7 @@ class FreshPortTests(GroundCase):
         self.assertEqual([port in ports for port in opened], [False] + [True] * (MAX_FRESH - 1))
 
     def test_unused_ones_are_shut(self) -> None:
-        """A fresh port that led nowhere is closed after a while, and not before."""
+        """A fresh port without a session is closed after ``SHUT_S`` seconds."""
         ground = self.ground()
         reach = ground.at("a", "none").reach
         reach._open_port()
@@ -338,10 +338,10 @@ OWN = Address("192.168.1.7", 8484)
 
 
 class KindTests(SynchronousTestCase):
-    """Behaviour of ``kind_of``."""
+    """Tests of ``kind_of``."""
 
     def test_each_kind_of_address(self) -> None:
-        """Who carries, tunnels or loops back shows in the address; a far one that was introduced is punched."""
+        """The address shows relayed, tunnelled and loopback paths; an introduced distant address counts as punched."""
         kinds = {
             "carried": relayed(bytes(20)),
             "tunnel": Address("~wss-0123456789ab", 1),
@@ -356,14 +356,14 @@ class KindTests(SynchronousTestCase):
 
 
 class PassageTests(GroundCase):
-    """Behaviour of ``Ways.passage``, over routers in memory."""
+    """Tests of ``Ways.passage`` with simulated routers."""
 
     def passage(self, a: EntangledNode, b: EntangledNode) -> Passage:
-        """How one reaches the other."""
+        """Return the path from ``a`` to ``b``."""
         return a.reach.ways.passage(b.contact)
 
     def test_kinds(self) -> None:
-        """Two behind cone routers are punched, two behind symmetric ones carried, two of one site on their LAN."""
+        """Nodes behind cone routers are punched, behind symmetric routers relayed, and at one site use their LAN."""
         carrier = self.ground().nodes["pub"].identity.node_id
         for one, other, site, kind in (
             ("port", "port", "b", "punched"),
@@ -382,7 +382,7 @@ class PassageTests(GroundCase):
             self.assertEqual(self.passage(a, ground.nodes["pub"]).kind, "direct")
 
     def test_since(self) -> None:
-        """A way is as old as it is, whatever sessions succeed each other; one that was lost begins anew."""
+        """The age of a path includes successive sessions; a lost path is removed."""
         ground = self.ground()
         a, pub = ground.nodes["pub"], ground.at("b", "none")
         began = ground.clock.seconds()

@@ -1,4 +1,4 @@
-"""Tests of what a council member answers, keeps and forgets, of what stands in records, and of what is completed."""
+"""Tests of the acceptors of tuple takes, of stored postings, and of the completion of takes."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class SeatTests(SynchronousTestCase):
         self.seat = self.made()
 
     def made(self, seed: int = 1) -> Seat:
-        """The next life of the member, on the same store."""
+        """Create the member again on the same store, as after a restart."""
         return Seat(Exposed(), self.store, self.clock, random.Random(seed))
 
     def claim(self, where: Place, counter: int = 1, taker: bytes = b"a", lease: float = 2.0) -> Kind:
@@ -95,7 +95,7 @@ class SeatTests(SynchronousTestCase):
         return reply.kind
 
     def test_lost_memory_is_another_life(self) -> None:
-        """A member whose store is empty or rotten has another incarnation, and refuses what counts on the old one."""
+        """A member with an empty or corrupted store has a new incarnation and rejects requests to the old one."""
         life = self.seat.incarnation
         self.claim(place(1))
         note = CODEC.bucket_of(place(1))
@@ -111,7 +111,7 @@ class SeatTests(SynchronousTestCase):
             self.assertEqual(self.claim(place(1)), Kind.GRANTED)
 
     def test_wrong_questions(self) -> None:
-        """What is no lawful question is refused, and changes nothing."""
+        """An invalid request is rejected and has no effect."""
         life, where = self.seat.incarnation, place(1).packed()
         wrong: list[tuple[Any, ...]] = [
             (KEY[1:], [where], life, 1, b"a", 1.0), (KEY, [], life, 1, b"a", 1.0),
@@ -126,7 +126,7 @@ class SeatTests(SynchronousTestCase):
         self.assertEqual(len(self.seat), 0)
 
     def test_nothing_is_promised_about_what_is_over(self) -> None:
-        """A tuple that its publisher removed, or whose slot holds another one by now, is not given away any more."""
+        """A tuple that its publisher removed, or replaced by another one in its slot, cannot be claimed."""
         self.store.put(tuple_record(place(1)), 99.0)
         self.assertEqual(self.claim(place(1)), Kind.GRANTED)
         self.store.put(tuple_record(place(2)), 99.0)
@@ -137,7 +137,7 @@ class SeatTests(SynchronousTestCase):
         self.assertEqual(self.claim(old), Kind.OUTBID)
 
     def test_bounded(self) -> None:
-        """A full member forgets what harms nobody, never an open acceptance, and keeps its promises by a floor."""
+        """A full member removes only registers of removed tuples, and keeps a floor for their ballots."""
         self.patch(module, "MAX_REGISTERS", 4)
         for number in range(4):
             self.claim(place(number), counter=number + 1, lease=100.0)
@@ -154,7 +154,7 @@ class SeatTests(SynchronousTestCase):
         self.assertEqual(len(self.seat), 4)
 
     def test_unsettled(self) -> None:
-        """A confirmation of which no more was heard is named after a while, until it is settled or its tuple gone."""
+        """An accepted take without an outcome is listed after a while, until it is settled or its tuple is removed."""
         for number in (1, 2, 3):
             self.store.put(tuple_record(place(number)), 999.0)
             self.claim(place(number))
@@ -173,7 +173,7 @@ class SeatTests(SynchronousTestCase):
         self.assertIn(place(1), [posted.place for posted in self.seat.unsettled()])
 
     def test_answers_wait_for_the_disk(self) -> None:
-        """Where the store says when it has written, a vote is told only afterwards."""
+        """A vote is sent only after the store has written it."""
         disk: Deferred[None] = Deferred()
         self.seat.written = lambda: disk
         life = self.seat.incarnation
@@ -183,7 +183,7 @@ class SeatTests(SynchronousTestCase):
         self.assertEqual(self._kind(self.successResultOf(answer), Event.PREPARE), Kind.GRANTED)
 
     def test_what_was_accepted_is_told(self) -> None:
-        """A later claimant is told what to complete, once the one before it has had a second to finish."""
+        """A later claim returns the accepted value, one second after the first taker could have completed it."""
         self.claim(place(1), 1, b"a", lease=100.0)
         self.assertEqual([self.confirm(place(1)) for _ in range(2)], [Kind.GRANTED] * 2)
         self.assertEqual(self.claim(place(1), 2, b"b"), Kind.HELD)
@@ -197,7 +197,7 @@ class SeatTests(SynchronousTestCase):
     @settings(max_examples=300)
     @given(foreign=FOREIGN, noise=st.binary(max_size=60))
     def test_notes_are_decoded_totally(self, foreign: Any, noise: bytes) -> None:
-        """A rotten note gives None, and never an exception."""
+        """A corrupted stored vote decodes to None, without an exception."""
         good = [KEY, place(1).packed(), 1, b"a", 1.0, None]
         self.assertEqual(CODEC.unpack(CODEC.pack({})), ({}, True))
         rows = [[foreign], [[*good[:5], foreign]], [[*good[:5], [1, b"a", foreign]]], foreign]
@@ -214,14 +214,14 @@ class SeatTests(SynchronousTestCase):
 
 class PostingTests(SynchronousTestCase):
     def test_round_trip(self) -> None:
-        """A tuple and a note come back from their records as they were."""
+        """A tuple and the note of its taking survive encoding and decoding."""
         council = (Member(PEER, b"i" * 8),)
         value = packed_tuple(place(1).mark, ("x", 1, None), council)
         self.assertEqual(posting(record(place(1).name, value)), Posted(place(1), ("x", 1, None), council))
         self.assertEqual(posting(record("n", packed_taken(place(1), b"taker"))), Taken(place(1), b"taker"))
 
     def test_standing(self) -> None:
-        """What was taken does not stand; another tuple in the same slot does."""
+        """A taken tuple is no longer available; another tuple in the same slot is."""
         note = record("n", packed_taken(place(1), b"taker"))
         posted, taken = standing([tuple_record(place(1)), tuple_record(place(2)), note])
         self.assertEqual([one.place for one in posted], [place(2)])
@@ -233,7 +233,7 @@ class PostingTests(SynchronousTestCase):
             self.assertEqual([one.place for one in posted], [newer])
 
     def test_unlawful(self) -> None:
-        """Records that are no postings are passed over."""
+        """A record that is not a posting decodes to None."""
         member = [*PEER.packed(), b"i" * 8]
         for fields in (
             [1, b"short", ["x"], [member]], [1, b"m" * 8, [], [member]], [1, b"m" * 8, ["x"], []],
@@ -248,7 +248,7 @@ class PostingTests(SynchronousTestCase):
     @settings(max_examples=300)
     @given(foreign=FOREIGN, noise=st.binary(max_size=60))
     def test_total(self, foreign: Any, noise: bytes) -> None:
-        """Any record gives a posting or None, and never an exception."""
+        """Any record decodes to a posting or None, without an exception."""
         self.assertIsInstance(posting(record("t", noise)), Posted | Taken | None)
         for fields in (foreign, [1, b"m" * 8, foreign, [foreign]], [1, b"m" * 8, ["x"], foreign], [2, foreign, b"t"]):
             try:
@@ -278,7 +278,7 @@ class ResolveTests(SynchronousTestCase):
         return maybeDeferred(getattr(self.seats[number], method.replace("decree.", "answer_")), PEER, *arguments)
 
     def begin(self, number: int, counter: int, taker: bytes) -> None:
-        """Let one member accept a take, as if its taker had died then."""
+        """Let one member accept a take, as if the taker failed afterwards."""
         seat = self.seats[number]
         places: list[object] = [place(1).packed()]
         seat.answer_claim(PEER, KEY, places, seat.incarnation, counter, taker, 1.0)
@@ -291,20 +291,20 @@ class ResolveTests(SynchronousTestCase):
         return found[0]
 
     def test_own_value_gives_way(self) -> None:
-        """A take that one member has accepted may be decided, so it is completed, whoever asks."""
+        """A take that one member accepted may be decided; the caller completes it and drops its value."""
         self.begin(0, 1, b"a")
         self.silent.add(2)
         self.assertEqual(self.resolve(OWN), b"a")
 
     def test_highest_ballot(self) -> None:
-        """Of two takes that were begun only the one under the higher ballot may be decided."""
+        """Of two incomplete takes the one with the higher ballot is completed."""
         self.begin(0, 2, b"b")
         self.begin(1, 1, b"a")
         self.silent.add(2)
         self.assertEqual(self.resolve(None), b"b")
 
     def test_nothing_was_begun(self) -> None:
-        """Where nothing was accepted the own value is decided, and without one nothing is, nor held."""
+        """Without an accepted value the caller's value is decided; without either, nothing is decided or held."""
         self.assertIsNone(self.resolve(None))
         self.assertEqual(self.resolve(OWN), OWN)
         self.assertEqual(self.resolve(b"late"), OWN)

@@ -1,4 +1,4 @@
-"""Tests of tuple spaces over whole nodes."""
+"""Tests of tuple spaces on whole nodes."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ DELAY = Weather(delay_s=0.005, jitter_s=0.002)
 
 
 class SpaceCase(FleetCase):
-    """A test with one space on each node of a fleet."""
+    """A test case with one space on each node of a simulated team."""
 
     made: list[TupleSpace]
 
     def spaces(self, n: int, weather: Weather = DELAY, seed: int = 1) -> tuple[Fleet, list[TupleSpace]]:
-        """A fleet, and a space on each of its nodes, which are stopped before the fleet is."""
+        """Return a simulated team and a space on each node; the spaces are stopped before the team."""
         fleet = self.fleet(n, seed, weather)
         spaces = [TupleSpace(node, fleet.clock, fleet.rng(place)) for place, node in enumerate(fleet.nodes)]
         self.made = spaces
@@ -42,17 +42,17 @@ class SpaceCase(FleetCase):
         super().tearDown()
 
     def posted(self, fleet: Fleet) -> list[Posted]:
-        """Every tuple that some node keeps, each once."""
+        """Return every tuple that some node stores, without duplicates."""
         said = [posting(record) for node in fleet.nodes for record in node.store.records()]
         return list({one.place: one for one in said if isinstance(one, Posted)}.values())
 
     def called_up(self, node: EntangledNode, answer: Callable[..., object]) -> None:
-        """Let ``node`` give this answer when it is called to a council."""
-        node.seat.sit()  # a seat that is taken up later would answer for itself
+        """Let ``node`` give this reply to an invitation to a council."""
+        node.seat.sit()  # otherwise the seat would register its method later
         node.endpoint.expose("decree.enrol", answer)
 
     def moment(self, fleet: Fleet, work: Deferred[Any]) -> list[float]:
-        """Where the moment at which ``work`` fires will stand."""
+        """Return a list that will contain the time at which ``work`` fires."""
         moments: list[float] = []
 
         def fired(result: object) -> object:
@@ -65,7 +65,7 @@ class SpaceCase(FleetCase):
 
 class TupleSpaceTests(SpaceCase):
     def test_put_read_and_get(self) -> None:
-        """What one node puts all read as often as they like, by template; when one has taken it, it is gone for all."""
+        """A tuple can be read by all nodes by template; after one node took it, it is gone for all."""
         fleet, (a, b, c) = self.spaces(3)
         for number in (2, 1, 3):
             self.done(fleet, a.put(("job", number, None)), 1.0)
@@ -81,7 +81,7 @@ class TupleSpaceTests(SpaceCase):
             self.assertEqual(len(self.done(fleet, space.read_all(("job", ANY, ANY)))), 2)
 
     def test_equal_tuples_are_several(self) -> None:
-        """A space is a bag: of equal tuples each is taken once; other spaces and lengths do not see them."""
+        """A space is a bag: each of several equal tuples is taken once; other spaces and lengths do not match."""
         fleet, (a, b, _) = self.spaces(3)
         for space in (a, a, b):
             self.done(fleet, space.put(("same",)), 1.0)
@@ -92,7 +92,7 @@ class TupleSpaceTests(SpaceCase):
         self.assertEqual(self.done(fleet, b.get_many(("same",), 5)), [("same",)] * 3)
 
     def test_stopped_while_several_are_confirmed(self) -> None:
-        """A space that is stopped before the council has said who has them fails the call, and nothing goes unsaid."""
+        """If a space stops before the council confirmed its takes, the call fails, and no error is left unhandled."""
         fleet, (a, b, _) = self.spaces(3)
         for _ in range(3):
             self.done(fleet, a.put(("same",)), 1.0)
@@ -104,7 +104,7 @@ class TupleSpaceTests(SpaceCase):
 
         self.patch(b._taker, "decide", cut_off)
         taking = b.get_many(("same",), 3)
-        fleet.run(0.2)  # the question whether they are confirmed is on its way
+        fleet.run(0.2)  # the confirm requests are in flight
         b.stop()
         fleet.run(30.0)
         self.failureResultOf(taking, NotRunning)
@@ -112,7 +112,7 @@ class TupleSpaceTests(SpaceCase):
         self.assertEqual(self.flushLoggedErrors(), [])
 
     def test_wakes_who_waits(self) -> None:
-        """A blocked read and a blocked get are woken within a second of the put, and each tuple wakes one get."""
+        """A blocked read and a blocked get return within a second of the put, and each tuple ends one get."""
         fleet, spaces = self.spaces(6)
         reading = self.moment(fleet, spaces[1].read(("go", int)))
         gets = [space.get(("go", int)) for space in spaces[2:5]]
@@ -129,7 +129,7 @@ class TupleSpaceTests(SpaceCase):
             self.assertEqual([len(moments) for moments in got].count(1), number)
 
     def test_wait_survives_the_nodes_that_held_it(self) -> None:
-        """Though all of the nodes that would have pushed are dead but two, the next put wakes who waits."""
+        """A blocked read returns after the next put although most of the watched replicas have failed."""
         fleet, spaces = self.spaces(6)
         waiting = self.moment(fleet, spaces[0].read(("go",)))
         fleet.run(1.0)
@@ -138,13 +138,13 @@ class TupleSpaceTests(SpaceCase):
             fleet.nodes[place].vanish()
         fleet.run(12.0)
         began = fleet.clock.seconds()
-        # Half of the members are missing, so nobody can promise that it lasts; whoever waits is woken all the same.
+        # Half of the members are missing, so the put cannot be confirmed; the blocked read returns nevertheless.
         spaces[5].put(("go",)).addErrback(lambda failure: failure.trap(NoAnswer))
         fleet.run(1.5)
         self.assertLess(waiting[0] - began, 1.0)
 
     def test_a_council_is_whole(self) -> None:
-        """A put waits for members that are silent, for a smaller council would not survive any; in the end it fails."""
+        """A put waits for silent members, as a smaller council would tolerate no failure; finally it fails."""
         fleet, (a, *_) = self.spaces(4)
         for node in fleet.nodes[1:]:
             self.called_up(node, lambda peer: Deferred())
@@ -164,7 +164,7 @@ class TupleSpaceTests(SpaceCase):
         self.assertEqual(len(self.posted(fleet)), 1)
 
     def test_a_council_without_those_who_refuse(self) -> None:
-        """Nobody waits for nodes that say that they will not be members: the council is as large as can be."""
+        """A put does not wait for nodes that reject membership; the council is as large as possible."""
         fleet, (a, *_) = self.spaces(3)
 
         def refuse(peer: object) -> bytes:
@@ -175,7 +175,7 @@ class TupleSpaceTests(SpaceCase):
         self.assertEqual([len(one.council) for one in self.posted(fleet)], [2])
 
     def test_timeout(self) -> None:
-        """A blocking call ends by name after its time-out, and leaves nothing behind."""
+        """A blocking call raises ``NoTuple`` after its timeout."""
         fleet, (a, b, _) = self.spaces(3)
         calls = [a.get(("none",), timeout=0.5), b.read(("none",), timeout=0.5), b.claim(("none",), timeout=0.5)]
         fleet.run(0.6)
@@ -183,7 +183,7 @@ class TupleSpaceTests(SpaceCase):
             self.failureResultOf(call, NoTuple)
 
     def test_cancel(self) -> None:
-        """A cancelled get takes nothing: the next tuple goes to the next one who asks."""
+        """A cancelled get takes no tuple; the next tuple goes to the next caller."""
         fleet, (a, b, c) = self.spaces(3)
         get = a.get(("job",))
         fleet.run(1.0)
@@ -193,7 +193,7 @@ class TupleSpaceTests(SpaceCase):
         self.assertEqual(self.done(fleet, c.get_if_exists(("job",))), ("job",))
 
     def test_cancelled_too_late(self) -> None:
-        """A get that is cancelled while its take is being confirmed puts the tuple back."""
+        """A get that is cancelled during the confirmation of its take puts the tuple back."""
         fleet, (a, b, c) = self.spaces(3)
         for pause in (0.005, 0.012, 0.02, 0.03, 0.04, 0.05):
             self.done(fleet, b.put(("job", pause)), 1.0)
@@ -206,7 +206,7 @@ class TupleSpaceTests(SpaceCase):
                 self.assertEqual(self.done(fleet, c.get(("job", pause), timeout=4.0)), ("job", pause), pause)
 
     def test_ttl(self) -> None:
-        """A tuple with a time to live is there until then, and not afterwards."""
+        """A tuple with a TTL exists until its TTL ends."""
         fleet, (a, b, _) = self.spaces(3)
         self.done(fleet, a.put(("short",), ttl=5.0), 1.0)
         self.assertEqual(self.done(fleet, b.read_if_exists(("short",)), 1.0), ("short",))
@@ -215,7 +215,7 @@ class TupleSpaceTests(SpaceCase):
         self.assertIsNone(self.done(fleet, b.get_if_exists(("short",)), 1.0))
 
     def test_tuples_that_nobody_can_take_do_not_keep_the_others(self) -> None:
-        """Where tuples stand whose councils lost their majority for good, ``get`` takes the others all the same."""
+        """``get`` skips tuples with a council that lost its majority and takes other tuples."""
         fleet, spaces = self.spaces(8)
         for number in range(4):
             self.done(fleet, spaces[0].put(("stuck", number)), 0.5)
@@ -232,7 +232,7 @@ class TupleSpaceTests(SpaceCase):
             self.assertEqual(self.done(fleet, space.get((str, int)), 20.0)[0], "good")
 
     def test_slots_are_used_again(self) -> None:
-        """However many tuples come and go, the slots they leave behind stay as many as a few seconds need."""
+        """Slots of taken tuples are reused, which bounds their number."""
         fleet, (a, b, _) = self.spaces(3)
         for number in range(150):
             self.done(fleet, a.put(("n", number)), 0.1)
@@ -242,13 +242,13 @@ class TupleSpaceTests(SpaceCase):
         self.assertEqual(self.done(fleet, a.read_all(("n", ANY))), [])
 
     def test_single_node(self) -> None:
-        """A node that is all alone can use a space, and has nobody to ask."""
+        """A single node can use a space without other nodes."""
         fleet, (a,) = self.spaces(1)
         self.done(fleet, a.put(("x",)))
         self.assertEqual(self.done(fleet, a.get(("x",))), ("x",))
 
     def test_wrong_use(self) -> None:
-        """What is no tuple raises at once, before anything is sent, and a stopped space says that it is stopped."""
+        """An invalid tuple raises at once, and a stopped space raises ``NotRunning``."""
         fleet, (a, b) = self.spaces(2)
         fleet.run(1.0)
         for wrong in ([], [object()], "text"):
@@ -270,7 +270,7 @@ class ClaimTests(SpaceCase):
         return claim
 
     def test_confirm(self) -> None:
-        """A claimed tuple is out of reach of others, and when it is confirmed it is taken."""
+        """A claimed tuple cannot be taken by others, and is taken after the confirmation."""
         fleet, (a, b, c) = self.spaces(3)
         self.done(fleet, a.put(("job", 1)), 1.0)
         claim = self._claimed(fleet, b, lease=10.0)
@@ -282,7 +282,7 @@ class ClaimTests(SpaceCase):
         self.failureResultOf(claim.confirm(), ClaimLost)
 
     def test_a_dead_taker_gives_back(self) -> None:
-        """A taker that dies without confirming loses the tuple when its claim ends, publisher alive or not."""
+        """The claim of a failed taker ends with its lease, even if the publisher has failed."""
         fleet, spaces = self.spaces(6)
         self.done(fleet, spaces[1].put(("job", 1)), 1.0)
         self._claimed(fleet, spaces[2], lease=3.0)
@@ -294,7 +294,7 @@ class ClaimTests(SpaceCase):
         self.assertEqual(len(got), 1)
 
     def test_release(self) -> None:
-        """A claim that is released can be had by another at once."""
+        """A released claim makes the tuple available at once."""
         fleet, (a, b, c) = self.spaces(3)
         self.done(fleet, a.put(("job", 1)), 1.0)
         claim = self._claimed(fleet, b, lease=60.0)
@@ -306,7 +306,7 @@ class ClaimTests(SpaceCase):
         self.assertEqual(self.done(fleet, waiting, 1.0), ("job", 1))
 
     def test_get_behind_another_call_of_the_same_node(self) -> None:
-        """A get that finds the tuple held by another call of its node goes on when that call does not win it."""
+        """A get continues if another call of its node, which holds the tuple, does not win it."""
         fleet, (a, b, c) = self.spaces(3)
         b.read(("bell", int)).addErrback(lambda failure: failure.trap(NotRunning))  # keeps the shelf of b open
         self.done(fleet, a.put(("job", 1)), 1.0)
@@ -316,7 +316,7 @@ class ClaimTests(SpaceCase):
         self.assertEqual(self.done(fleet, waiting, 5.0), ("job", 1))
 
     def test_renew(self) -> None:
-        """A claim that is renewed outlasts its first lease; one that is over cannot be renewed."""
+        """A renewed claim lasts beyond its first lease; a confirmed claim cannot be renewed."""
         fleet, (a, b, c) = self.spaces(3)
         self.done(fleet, a.put(("job", 1)), 1.0)
         claim = self._claimed(fleet, b)
@@ -327,7 +327,7 @@ class ClaimTests(SpaceCase):
         self.failureResultOf(claim.renew(), ClaimLost)
 
     def test_late_confirm(self) -> None:
-        """Who confirms after its claim ended gets the tuple if nobody else did, and ``ClaimLost`` if somebody did."""
+        """A confirm after the end of a claim succeeds if no other node took the tuple, else raises ``ClaimLost``."""
         fleet, (a, b, c) = self.spaces(3)
         self.done(fleet, a.put(("job", 1)), 1.0)
         claim = self._claimed(fleet, b, lease=1.0)
@@ -344,7 +344,7 @@ class ClaimTests(SpaceCase):
 
 class RestartTests(SpaceCase):
     def test_a_restarted_member_knows_what_it_accepted(self) -> None:
-        """All members die and come back with their stores: a tuple that was taken stays taken."""
+        """After a restart of all members with their stores a taken tuple stays taken."""
         fleet, spaces = self.spaces(3)
         self.done(fleet, spaces[0].put(("job", 1)), 1.0)
         self.done(fleet, spaces[1].get(("job", ANY)), 1.0)
