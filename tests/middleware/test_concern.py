@@ -1,4 +1,4 @@
-"""Tests of what a majority promises of records, whoever joins, comes back empty or is cut off."""
+"""Tests of the guarantees of the consistency levels under joins, lost stores and partitions."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ KEY = hashed_key("task")
 
 
 class ConcernCase(FleetCase):
-    """A few words for what most tests do."""
+    """Helpers of these tests."""
 
     def cut(self, fleet: Fleet, *places: int) -> None:
         fleet.board.partition([fleet.address(place) for place in places])
@@ -34,19 +34,19 @@ class ConcernCase(FleetCase):
         return self.failureResultOf(work, kind).value
 
     def outcome(self, fleet: Fleet, work: Deferred[Any], within: float = 5.0) -> Any:
-        """What came of ``work``: its result, or its exception."""
+        """Return the result or the exception of ``work``."""
         results: list[Any] = []
         work.addErrback(lambda failure: failure.value).addCallback(results.append)
         fleet.run(within)
         return results[0] if results else None
 
     def values(self, fleet: Fleet, place: int, concern: Any = "majority") -> Any:
-        """What a read at a node gives: values, or why there are none."""
+        """Return the values of a read at a node, or the type of its error."""
         found = self.outcome(fleet, fleet.nodes[place].get(KEY, concern))
         return [record.value for record in found] if isinstance(found, list) else type(found)
 
     def joined(self, fleet: Fleet, count: int, known: int) -> None:
-        """So many newcomers join through one node."""
+        """Let new nodes join through one node."""
         for _ in range(count):
             place = len(fleet.nodes)
             fleet.nodes.append(fleet.made(place))
@@ -56,7 +56,7 @@ class ConcernCase(FleetCase):
 
 class WriteConcernTests(ConcernCase):
     def test_how_many_have_it(self) -> None:
-        """Each concern is met before the writer is told, and what it is told is at least that."""
+        """A write at each consistency level is acknowledged by at least the required number of replicas."""
         fleet = self.fleet(5)
         concerns: tuple[tuple[Concern, int], ...] = (("one", 1), ("majority", 3), ("all", 5))
         for concern, least in concerns:
@@ -64,7 +64,7 @@ class WriteConcernTests(ConcernCase):
             self.assertGreaterEqual(stored, least)
 
     def test_named_error_says_how_many(self) -> None:
-        """With two of five cut off ``all`` fails and says that three have it; a minority fails ``majority``."""
+        """With two of five nodes cut off ``all`` fails with three acknowledgements; the minority fails ``majority``."""
         fleet = self.fleet(5)
         self.cut(fleet, 3, 4)
         error = self.failure(fleet, fleet.nodes[0].put(KEY, "a", b"x", "team", "all"), NotAcknowledged)
@@ -74,7 +74,7 @@ class WriteConcernTests(ConcernCase):
         self.assertEqual(self.done(fleet, fleet.nodes[3].put(KEY, "c", b"x", "team", "one")) >= 1, True)
 
     def test_one_after_the_other_may_die(self) -> None:
-        """A majority that is in touch goes on without the dead, until two of five are left; then writes still work."""
+        """A majority continues after failures, one after the other, until two of five nodes are left and can write."""
         fleet = self.fleet(5)
         for place in (4, 3, 2):
             fleet.nodes[place].vanish()
@@ -84,7 +84,7 @@ class WriteConcernTests(ConcernCase):
 
 class CompareAndSetTests(ConcernCase):
     def test_only_what_was_expected_is_replaced(self) -> None:
-        """A first write expects 0, the next one the number of the last; any other number is a conflict."""
+        """The first write expects sequence 0, the next one the last sequence; any other number is a conflict."""
         fleet = self.fleet(3)
         first = self.done(fleet, fleet.nodes[0].put(KEY, "a", b"1", expect=0))
         conflict = self.failure(fleet, fleet.nodes[0].put(KEY, "a", b"2", expect=0), Conflict)
@@ -95,7 +95,7 @@ class CompareAndSetTests(ConcernCase):
         self.assertEqual(self.values(fleet, 1), [])
 
     def test_two_at_once(self) -> None:
-        """Of two writes that expect the same number one wins."""
+        """Of two concurrent writes that expect the same sequence one succeeds."""
         fleet = self.fleet(3)
         works = [fleet.nodes[0].put(KEY, "a", value, expect=0) for value in (b"1", b"2")]
         fleet.run(1.0)
@@ -104,7 +104,7 @@ class CompareAndSetTests(ConcernCase):
         self.assertEqual(self.values(fleet, 1), [b"1"])
 
     def test_a_former_life_is_not_overwritten(self) -> None:
-        """A node that lost its store does not replace by compare-and-set what its former life has left."""
+        """A node that lost its store does not overwrite records of its former run by compare-and-set."""
         fleet = self.fleet(3)
         old = self.done(fleet, fleet.nodes[2].put(KEY, "a", b"old"))
         fleet.nodes[2].vanish()
@@ -129,7 +129,7 @@ class ReadConcernTests(ConcernCase):
         return self.world.board.counters["sent"]
 
     def test_fast_costs_two_datagrams(self) -> None:
-        """Where everybody is known, a fast read is one question and one answer, a write 8 of each."""
+        """If all members are known, a fast read is one request and one reply, a write eight of each."""
         put = self.reader.put(KEY, "a", b"x")
         self.world.run(0.001)
         self.successResultOf(put)
@@ -144,7 +144,7 @@ class ReadConcernTests(ConcernCase):
         self.assertEqual(self.sent() - before, 2 * K)
 
     def test_a_dead_replica_is_not_waited_for(self) -> None:
-        """Right after a death reads are hedged: with half of the holders silent fast ones are answered in 60 ms."""
+        """Reads are hedged: with half of the holders dead, a fast read is answered within 60 ms."""
         self.done(self.world, self.reader.put(KEY, "a", b"x", "team", "all"))
         for place in self.order[:4]:
             self.world.nodes[place].vanish()
@@ -155,7 +155,7 @@ class ReadConcernTests(ConcernCase):
         self.failure(self.world, self.reader.get(KEY), Unavailable)
 
     def test_read_repair(self) -> None:
-        """What a majority read shows, a majority has by then, though one replica only had it before."""
+        """A majority read stores its result at a majority, even if a single replica had the record before."""
         writer = self.world.nodes[self.order[0]]
         made = Record(KEY, "a", writer.identity.public, 7, "team", 6000.0, b"x").signed(writer.identity)
         self.world.nodes[self.order[1]].replica.keep(made)
@@ -165,7 +165,7 @@ class ReadConcernTests(ConcernCase):
         self.assertGreater(len(holding), K // 2)
 
     def test_nothing_is_said_by_a_majority_only(self) -> None:
-        """That a key is empty takes a majority to say; while it cannot be asked, a read fails by name."""
+        """Only a majority can confirm that a key is empty; without a majority the read fails."""
         self.assertEqual(self.values(self.world, self.order[-1], "fast"), [])
         for place in self.order[:5]:
             self.world.nodes[place].vanish()
@@ -175,7 +175,7 @@ class ReadConcernTests(ConcernCase):
 
 class NewcomerTests(ConcernCase):
     def test_second_node_reads_as_soon_as_it_has_joined(self) -> None:
-        """Of two nodes both have to vote; the one that has just come can read all the same, and surely."""
+        """In a team of two a node can read with certainty as soon as it has joined."""
 
         async def joined_and_read(fleet: Fleet) -> list[Record]:
             fleet.nodes.append(fleet.made(1))
@@ -191,7 +191,7 @@ class NewcomerTests(ConcernCase):
 
 class AbsenceTests(ConcernCase):
     def test_a_delete_stays_one(self) -> None:
-        """A node that was off during a delete does not bring the record back, however it comes back."""
+        """A node that was offline during a deletion does not restore the record."""
         fleet = self.fleet(5)
         self.done(fleet, fleet.nodes[0].put(KEY, "a", b"x", "team", "all"))
         fleet.nodes[3].vanish()
@@ -207,7 +207,7 @@ class AbsenceTests(ConcernCase):
             self.assertEqual(fleet.stores[place].get(KEY), [])
 
     def test_long_absence_means_empty(self) -> None:
-        """A node that was away for longer than tombstones are kept re-joins empty, a shorter absence costs nothing."""
+        """A node that was offline longer than the TTL of tombstones rejoins empty; a shorter absence loses nothing."""
         self.assertGreater(TOMBSTONE_TTL, TOLERATED_ABSENCE)
         for away, kept in ((TOLERATED_ABSENCE - 60.0, 1), (TOLERATED_ABSENCE + 60.0, 0)):
             fleet = self.fleet(1)
@@ -222,7 +222,7 @@ class AbsenceTests(ConcernCase):
                 moment[0] += away
 
     def life(self, fleet: Fleet, moment: list[float]) -> EntangledNode:
-        """One life of the node of place 0, with a wall clock."""
+        """Run the node of place 0 once, with a wall clock."""
         network = fleet.board.network(*fleet.address(0))
         node = EntangledNode(
             fleet.identity(0), TEAM, network, fleet.store(0), fleet.clock, fleet.rng(0), wall=lambda: moment[0]
@@ -236,7 +236,7 @@ class AbsenceTests(ConcernCase):
 
 class WatchNumberTests(ConcernCase):
     def test_a_gap_is_noticed_and_filled(self) -> None:
-        """A watcher that missed a push sees by the number of the next one that it did, and asks at once."""
+        """A watcher detects a missed push by the next push number and requests the records at once."""
         fleet = self.fleet(2)
         told: list[list[bytes | None]] = []
         watch = fleet.nodes[1].watch(KEY, lambda records: told.append([r.value for r in records]))
@@ -255,7 +255,7 @@ class WatchNumberTests(ConcernCase):
 
 class SecondHandTests(ConcernCase):
     def test_only_the_second_hand_is_verified(self) -> None:
-        """Nobody verifies what the owner stores in its own session; whoever gets it from another does."""
+        """A replica verifies the signature of a record from another node than its owner, not in the owner's session."""
         fleet = self.fleet(3)
         owner, other = fleet.identity(1), fleet.nodes[2]
         unsigned = Record(KEY, "x", owner.public, 9, "team", 60.0, b"x", bytes(64))
@@ -270,7 +270,7 @@ class SecondHandTests(ConcernCase):
 
 class WalkTests(ConcernCase):
     def test_copies_on_the_path(self) -> None:
-        """In a network that nobody knows whole a popular value is copied along the way, and never counted as sure."""
+        """A fast read in a large network leaves cached copies on its path, which never count as a replica."""
         fleet = self.fleet(30, seed=5)
         self.done(fleet, fleet.nodes[0].put(KEY, "a", b"x"))
         for node in fleet.nodes:
@@ -298,7 +298,7 @@ class WalkTests(ConcernCase):
 
 
 class Replaced(MemoryStore):
-    """A store that was made anew because its file was rotten; it has the notes of the old one."""
+    """A store that replaced a corrupted file and kept its notes."""
 
     origin = "replaced"
 
@@ -308,14 +308,14 @@ class Replaced(MemoryStore):
 
 
 class CutTests(ConcernCase):
-    """Few behind a cut, with newcomers of their own, against the many."""
+    """A minority behind a partition, with new nodes, against the majority."""
 
     def test_newcomers_make_no_majority_of_a_minority(self) -> None:
-        """However many join on the smaller side of a cut, nothing is read or written there by majority."""
+        """For any number of joins in the minority, majority reads and writes fail there."""
         for count, small, newcomers, wait in ((3, (2,), 2, 3.0), (5, (3, 4), 3, 12.0), (4, (2, 3), 3, 0.0)):
             fleet = self.fleet(count)
             self.cut(fleet, *small, *range(count, count + newcomers))
-            fleet.run(wait)  # whether the many are known as absent yet, or not
+            fleet.run(wait)  # before or after the majority is known as absent
             has_majority = 2 * len(small) < count
             stored = self.outcome(fleet, fleet.nodes[0].put(KEY, "a", b"x"))
             self.assertEqual(type(stored) is NotAcknowledged, not has_majority)
@@ -332,14 +332,14 @@ class CutTests(ConcernCase):
             self.assertEqual(sorted(self.values(fleet, len(fleet.nodes) - 1)), [b"x", b"y"])
 
     def test_a_lost_memory_was_a_vote(self) -> None:
-        """A node whose file rotted away is not sure while only those answer who may have missed what it held."""
+        """A node with a lost store is not ``SURE`` while only nodes answer that may have missed its records."""
         fleet = self.fleet(3)
         self.cut(fleet, 2)
         self.outcome(fleet, fleet.nodes[0].put(KEY, "a", b"x"))
         fleet.board.heal()
         self.cut(fleet, 0)
         fleet.nodes[1].vanish()
-        for _ in range(2):  # nor in its next life
+        for _ in range(2):  # the same after another restart
             former = fleet.stores[1]
             assert isinstance(former, MemoryStore)
             fleet.stores[1] = Replaced(former)
@@ -354,7 +354,7 @@ class CutTests(ConcernCase):
         self.assertEqual([self.values(fleet, place) for place in range(3)], [[b"x"]] * 3)
 
     def test_a_newcomer_and_a_lost_memory(self) -> None:
-        """Whoever enters by a node that lost its records hears from it who else there was, and is not sure without."""
+        """A new node that joins through a node with a lost store learns the members from it and is not ``SURE``."""
         fleet = self.fleet(3)
         self.cut(fleet, 2, 3)
         fleet.nodes[2].vanish()
@@ -367,7 +367,7 @@ class CutTests(ConcernCase):
         self.assertEqual([node.replica.is_sure() for node in fleet.nodes], [True, True, False, False])
 
     def test_a_door_that_shuts(self) -> None:
-        """A newcomer that did not hear who is known from the only one it met waits for that one, and for its word."""
+        """A new node whose only peer failed before it sent the member list waits until this peer returns."""
         fleet = self.fleet(3)
         self.cut(fleet, 2, 3)
         self.joined(fleet, 1, 2)
@@ -381,7 +381,7 @@ class CutTests(ConcernCase):
         self.assertEqual([node.replica.is_sure() for node in fleet.nodes], [True] * 4)
 
     def test_the_unsure_hold_without_a_vote(self) -> None:
-        """A replica that is not sure keeps what is stored at it, and the writer waits for its vote a little."""
+        """A replica that is not ``SURE`` stores records without a vote; the writer waits briefly for its vote."""
         fleet = self.fleet(2)
         unsure = fleet.nodes[1].replica
         genuine, unsure.is_sure = unsure.is_sure, lambda: False
@@ -401,7 +401,7 @@ class CutTests(ConcernCase):
         self.assertEqual((refused.acknowledged, refused.needed), (1, 2))
 
     def test_a_later_record_at_the_unsure(self) -> None:
-        """A write is not acknowledged because a replica without a vote has the one after it."""
+        """A later record at a replica without a vote does not acknowledge an earlier write."""
         fleet = self.fleet(2)
         fleet.nodes[1].replica.is_sure = lambda: False
         first = fleet.nodes[0].put(KEY, "a", b"x")
@@ -411,7 +411,7 @@ class CutTests(ConcernCase):
         self.assertIsInstance(self.outcome(fleet, second), NotAcknowledged)
 
     def test_a_later_record_at_the_sure(self) -> None:
-        """A write is acknowledged where a majority has the one after it."""
+        """A write is acknowledged if a majority has the next one."""
         fleet = self.fleet(3)
         fleet.board.weather = Weather(delay_s=0.02, jitter_s=0.02, reorder=0.5)
         for _ in range(10):
@@ -419,7 +419,7 @@ class CutTests(ConcernCase):
             self.assertEqual([type(self.outcome(fleet, put, 0.5)) for put in puts], [Stored] * 3)
 
     def test_who_comes_back_behind_a_cut(self) -> None:
-        """A node that has yet to meet its team does not take the few that it meets for all, and deny what is there."""
+        """A node that has not met its team does not regard the few known members as all, and denies no record."""
         fleet = self.fleet(3)
         self.cut(fleet, 2)
         self.assertEqual(self.outcome(fleet, fleet.nodes[0].put(KEY, "a", b"x")), 2)
@@ -431,7 +431,7 @@ class CutTests(ConcernCase):
 
 class StartTests(ConcernCase):
     def test_a_liar_makes_no_members_up(self) -> None:
-        """A newcomer counts nobody as absent whom only one of those that it asks names."""
+        """A new node counts a member as absent only if several of the nodes that it queries name it."""
         fleet = self.fleet(3)
         ghosts = [[[Identity(bytes([n]) * 32).public, "10.9.9.9", n], 0] for n in range(200, 204)]
         fleet.nodes[1].endpoint.expose("known", lambda peer: ghosts)
@@ -441,7 +441,7 @@ class StartTests(ConcernCase):
         self.assertTrue(fleet.nodes[3].replica.is_sure())
 
     def test_a_new_team_all_at_once(self) -> None:
-        """Nodes that start at the same moment, each told of all others, are all sure in two seconds."""
+        """Nodes that start at the same time and know all addresses are ``SURE`` within four seconds."""
         fleet = self.fleet(0)
         for place in range(5):
             fleet.nodes.append(fleet.made(place))
@@ -451,7 +451,7 @@ class StartTests(ConcernCase):
         self.assertEqual([node.replica.is_sure() for node in fleet.nodes], [True] * 5)
 
     def test_a_power_cut(self) -> None:
-        """A team that comes back from its disks, all but one of it, is sure and writes again in a few seconds."""
+        """After a restart from disk of all members but one the team is ``SURE`` and writes within seconds."""
         fleet = self.fleet(5)
         self.outcome(fleet, fleet.nodes[0].put(KEY, "a", b"x"))
         for node in fleet.nodes:
@@ -466,7 +466,7 @@ class StartTests(ConcernCase):
         fleet.nodes[4].stop()
 
     def test_after_the_longest_cut(self) -> None:
-        """Half of a team goes on alone when no cut lasts so long, and not before."""
+        """Half of a team continues alone after the maximum duration of a partition, not before."""
         fleet = self.fleet(2)
         fleet.nodes[1].vanish()
         fleet.run(COUNTED_S - 10.0)

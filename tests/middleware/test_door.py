@@ -1,4 +1,4 @@
-"""Tests of the door: who is let in, what both sides hear of a refusal, and two nodes with one identity."""
+"""Tests of the admission check: admission, rejections on both sides, and two nodes with one identity."""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ from tests.middleware.test_endpoint import DELAY, TEAM, EndpointCase, Tap
 
 
 class LogCase(SynchronousTestCase):
-    """A test that reads the log."""
+    """A test case that reads the log."""
 
     def listened(self) -> list[str]:
-        """The warnings that are logged from now on."""
+        """Return the list that receives all later warnings of the log."""
         lines: list[str] = []
 
         @implementer(ILogObserver)
@@ -58,7 +58,7 @@ class LogCase(SynchronousTestCase):
 
 
 class ClosedCase(EndpointCase, LogCase):
-    """Two endpoints of a closed team, each with a ``Gate``."""
+    """A test case with two endpoints of a closed team, each with a ``Gate``."""
 
     def setUp(self) -> None:
         self.gates: list[Gate] = []
@@ -78,7 +78,7 @@ class ClosedCase(EndpointCase, LogCase):
         return endpoint, Contact(own.public, tap.address)
 
     def refused(self, asked: Deferred[Any], code: str, seconds: float = 3.0) -> str:
-        """The text with which a question fails, for the reason ``code``."""
+        """Return the error message of a request that is rejected with ``code``."""
         self.clock.advance(seconds)
         error = self.failureResultOf(asked, NotAdmitted).value
         self.assertEqual(error.code, code)
@@ -86,10 +86,10 @@ class ClosedCase(EndpointCase, LogCase):
 
 
 class PassTests(ClosedCase):
-    """What is shown in a handshake, and what becomes of it."""
+    """The certificate in a handshake, and its check."""
 
     def test_first_answer_still_takes_one_round_trip(self) -> None:
-        """With the largest passes a first question rides in the handshake; its answer says where the INIT came from."""
+        """With certificates of maximum size the first request fits into the INIT; the reply has the INIT's source."""
         answer = bytes(ANSWER_ROOM - 20)
         seen: list[tuple[Contact, Address]] = []
         self.a.on_seen.add(lambda contact, address: seen.append((contact, address)))
@@ -100,7 +100,7 @@ class PassTests(ClosedCase):
         self.assertEqual(seen, [(self.to_b, self.to_a.address)])
 
     def test_refused_by_the_responder(self) -> None:
-        """Who shows no lawful pass is told why, nothing that it asked runs, and no session is left on either side."""
+        """A node without a valid certificate gets the reason, its request does not run, and no session is left."""
         self.at_b.refused[self.to_a.public] = EXPIRED
         self.b.expose("look", lambda peer: self.runs.append(peer), early=True)
         text = self.refused(self.a.ask(self.to_b, "look"), EXPIRED, 2 * DELAY)
@@ -108,7 +108,7 @@ class PassTests(ClosedCase):
         self.assertEqual((self.runs, self.a._sessions, self.b._sessions), ([], {}, {}))
 
     def test_refused_by_the_initiator(self) -> None:
-        """Who answers with no lawful pass is told so in the first DATA; neither counts the other as met."""
+        """The initiator sends its rejection in the first DATA; neither side counts the other as met."""
         self.at_a.refused[self.to_b.public] = REVOKED
         met: list[Contact] = []
         refusals: list[tuple[Contact, str]] = []
@@ -121,7 +121,7 @@ class PassTests(ClosedCase):
         self.assertEqual(len(self.kept(self.to_b, DATA)), 1)
 
     def test_said_once(self) -> None:
-        """Each side logs each refusal once, with what to do; a node that has a new pass is let in."""
+        """Each side logs each rejection once, with a remedy; a node with a new certificate is admitted."""
         for count, code in enumerate((REVOKED, EXPIRED), start=1):
             self.at_b.refused[self.to_a.public] = code
             for _ in range(5):
@@ -132,7 +132,7 @@ class PassTests(ClosedCase):
         self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 2)), 2)
 
     def test_foreign_passes(self) -> None:
-        """Who shows no pass is foreign, and so is one of too many bytes, whatever is in it; that costs no signature."""
+        """A missing certificate and an oversized one are rejected as foreign; the oversized one is not checked."""
         self.at_a.shown += b"!"
         self.refused(self.a.ask(self.to_b, "echo", 1), FOREIGN)
         self.assertEqual(self.at_b.judged, [])
@@ -140,7 +140,7 @@ class PassTests(ClosedCase):
         self.refused(stranger.ask(self.to_b, "echo", 1), FOREIGN)
 
     def test_a_repeated_init_is_refused_without_a_key_exchange(self) -> None:
-        """The same INIT again gets the same refusal again, and the door is not asked a second time."""
+        """A repeated INIT gets the same rejection again without another check."""
         self.at_b.refused[self.to_a.public] = REVOKED
         self.refused(self.a.ask(self.to_b, "echo", 1), REVOKED)
         (init, source), judged = self.kept(self.to_b, INIT)[0], len(self.at_b.judged)
@@ -151,7 +151,7 @@ class PassTests(ClosedCase):
         self.assertEqual(first, second)
 
     def test_a_forged_init_reaches_no_door(self) -> None:
-        """Without the team's secret, or room for a pass, an INIT costs a hash at most: the door is not asked."""
+        """An INIT with a wrong team secret, or without room for a certificate, is dropped before the check."""
         for secret, hello in ((b"x" * 32, Hello(self.at_a.life, self.at_a.shown, ROOM)), (TEAM, Hello())):
             own = Credentials.of(Identity(b"m" * 32), secret)
             init = Invitation(own, exchange_key(self.to_b.public), bytes(range(32)), 5, b"", hello).datagram()
@@ -160,7 +160,7 @@ class PassTests(ClosedCase):
         self.assertEqual((self.at_b.judged, self.b.counters["forged"], self.kept(self.to_a, RESP)), ([], 2, []))
 
     def test_a_refusal_that_is_none(self) -> None:
-        """A member that sends a refusal without a lawful name is counted, and its session lives on."""
+        """A rejection with an invalid code is counted, and the session stays open."""
         self.got(self.a.ask(self.to_b, "echo", 1))
         session = next(iter(self.a._sessions.values()))
         for rubbish in (b"\x04", b"\x04\xff\xfe", b"\x04" + b"x" * 33):
@@ -171,10 +171,10 @@ class PassTests(ClosedCase):
 
 
 class EvictionTests(ClosedCase):
-    """Members that are members no more."""
+    """Members that were evicted."""
 
     def test_evicted_at_runtime(self) -> None:
-        """Who is evicted is told so, what it asked is stopped, and what is asked of it fails; it stays outside."""
+        """An evicted node gets the reason, its running requests are cancelled, and later ones are rejected."""
         never: Deferred[None] = Deferred()
         stopped: list[object] = []
         self.b.expose("wait", lambda peer: Deferred(lambda _: stopped.append(1)), changes=True)
@@ -193,7 +193,7 @@ class EvictionTests(ClosedCase):
         self.assertEqual(len(self.log), 2)
 
     def test_evicted_in_the_middle_of_a_parcel(self) -> None:
-        """A large question under way ends with the eviction, and nothing of it is kept on either side."""
+        """An eviction ends a large request in transfer, and both sides release its fragments."""
         asked = self.a.ask(self.to_b, "echo", bytes(500_000))
         self.clock.advance(6 * DELAY)
         self.b.evict(self.to_a.public)
@@ -203,7 +203,7 @@ class EvictionTests(ClosedCase):
             self.assertEqual(dict(end._courier._bytes_out), {})
 
     def test_evicted_before_it_confirmed(self) -> None:
-        """A session whose initiator has not confirmed it yet goes with its initiator; a stranger's eviction is none."""
+        """An eviction also removes an unconfirmed session; the eviction of an unknown node has no effect."""
         self.b.evict(Identity(b"n" * 32).public)
         self.assertEqual(self.log, [])
         self.a.ask(self.to_b, "add", 1, changes=True).addErrback(lambda failure: None)
@@ -217,13 +217,13 @@ class LifeTests(ClosedCase):
     """Two nodes with one identity."""
 
     def life(self, number: int, nonce: int) -> tuple[Endpoint, Contact]:
-        """One more node with the identity of ``a``."""
+        """Create another node with the identity of ``a``."""
         end, contact = self.endpoint(50 + nonce, identity=1, gate=Gate(number, nonce))
         self.equip(end)
         return end, contact
 
     def test_the_older_one_is_told(self) -> None:
-        """A later life is let in; the older one is told once that it is superseded, in its session and after."""
+        """A later run is admitted; the earlier one gets one rejection as superseded, in its session and later."""
         self.got(self.a.ask(self.to_b, "echo", 1))
         later, _ = self.life(2, 2)
         self.got(later.ask(self.to_b, "echo", 2))
@@ -235,7 +235,7 @@ class LifeTests(ClosedCase):
         self.assertTrue(all(meaning(SUPERSEDED) in line for line in self.log))
 
     def test_a_copy_is_doubled(self) -> None:
-        """The same life with other dice, or an unknown lower one, is refused, and the first one goes on."""
+        """A node with the same run number but another nonce, or a lower number, is rejected as doubled."""
         self.at_a.life = Life(5, self.at_a.life.nonce)
         self.got(self.a.ask(self.to_b, "echo", 1))
         for number, nonce in ((5, 2), (4, 3)):
@@ -244,7 +244,7 @@ class LifeTests(ClosedCase):
         self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 3)), 3)
 
     def test_a_copy_that_answers(self) -> None:
-        """A question that reaches a copy fails by name, and the copy is told; the session with the first one lives."""
+        """A request that reaches a copy is rejected; the session with the first node stays open."""
         self.equip(self.a)
         self.got(self.a.ask(self.to_b, "echo", 1))
         copy, to_copy = self.life(1, 2)
@@ -258,7 +258,7 @@ class LifeTests(ClosedCase):
         self.assertEqual(len(self.log), 2)
 
     def test_two_that_knock_at_once(self) -> None:
-        """Of two with one life whose INITs cross, the one that confirms first is in; the other one is told."""
+        """Of two nodes with one run and concurrent INITs the first to confirm is admitted, the other rejected."""
         copy, _ = self.life(1, 2)
         first, second = self.a.ask(self.to_b, "add", 1, changes=True), copy.ask(self.to_b, "add", 2, changes=True)
         self.clock.advance(3)
@@ -268,7 +268,7 @@ class LifeTests(ClosedCase):
         self.assertEqual(self.runs, [1])
 
     def test_a_recording_sets_no_life(self) -> None:
-        """A recorded INIT of an earlier life changes nothing that is remembered of lives."""
+        """A recorded INIT of an earlier run does not change the known runs."""
         self.got(self.a.ask(self.to_b, "echo", 1))
         recorded = self.kept(self.to_b, INIT)[0]
         later, _ = self.life(2, 2)
@@ -279,7 +279,7 @@ class LifeTests(ClosedCase):
         self.assertEqual(self.got(later.ask(self.to_b, "echo", 4)), 4)
 
     def test_lives(self) -> None:
-        """A later life holds, the one before it is superseded, any other one doubled; who counts none is let in."""
+        """The latest run is valid, the previous one superseded, any other one doubled; no run number is valid."""
         lives, one, two = Lives(), Life(1, b"1" * 8), Life(2, b"2" * 8)
         self.assertFalse(lives.met(b"a", one))
         self.assertEqual(lives.judge(b"a", two), "")
@@ -291,7 +291,7 @@ class LifeTests(ClosedCase):
         self.assertEqual(lives.judge(b"a", one), "")
 
     def test_tables_are_bounded(self) -> None:
-        """Lives and noted refusals are remembered up to a number; the oldest go first."""
+        """The tables of runs and of logged rejections are bounded; the oldest entries are removed first."""
         self.patch(door, "MAX_LIVES", 3)
         self.patch(door, "MAX_NOTED", 3)
         lives, noted = Lives(), Noted()
@@ -303,23 +303,23 @@ class LifeTests(ClosedCase):
         self.assertTrue(noted.is_new(0.0, b"\x00", EXPIRED))
 
     def test_the_log_is_no_target(self) -> None:
-        """Who invents keys gets a few lines at once and one a second, and what was not said is said later."""
+        """Rejections of invented keys are logged at a limited rate; skipped ones are logged later."""
         noted = Noted()
         self.assertEqual(sum(noted.is_new(0.0, number, FOREIGN) for number in range(1000)), LINES)
         self.assertEqual(sum(noted.is_new(3.0, number, FOREIGN) for number in range(1000)), 3)
 
     def test_next_life(self) -> None:
-        """A life has a higher number than the last one and, where that was lost, than those begun before in time."""
+        """The number of a run exceeds the last one and, if that was lost, the number of any earlier start by time."""
         self.assertEqual([next_life(0, 0.0), next_life(7, 5.0), next_life(7, 1e9)], [1, 8, 10**9])
 
 
 class SecretTests(ClosedCase):
-    """The team's secret is succeeded by another one."""
+    """The replacement of the team secret."""
 
     NEW, NEWER = b"n" * 32, b"N" * 32
 
     def test_both_are_good_for_a_while(self) -> None:
-        """While the old secret still counts, who has the new one and who has not reach each other, both ways."""
+        """While the old secret is valid, nodes with the old and the new secret reach each other."""
         self.assertRaises(ValueError, self.b.rekey, b"short")
         self.b.rekey(self.NEW, TEAM)
         self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 1), 4 * DELAY), 1)
@@ -332,7 +332,7 @@ class SecretTests(ClosedCase):
         self.assertEqual(self.got(new.ask(self.to_b, "echo", 4), 4 * DELAY), 4)
 
     def test_cookies_under_each_secret(self) -> None:
-        """Under load a member that has only the old secret can read its cookie, and so can one with only the new."""
+        """Under load a member can read its cookie with only the old or only the new secret."""
         self.b.rekey(self.NEW, TEAM)
         new, _ = self.endpoint(8, team=self.NEW)
         for asker in (self.a, new):
@@ -340,7 +340,7 @@ class SecretTests(ClosedCase):
             self.assertEqual(self.got(asker.ask(self.to_b, "echo", 1), 4 * DELAY), 1)
 
     def test_nobody_is_remembered_by_an_old_one(self) -> None:
-        """Who was greeted under the old secret is asked under it, then under the new one when that alone counts."""
+        """A peer is contacted under the secret of its last handshake, and under the new one when only that is valid."""
         self.equip(self.a)
         self.b.rekey(self.NEW, TEAM)
         self.assertEqual(self.got(self.b.greet(self.to_a.address), 1.0), self.to_a)
@@ -352,10 +352,10 @@ class SecretTests(ClosedCase):
 
 
 class RoleTests(ClosedCase):
-    """What a member may not do."""
+    """Methods that a role forbids."""
 
     def test_a_method_that_is_not_for_it(self) -> None:
-        """A call that a role does not allow is refused by name, however it comes, and does not run; it is said once."""
+        """A call that the caller's role forbids is rejected in every form, does not run, and is logged once."""
         self.b.expose("told", lambda peer: self.runs.append("told"))
         self.at_b.forbidden = {(self.to_a.public, name) for name in ("add", "whole", "told")}
         for asked in (
@@ -376,7 +376,7 @@ class RouteTests(EndpointCase):
     """Datagrams of other kinds."""
 
     def test_a_kind_has_one_receiver(self) -> None:
-        """Datagrams of a routed kind go where they belong; a kind that is taken cannot be routed."""
+        """Datagrams of a routed kind go to their receiver; a kind in use cannot be routed."""
         got: list[tuple[bytes, Address]] = []
         self.b.route(0x17, lambda datagram, source: got.append((datagram, source)))
         self.a.post(b"\x17 knock", self.to_b.address)
@@ -390,16 +390,16 @@ class RouteTests(EndpointCase):
 
 
 class AddressTests(SynchronousTestCase):
-    """Addresses in bytes."""
+    """The binary encoding of addresses."""
 
     def test_there_and_back(self) -> None:
-        """Addresses of both families come back as they were; the zone of a local one stays behind."""
+        """IPv4 and IPv6 addresses survive encoding and decoding; the zone of a link-local address is dropped."""
         for address in (Address("10.0.0.1", 8470), Address("255.255.255.255", 65535), Address("2001:db8::1", 1)):
             self.assertEqual(address_of(packed_address(address)), address)
         self.assertEqual(address_of(packed_address(Address("fe80::1%eth0", 7))), Address("fe80::1", 7))
 
     def test_what_is_no_address(self) -> None:
-        """Names and rubbish are packed as nothing, which reads as no address; so does what is cut short."""
+        """Host names and invalid input are encoded as no address, and truncated bytes decode to None."""
         for host, port in (
             ("robot.local", 1),
             ("~0102", 1),
@@ -414,7 +414,7 @@ class AddressTests(SynchronousTestCase):
 
 
 class GatedFleet(Fleet):
-    """A fleet of a closed team; ``gates`` are its doors, by place."""
+    """A simulated closed team; ``gates`` are its admission checks by node number."""
 
     def __init__(self, n: int) -> None:
         self.gates: dict[int, Gate] = {}
@@ -427,7 +427,7 @@ class GatedFleet(Fleet):
         return EntangledNode(identity, FLEET_TEAM, network, store, self.clock, dice, lease, self.clock.seconds, gate)
 
     def evict(self, place: int, by: tuple[int, ...]) -> None:
-        """Have some members evict the one of a place."""
+        """Let some members evict the node with this number."""
         public = self.identity(place).public
         for other in by:
             self.gates[other].refused[public] = REVOKED
@@ -438,26 +438,26 @@ KEY = hashed_key("somewhere")
 
 
 class MemberTests(FleetCase, LogCase):
-    """Nodes with a door."""
+    """Nodes with an admission check."""
 
     def gated(self, n: int) -> GatedFleet:
-        """A fleet that is stopped when the test ends."""
+        """Return a team that is stopped after the test."""
         fleet = GatedFleet(n)
         self.worlds.append(fleet)
         return fleet
 
     def test_the_last_one_left_does_not_look_for_it(self) -> None:
-        """Who evicted the only other member does not look for it where it was."""
+        """A node that evicted the only other member does not try to reach it."""
         fleet = self.gated(2)
         fleet.evict(1, by=(0,))
         fleet.kill(1)
-        fleet.run(3.0)  # what was under way just then is over
+        fleet.run(3.0)  # until pending traffic has ended
         sent = fleet.board.counters["sent"]
         fleet.run(30.0)
         self.assertEqual(fleet.board.counters["sent"], sent)
 
     def test_a_copy_of_a_member(self) -> None:
-        """A copy that is refused, or that takes the place of the first one, costs nobody the member."""
+        """A copy that is rejected, or that replaces the first node, does not remove the member at others."""
         for number, is_in in ((0, False), (99, True)):
             fleet = self.gated(3)
             public, life = fleet.identity(2).public, fleet.gates[2].life
@@ -476,7 +476,7 @@ class MemberTests(FleetCase, LogCase):
             self.assertEqual(bool(copy._sessions), is_in)
 
     def test_a_slot_that_is_not_for_it(self) -> None:
-        """What its own role forbids a node does not write: the writer is told at once, and nothing is sent."""
+        """A write that the node's role forbids is rejected at once, and nothing is sent."""
         fleet = self.gated(2)
         fleet.gates[1].unwritable.add((fleet.identity(1).public, "order"))
         sent = fleet.board.counters["sent"]
@@ -484,7 +484,7 @@ class MemberTests(FleetCase, LogCase):
         self.assertEqual((error.code, fleet.board.counters["sent"]), (ROLE, sent))
 
     def test_the_evicted_one_is_no_majority_by_itself(self) -> None:
-        """Who is turned away by all counts them as absent, so it does not take itself for the team."""
+        """A node that all members reject counts them as absent, and has no majority alone."""
         fleet = self.gated(4)
         fleet.evict(3, by=(0, 1, 2))
         fleet.run(5.0)
@@ -494,7 +494,7 @@ class MemberTests(FleetCase, LogCase):
         self.failureResultOf(stored, NoAnswer)
 
     def test_a_recording_parts_nobody(self) -> None:
-        """A recorded INIT whose pass counts no more is refused, and its sender stays a member with all it leased."""
+        """A recorded INIT with an expired certificate is rejected; its sender keeps its membership and leases."""
         fleet = self.gated(3)
         init = [d for d, to in self.recorded(fleet, 2) if d[0] == INIT][0]
         self.done(fleet, fleet.nodes[2].put(KEY, "here", b"2", "leased"))
@@ -511,7 +511,7 @@ class MemberTests(FleetCase, LogCase):
         self.assertEqual([r.value for r in self.done(fleet, fleet.nodes[1].get(KEY))], [b"2"])
 
     def recorded(self, fleet: GatedFleet, place: int) -> list[tuple[bytes, Address]]:
-        """What a new life of the node of a place sends to enter."""
+        """Return the datagrams that a restarted node sends to join."""
         sent: list[tuple[bytes, Address]] = []
         fleet.kill(place)
         fleet.run(3.0)
@@ -530,17 +530,17 @@ class MemberTests(FleetCase, LogCase):
 
 
 class RebuffTests(SynchronousTestCase):
-    """Behaviour of ``Rebuffs``."""
+    """Tests of ``Rebuffs``."""
 
     def setUp(self) -> None:
         self.rebuffs = Rebuffs()
 
     def met(self, who: bytes, now: float, code: str = "revoked") -> None:
-        """Somebody is not let in."""
+        """Record a rejection."""
         self.rebuffs.met(who, "10.0.0.1:7000", "we", code, "why; what to do", now)
 
     def test_count_what_happens_again(self) -> None:
-        """The same refusal of the same key is one, with its first and last moment; another code is another one."""
+        """Equal rejections of one key are merged, with the first and last time; another code is a separate entry."""
         for now in (1.0, 2.0, 5.0):
             self.met(b"a", now)
         self.met(b"a", 6.0, "expired")
@@ -548,14 +548,14 @@ class RebuffTests(SynchronousTestCase):
         self.assertEqual(found, [("expired", 6.0, 6.0, 1), ("revoked", 1.0, 5.0, 3)])
 
     def test_forget_after_an_hour(self) -> None:
-        """What is longer ago than an hour is not told, and counts from one again."""
+        """A rejection older than an hour is not returned, and a later one starts at one again."""
         self.met(b"a", 0.0)
         self.assertEqual(self.rebuffs.newest(HOUR + 1.0), [])
         self.met(b"a", HOUR + 1.0)
         self.assertEqual([each.count for each in self.rebuffs.newest(HOUR + 1.0)], [1])
 
     def test_invented_keys_take_no_room(self) -> None:
-        """However many keys somebody invents, only the newest few are remembered."""
+        """Only the latest rejections are stored, for any number of invented keys."""
         for number in range(10 * MAX_REBUFFS):
             self.met(number.to_bytes(32), float(number))
         self.assertEqual((len(self.rebuffs), self.rebuffs.newest(700.0)[0].last_at), (MAX_REBUFFS, 639.0))

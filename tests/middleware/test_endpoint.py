@@ -1,4 +1,4 @@
-"""Tests of the endpoint: two or three of them on simulated time and a switchboard."""
+"""Tests of the endpoint, with two or three endpoints in virtual time on a switchboard."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from middleware.entangled.wire.peer import IN_TOUCH, SESSION_END_S
 from middleware.entangled.wire.session import DATA, INIT, MAX_PLAIN, RESP, Invitation
 
 TEAM = b"k" * 32
-DELAY = 1 / 64  # sums of it are exact
+DELAY = 1 / 64  # a power of two, so sums are exact
 
 
 class Tap:
-    """A ``Network`` that keeps what it receives, and passes it on."""
+    """A ``Network`` that records received datagrams and forwards them."""
 
     def __init__(self, network: SwitchboardNetwork) -> None:
         self.network = network
@@ -35,11 +35,11 @@ class Tap:
 
     @property
     def address(self) -> Address:
-        """The address of the network underneath."""
+        """The address of the underlying network."""
         return self.network.address
 
     def listen(self, receiver: Any) -> None:
-        """Listen, with an ear between."""
+        """Listen and record."""
         self.receiver = receiver
         self.network.listen(self._receive)
 
@@ -48,19 +48,19 @@ class Tap:
         self.receiver(datagram, source)
 
     def send(self, datagram: bytes, to: Address) -> None:
-        """Send."""
+        """Send a datagram."""
         self.network.send(datagram, to)
 
     def close(self) -> None:
-        """Close."""
+        """Close the network."""
         self.network.close()
 
 
 class EndpointCase(SynchronousTestCase):
-    """Two endpoints ``a`` and ``b``; ``b`` has a few methods."""
+    """A test case with two endpoints ``a`` and ``b``; ``b`` has some methods."""
 
     def setUp(self) -> None:
-        """Start both."""
+        """Start both endpoints."""
         self.clock = HeapClock()
         self.rng = random.Random(11)
         self.board = Switchboard(self.clock, self.rng, Weather(DELAY))
@@ -71,19 +71,19 @@ class EndpointCase(SynchronousTestCase):
         self.equip(self.b)
 
     def equip(self, endpoint: Endpoint) -> None:
-        """Give an endpoint the methods."""
+        """Register the methods."""
         endpoint.expose("echo", lambda peer, value: value, early=True)
         endpoint.expose("add", self.add, changes=True)
         endpoint.expose("refuse", self.refuse)
         endpoint.expose("whole", self.whole)
 
     def add(self, peer: Contact, value: int) -> int:
-        """Count a run."""
+        """Record the call."""
         self.runs.append(value)
         return value
 
     def refuse(self, peer: Contact) -> None:
-        """Say no."""
+        """Reject the call."""
         raise Refused("not today")
 
     def whole(self, peer: Contact, number: int, name: str | None = None) -> list[object]:
@@ -93,7 +93,7 @@ class EndpointCase(SynchronousTestCase):
     def endpoint(
         self, seed: int, team: bytes = TEAM, port: int = 0, identity: int | None = None
     ) -> tuple[Endpoint, Contact]:
-        """A started endpoint and its contact."""
+        """Return a started endpoint and its contact."""
         own = Identity(bytes([identity or seed]) * 32)
         tap = Tap(self.board.network("127.0.0.1", port))
         endpoint = Endpoint(own, team, tap, self.clock, random.Random(seed))
@@ -102,25 +102,25 @@ class EndpointCase(SynchronousTestCase):
         return endpoint, Contact(own.public, tap.address)
 
     def got(self, deferred: Deferred[Any], seconds: float = 3.0) -> Any:
-        """The result of a Deferred after some time."""
+        """Return the result of a Deferred after some time."""
         self.clock.advance(seconds)
         return self.successResultOf(deferred)
 
     def failed(self, deferred: Deferred[Any], kind: type[Exception], seconds: float = 3.0) -> str:
-        """The text of the error that a Deferred fails with after some time."""
+        """Return the error message of a Deferred after some time."""
         self.clock.advance(seconds)
         return str(self.failureResultOf(deferred, kind).value)
 
     def kept(self, contact: Contact, kind: int) -> list[tuple[bytes, Address]]:
-        """The datagrams of one kind that a node received."""
+        """Return the datagrams of one kind that a node received."""
         return [item for item in self.taps[contact.address].kept if item[0][0] == kind]
 
 
 class AskTests(EndpointCase):
-    """Questions and answers."""
+    """Requests and replies."""
 
     def test_change_waits_for_the_session(self) -> None:
-        """A changing question takes two round trips at first, then one; no INIT runs it, whatever the asker says."""
+        """A changing request takes two round trips for the first time, then one; it never runs from an INIT."""
         self.assertEqual(self.got(self.a.ask(self.to_b, "add", 1, changes=True), 4 * DELAY), 1)
         self.assertEqual(self.got(self.a.ask(self.to_b, "add", 2, changes=True), 2 * DELAY), 2)
         self.assertEqual(self.board.counters["sent"], 6)
@@ -131,14 +131,14 @@ class AskTests(EndpointCase):
         self.assertEqual((self.got(asked), self.runs), (5, [1, 2, 5]))
 
     def test_long_questions(self) -> None:
-        """A question too long for an INIT waits for the session; what cannot be sent at all fails at once."""
+        """A request too long for an INIT waits for the session; one that cannot be encoded fails at once."""
         self.assertEqual(len(self.got(self.a.ask(self.to_b, "echo", bytes(1330)))), 1330)
 
         self.failureResultOf(self.a.ask(self.to_b, "echo", object()), TypeError)
         self.assertRaises(TooLarge, self.a.tell, self.to_b, "echo", bytes(MAX_PLAIN))
 
     def test_refusals(self) -> None:
-        """A lawful no, an unknown method, misfitting arguments and a too long answer each reach the asker in words."""
+        """A rejection, an unknown method, invalid arguments and an oversized result give an error message."""
         self.b.expose("fill", lambda peer, count: bytes(count))
         ask = self.a.ask
         self.assertEqual(self.failed(ask(self.to_b, "refuse"), Refused), "not today")
@@ -151,7 +151,7 @@ class AskTests(EndpointCase):
         self.assertEqual(self.got(ask(self.to_b, "whole", 1, None)), [1, None])
 
     def test_foreign_exceptions_stay_inside(self) -> None:
-        """An exception of a method, and a result that cannot be sent, are logged; the asker learns no detail."""
+        """An exception in a method and a result that cannot be encoded are logged; the caller gets no details."""
         self.b.expose("crash", lambda peer: 1 // 0)
         self.b.expose("odd", lambda peer: object())
         for name in ("crash", "odd"):
@@ -159,7 +159,7 @@ class AskTests(EndpointCase):
         self.assertEqual(len(self.flushLoggedErrors(ZeroDivisionError)), 1)
 
     def test_slow_methods(self) -> None:
-        """Deferreds and coroutines answer when they are done, run once, and outlast the time-out of a single try."""
+        """Asynchronous methods reply when they are done, run once, and may take longer than one retransmission."""
         waiting: list[Deferred[int]] = []
 
         async def slow(peer: Contact) -> int:
@@ -179,7 +179,7 @@ class AskTests(EndpointCase):
             self.assertEqual(self.got(asked, 0.1), 42)
 
     def test_no_answer(self) -> None:
-        """Nobody there: the question fails in 1.5 s after four tries; a peer that was known to be near fails sooner."""
+        """Without a reply a request fails in 1.5 s after four tries, and sooner for a peer known to be near."""
         asked = self.a.ask(Contact(self.to_b.public, Address("127.0.0.1", 9)), "echo", 1)
         self.clock.advance(1.4)
         self.assertNoResult(asked)
@@ -197,7 +197,7 @@ class AskTests(EndpointCase):
         self.assertEqual(self.clock.getDelayedCalls(), [])
 
     def test_cancelled_question_is_forgotten(self) -> None:
-        """A cancelled question leaves no timer, and its late answer is only counted."""
+        """A cancelled request leaves no timer, and its late reply is only counted."""
         self.got(self.a.ask(self.to_b, "echo", 1))
         asked = self.a.ask(self.to_b, "echo", 2)
         asked.cancel()
@@ -205,7 +205,7 @@ class AskTests(EndpointCase):
         self.assertEqual(self.a.counters["unasked"], 1)
 
     def test_both_open_at_once(self) -> None:
-        """When both open a session in the same moment both get their answers, then and later."""
+        """If both endpoints start a handshake at the same time, both get their replies, then and later."""
         self.equip(self.a)
         both = [self.a.ask(self.to_b, "add", 1, changes=True), self.b.ask(self.to_a, "add", 2, changes=True)]
         self.clock.advance(1)
@@ -215,7 +215,7 @@ class AskTests(EndpointCase):
         self.assertEqual([self.successResultOf(one) for one in both], [3, 4])
 
     def test_contacts_are_reported_when_proved(self) -> None:
-        """The asker reports the answerer when it answers, the answerer the asker when its session is confirmed."""
+        """The caller reports its peer with the reply, the callee reports its peer with the confirmed session."""
         seen: list[tuple[float, str, Contact]] = []
         self.a.on_contact.add(lambda contact: seen.append((self.clock.seconds(), "a", contact)))
         self.b.on_contact.add(lambda contact: seen.append((self.clock.seconds(), "b", contact)))
@@ -225,10 +225,10 @@ class AskTests(EndpointCase):
 
 
 class TellTests(EndpointCase):
-    """Messages without answer, greetings, starting and stopping."""
+    """One-way messages, key requests, start and stop."""
 
     def test_tells_open_a_session_and_arrive_once(self) -> None:
-        """What is told before there is a session arrives after the handshake, in order and once each."""
+        """One-way messages sent before the session arrive in order after the handshake, each once."""
         self.board.weather = Weather(DELAY, duplicate=1.0)
         for number in range(5):
             self.a.tell(self.to_b, "add", number)
@@ -241,7 +241,7 @@ class TellTests(EndpointCase):
         self.assertEqual((self.b.counters["unknown method"], self.b.counters["refused"]), (1, 1))
 
     def test_tells_that_cannot_arrive_are_counted(self) -> None:
-        """What is told to nobody is dropped and counted, and the queue is bounded."""
+        """One-way messages to an unreachable peer are dropped and counted, and their queue is bounded."""
         for number in range(100):
             self.a.tell(Contact(self.to_b.public, Address("127.0.0.1", 9)), "add", number)
         self.clock.advance(5)
@@ -249,7 +249,7 @@ class TellTests(EndpointCase):
         self.assertEqual(self.clock.getDelayedCalls(), [])
 
     def test_greeting(self) -> None:
-        """A greeting learns the key at an address, under loss too, with an answer no larger than the question."""
+        """``greet`` learns the key at an address, also under loss; the reply is no larger than the request."""
         self.board.weather = Weather(DELAY, loss=0.3)
         self.assertEqual(self.got(self.a.greet(self.to_b.address)), self.to_b)
         sizes = {len(datagram) for tap in self.taps.values() for datagram, _ in tap.kept}
@@ -257,7 +257,7 @@ class TellTests(EndpointCase):
         self.failed(self.a.greet(Address("127.0.0.1", 9)), NoAnswer)
 
     def test_stopped_endpoint_fails_everything(self) -> None:
-        """Stopping fails what is pending, leaves no timer, and later calls fail; it may be started again."""
+        """A stop fails pending and later calls and leaves no timer; the endpoint can start again."""
         pending = [self.a.ask(self.to_b, "echo", 1), self.a.greet(Address("127.0.0.1", 9))]
         self.a.stop()
         self.a.stop()
@@ -265,16 +265,16 @@ class TellTests(EndpointCase):
         for one in pending:
             self.failureResultOf(one, NotRunning)
         self.assertRaises(NotRunning, self.a.tell, self.to_b, "echo", 1)
-        self.assertEqual([call.getTime() for call in self.clock.getDelayedCalls()], [DELAY, DELAY])  # on the wire
+        self.assertEqual([call.getTime() for call in self.clock.getDelayedCalls()], [DELAY, DELAY])  # in transit
         self.a.start()
         self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 2)), 2)
 
 
 class WeatherTests(EndpointCase):
-    """Loss, duplication, restart, moving."""
+    """Loss, duplication, restarts and address changes."""
 
     def test_restarted_peer_answers_again(self) -> None:
-        """A peer that lost its sessions, or came back elsewhere, answers the next question within half a second."""
+        """A peer that lost its sessions or changed its address answers the next request within half a second."""
         self.got(self.a.ask(self.to_b, "echo", 1))
         for seed, name, port in (
             (3, "echo", self.to_b.address.port),
@@ -288,13 +288,13 @@ class WeatherTests(EndpointCase):
         self.board.kill(self.to_b.address)
         self.b, self.to_b = self.endpoint(6, port=self.to_b.address.port, identity=2)
         self.equip(self.b)
-        for number in range(10):  # whoever only tells notices it, too
+        for number in range(10):  # one-way messages reveal a restart, too
             self.a.tell(self.to_b, "add", 10 + number)
             self.clock.advance(1)
         self.assertIn(19, self.runs)
 
     def test_address_follows_the_key(self) -> None:
-        """Answers go where a peer's newest datagram came from, and a replay from elsewhere moves nothing."""
+        """Replies go to the source of a peer's newest datagram; a replayed datagram does not change the address."""
         self.got(self.a.ask(self.to_b, "echo", 1))
         old = self.taps[self.to_a.address]
         moved = self.board.network("127.0.0.1", 40000)
@@ -310,7 +310,7 @@ class WeatherTests(EndpointCase):
         self.assertEqual(seen, [Contact(self.to_a.public, Address("127.0.0.1", 40000))])
 
     def test_nobody_is_asked_on_a_session_that_may_be_gone(self) -> None:
-        """In a wide network a question after a long silence takes one round trip, though the other side let go."""
+        """In a wide network a request after a long silence takes one round trip, even if the peer's session ended."""
         self.a.peers.is_wide = self.b.peers.is_wide = True
         self.got(self.a.ask(self.to_b, "echo", 1))
         self.clock.advance(IN_TOUCH - 3.5)
@@ -323,7 +323,7 @@ class WeatherTests(EndpointCase):
         self.assertTrue(self.a.is_met(self.to_b))
 
     def test_keys_of_an_idle_session_are_forgotten(self) -> None:
-        """Nothing is sent for an idle session; at its end both sides forget its keys, and a question opens another."""
+        """An idle session sends nothing; at its end both sides delete its keys, and a request opens a new session."""
         self.got(self.a.ask(self.to_b, "echo", 1))
         sent = self.board.counters["sent"]
         self.clock.advance(SESSION_END_S - 4.0)
@@ -337,7 +337,7 @@ class WeatherTests(EndpointCase):
         self.assertEqual(len(self.kept(self.to_b, INIT)), 2)
 
     def test_used_session_is_renewed(self) -> None:
-        """A session in use is succeeded every 120 s by one handshake; each answer still takes one round trip."""
+        """A used session is renewed every 120 s by one handshake, and each reply still takes one round trip."""
         for seconds in range(600):
             asker, to = (self.a, self.to_b) if seconds % 2 else (self.b, self.to_a)
             asker.tell(to, "echo", seconds)
@@ -353,7 +353,7 @@ class WeatherTests(EndpointCase):
         self.assertIn(sum(inits), (5, 6, 7))
 
     def test_session_that_cannot_be_renewed_is_dropped(self) -> None:
-        """Where the peer is silent nothing is sent any more under keys that came to their end, by age or by use."""
+        """Without a reply from the peer nothing is sent under keys that expired by age or by use."""
         for tells, seconds in ((200, 1.0), (30, 0.0)):
             self.got(self.a.ask(self.to_b, "echo", 1))
             self.board.cut(self.to_a.address, self.to_b.address)
@@ -366,7 +366,7 @@ class WeatherTests(EndpointCase):
             self.clock.advance(10.0)
 
     def test_worn_session_is_renewed(self) -> None:
-        """After its number of datagrams a session gets a successor, and after twice as many nothing is sent on it."""
+        """A session is renewed after its limit of datagrams, and is not used after twice the limit."""
         self.patch(peer, "SESSION_DATAGRAMS", 20)
         worn = 0
         for number in range(100):
@@ -379,17 +379,17 @@ class WeatherTests(EndpointCase):
 
 
 class AttackTests(EndpointCase):
-    """Datagrams that must change nothing."""
+    """Datagrams that must have no effect."""
 
     def send_raw(self, datagram: bytes, source: Address = Address("127.0.0.1", 666)) -> int:  # noqa: B008
-        """Hand a datagram to ``b``; how many datagrams ``b`` sent because of it."""
+        """Deliver a datagram to ``b`` and return the number of datagrams that ``b`` sends in response."""
         before = self.board.counters["sent"]
         self.taps[self.to_b.address].receiver(datagram, source)
         self.clock.advance(2 * DELAY)
         return self.board.counters["sent"] - before
 
     def test_response_counts_only_from_where_it_was_asked(self) -> None:
-        """A RESP that comes from another address, or twice, opens nothing."""
+        """A RESP from another address, or a repeated one, opens no session."""
         asked = self.a.ask(self.to_b, "echo", 1)
         self.clock.advance(1.5 * DELAY)
         tap = self.taps[self.to_a.address]
@@ -410,7 +410,7 @@ class AttackTests(EndpointCase):
         self.assertEqual(counted, [1, 1, 1, 1])
 
     def test_malformed_messages_of_members(self) -> None:
-        """A member that seals rubbish, in a handshake or a session, is counted; the session goes on."""
+        """Invalid messages from a member are counted, and the session stays open."""
         self.got(self.a.ask(self.to_b, "echo", 1))
         session = next(iter(self.a._sessions.values()))
         for rubbish in (b"\xc1", b"\x93\x01", b"\x90", self.rng.randbytes(300)):
@@ -421,7 +421,7 @@ class AttackTests(EndpointCase):
         self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 2)), 2)
 
     def test_key_of_another_is_not_believed(self) -> None:
-        """A member that names another one's public key in its INIT gets no answer and makes no session."""
+        """An INIT with the public key of another member gets no reply and creates no session."""
         thief = replace(self.a._credentials, public=Identity(b"v" * 32).public)
         for own in (thief, replace(self.a._credentials, public=b"\xff" * 32)):
             invitation = Invitation(own, exchange_key(self.to_b.public), self.rng.randbytes(32), 5, b"")
@@ -429,7 +429,7 @@ class AttackTests(EndpointCase):
         self.assertEqual((self.b.counters, self.b._sessions), ({"forged": 2}, {}))
 
     def test_peers_stay_bounded(self) -> None:
-        """Beyond the bounded number of peers the longest idle one goes with its sessions, and may come back."""
+        """The number of peers is bounded; the longest idle one is removed with its sessions and may return."""
         self.patch(peer, "MAX_PEERS", 5)
         contacts = []
         for seed in range(20, 30):
@@ -441,7 +441,7 @@ class AttackTests(EndpointCase):
         self.assertEqual(self.got(self.a.ask(contacts[0], "echo", 1)), 1)
 
     def test_answers_under_way_stay_bounded(self) -> None:
-        """A peer that opens more long questions than it may is refused by name, and nothing runs for it."""
+        """Long requests of a peer beyond the limit are rejected and do not run."""
         self.patch(method, "MAX_PER_PEER", 3)
         self.got(self.a.ask(self.to_b, "echo", 1))
         asked = [self.a.ask(self.to_b, "add", number, changes=True) for number in range(5)]

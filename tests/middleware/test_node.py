@@ -1,4 +1,4 @@
-"""Tests of the library's node: a fleet of them on simulated time and a switchboard."""
+"""Tests of ``EntangledNode``: a simulated team in virtual time on a switchboard."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ ROUGH = Weather(delay_s=0.01, jitter_s=0.01, loss=0.3, duplicate=0.05, reorder=0
 
 
 class NodeCase(FleetCase):
-    """A few words for what most tests do."""
+    """Helpers of these tests."""
 
     def values(self, fleet: Fleet, place: int, key: bytes = KEY, within: float = 3.0) -> list[bytes | None]:
         return [record.value for record in self.done(fleet, fleet.nodes[place].get(key), within)]
 
     def watched(self, node: EntangledNode, **options: Any) -> list[list[bytes | None]]:
-        """All that a watch tells, from now on."""
+        """Return the list that receives all notifications of a watch."""
         told: list[list[bytes | None]] = []
         node.watch(KEY, lambda records: told.append([r.value for r in records]), **options)
         return told
@@ -36,7 +36,7 @@ class NodeCase(FleetCase):
 
 class VerbTests(NodeCase):
     def test_put_replace_and_remove(self) -> None:
-        """What nodes put under one key, each in its slot, all find, as it was put last; what is removed stays gone."""
+        """All nodes find the last value in each slot of a key; a removed record stays removed."""
         fleet = self.fleet(4)
         self.assertGreaterEqual(self.done(fleet, fleet.nodes[1].put(KEY, "state", b"one")), 3)
         for node in fleet.nodes[:2]:
@@ -51,7 +51,7 @@ class VerbTests(NodeCase):
         self.assertEqual(set(self.values(fleet, 2)), {b"two", b"three"})
 
     def test_a_node_alone(self) -> None:
-        """A node alone keeps, finds and watches its own records, leases included."""
+        """A single node stores, finds and watches its records, including leased ones."""
         fleet = self.fleet(1)
         told = self.watched(fleet.nodes[0])
         self.assertEqual(self.done(fleet, fleet.nodes[0].put(KEY, "state", b"one", "leased")), 1)
@@ -59,7 +59,7 @@ class VerbTests(NodeCase):
         self.assertEqual(told, [[b"one"]])
 
     def test_wrong_calls_fly(self) -> None:
-        """What cannot be stored raises at once, and nothing can be asked of a node that does not run."""
+        """An invalid record raises at once, and a stopped node raises ``NotRunning``."""
         fleet = self.fleet(1)
         node = fleet.nodes[0]
         self.assertRaises(TooLarge, node.put, KEY, "state", bytes(MAX_VALUE + 1))
@@ -74,7 +74,7 @@ class VerbTests(NodeCase):
             self.assertRaises(NotRunning, call)
 
     def test_the_largest_record(self) -> None:
-        """The largest value under the longest name travels, several of them page by page, with many small ones."""
+        """Records of maximum size with the longest names are read in pages, together with many small ones."""
         fleet = self.fleet(2)
         for place in range(12):
             name = f"{place:02}" + "ä" * (MAX_NAME // 2 - 1)
@@ -83,7 +83,7 @@ class VerbTests(NodeCase):
         self.assertEqual(len(self.values(fleet, 1)), 12)
 
     def test_earlier_life_is_stepped_over(self) -> None:
-        """A node that lost its store writes over what its former life has left, even by the same number."""
+        """A node that lost its store overwrites the records of its former run, even at the same sequence number."""
         for writes in (1, 3):
             fleet = self.fleet(3, seed=writes)
             for number in range(writes):
@@ -101,7 +101,7 @@ class VerbTests(NodeCase):
 
 class LeaseTests(NodeCase):
     def test_vanish_with_the_owner(self) -> None:
-        """What a node owns on lease stays while it lives, and is gone within one lease and a sweep of its death."""
+        """A leased record exists while its owner lives, and expires within one lease and a sweep after its failure."""
         fleet = self.fleet(4)
         fleet.nodes[3].put(KEY, "state", b"here", "leased")
         fleet.run(30.0)
@@ -116,7 +116,7 @@ class LeaseTests(NodeCase):
         self.assertEqual(self.values(fleet, 0), [])
 
     def test_two_die_at_once(self) -> None:
-        """A dead replica does not keep the lease of one that died with it."""
+        """A failed replica does not keep the leased record of an owner that failed at the same time."""
         fleet = self.fleet(4)
         for node in fleet.nodes[2:]:
             node.put(KEY, "state", b"here", "leased")
@@ -128,7 +128,7 @@ class LeaseTests(NodeCase):
         self.assertEqual(told[-1], [])
 
     def test_goodbye(self) -> None:
-        """What a node leased leaves with it at once when it says goodbye, and comes back with it."""
+        """A goodbye removes the leased records of a node at once; the node can store them again later."""
         fleet = self.fleet(3)
         fleet.nodes[2].put(KEY, "state", b"here", "leased")
         told = self.watched(fleet.nodes[0])
@@ -141,7 +141,7 @@ class LeaseTests(NodeCase):
         self.assertEqual(told[-1], [b"back"])
 
     def test_lost_replica_is_mended(self) -> None:
-        """A replica that lost a lease gets it again within a few beats."""
+        """A replica that lost a leased record receives it again within a few renewals."""
         fleet = self.fleet(3)
         fleet.nodes[2].put(KEY, "state", b"here", "leased")
         fleet.run(1.0)
@@ -150,7 +150,7 @@ class LeaseTests(NodeCase):
         self.assertEqual([r.value for r in fleet.stores[0].get(KEY)], [b"here"])
 
     def test_replica_lets_go_of_what_it_holds_in_vain(self) -> None:
-        """An old lease that a replica still has, and that its owner does not know any more, goes in a few beats."""
+        """A replica removes a leased record that its owner no longer knows within a few renewals."""
         fleet = self.fleet(3)
         old = Record(KEY, "old", fleet.nodes[2].identity.public, 1, "leased", 1.0, b"old").signed(fleet.identity(2))
         fleet.nodes[2].put(KEY, "state", b"here", "leased")
@@ -159,7 +159,7 @@ class LeaseTests(NodeCase):
         self.assertEqual([r.value for r in fleet.stores[0].get(KEY)], [b"here"])
 
     def test_short_silence_ends_no_lease(self) -> None:
-        """A cut of half a lease costs nobody its place; a long one does, and after it all is back."""
+        """A partition of half a lease removes no leased record; a longer one does, and they return after it."""
         fleet = self.fleet(3)
         fleet.nodes[2].put(KEY, "state", b"here", "leased")
         told = self.watched(fleet.nodes[0])
@@ -175,7 +175,7 @@ class LeaseTests(NodeCase):
 
 class TeamRecordTests(NodeCase):
     def test_pass_from_hand_to_hand(self) -> None:
-        """A record and a tombstone outlive every node that held them at first, one leaving after the other."""
+        """A record and a tombstone outlive all their first replicas, which leave one after the other."""
         fleet = self.fleet(3)
         self.done(fleet, fleet.nodes[0].put(KEY, "task", b"do it"))
         self.done(fleet, fleet.nodes[0].put(KEY, "gone", b"no"))
@@ -185,14 +185,14 @@ class TeamRecordTests(NodeCase):
             fleet.enter(fleet.nodes[-1], [fleet.address(place)])
             fleet.run(2.0)
             fleet.nodes[place].vanish()
-            fleet.run(40.0)  # until the others have struck it
+            fleet.run(40.0)  # until the other nodes remove it from the roster
         self.assertEqual(self.values(fleet, 5), [b"do it"])
         self.assertEqual(len(fleet.stores[5].get(KEY, tombstones=True)), 2)
 
 
 class WatchTests(NodeCase):
     def test_changes_are_pushed(self) -> None:
-        """A watcher hears each change at once, without asking again."""
+        """A watcher receives each change at once, without another request."""
         fleet = self.fleet(3)
         told = self.watched(fleet.nodes[2])
         fleet.run(0.5)
@@ -204,7 +204,7 @@ class WatchTests(NodeCase):
         self.assertEqual(told, [[b"one"], [b"two"], []])
 
     def test_end_of_the_node_is_no_news(self) -> None:
-        """A node that stops does not tell its own subscribers that everybody has left."""
+        """A node that stops does not notify its subscribers of removed records."""
         fleet = self.fleet(3)
         told = self.watched(fleet.nodes[2])
         fleet.nodes[0].put(KEY, "state", b"one", "leased")
@@ -214,7 +214,7 @@ class WatchTests(NodeCase):
         self.assertEqual(told, [[b"one"]])
 
     def test_failing_subscriber(self) -> None:
-        """A subscriber that fails is logged, and the others are told."""
+        """An exception in a subscriber is logged, and the other subscribers are notified."""
         fleet = self.fleet(2)
         fleet.nodes[1].watch(KEY, lambda records: [][0])
         told = self.watched(fleet.nodes[1])
@@ -224,7 +224,7 @@ class WatchTests(NodeCase):
         self.assertEqual(len(self.flushLoggedErrors(IndexError)), 1)
 
     def test_push_by_a_stranger(self) -> None:
-        """Only replicas that were asked are believed, and nothing malformed that they push changes anything."""
+        """Pushes from replicas without a subscription and invalid pushes are ignored."""
         fleet = self.fleet(3)
         told = self.watched(fleet.nodes[2])
         fleet.run(0.5)
@@ -243,10 +243,10 @@ class WatchTests(NodeCase):
         self.assertEqual(told, [])
 
     def test_rough_weather(self) -> None:
-        """With three of ten datagrams lost, each value arrives everywhere and the living stay in sight.
+        """At 30 % loss each value arrives at all nodes, and leased records of live nodes stay visible.
 
-        Their leases are of 1 s and told three times in that, which one of them in some hundred does not outlive: it is
-        seen again within 2 s.
+        The leases are 1 s and renewed three times in this time; about one in some hundred still expires, and is visible
+        again within 2 s.
         """
         for seed in range(3):
             fleet = self.fleet(4, seed, ROUGH)
@@ -277,7 +277,7 @@ class WatchTests(NodeCase):
 
 class RpcTests(NodeCase):
     def test_decorated_function_is_called(self) -> None:
-        """A decorated function answers the calls of peers, with its arguments checked and its refusals by name."""
+        """A decorated function answers calls; its arguments are checked, and its rejections carry a code."""
         fleet = self.fleet(2)
         server, client = fleet.nodes
         counted: list[int] = []
@@ -316,7 +316,7 @@ class KeepTests(NodeCase):
         self.page, self.dog = self.order[-1], self.order[-2]
 
     def test_copies_follow_what_is_seen(self) -> None:
-        """A node that does not hold a key has its records in its store while it watches with ``keep``."""
+        """A node outside the holders of a key has its records in its store while it watches with ``keep``."""
         store = self.page.store
         self.dog.put(KEY, "state", b"here", "leased")
         self.world.run(1.0)
@@ -337,7 +337,7 @@ class KeepTests(NodeCase):
         self.assertEqual(store.get(KEY), [])
 
     def test_copies_are_nobodys_opinion(self) -> None:
-        """Nobody is answered from a copy, and none survives its node."""
+        """Watched copies are not returned to other nodes and are removed when the node stops."""
         self.dog.put(KEY, "state", b"here", "leased")
         self.page.watch(KEY, lambda records: None, keep=True)
         self.world.run(3.0)
@@ -348,7 +348,7 @@ class KeepTests(NodeCase):
         self.assertEqual(self.page.store.get(KEY), [])
 
     def test_copy_that_comes_to_be_held(self) -> None:
-        """A copy whose record is then stored here for good is held as any other: its lease can run out."""
+        """A watched copy that is then stored as a replica is treated like any other record, and its lease can end."""
         self.dog.put(KEY, "state", b"here", "leased")
         self.page.watch(KEY, lambda records: None, keep=True)
         self.world.run(3.0)
@@ -362,7 +362,7 @@ class KeepTests(NodeCase):
 
 class LargeFleetTests(NodeCase):
     def test_more_nodes_than_replicas(self) -> None:
-        """Among 20 nodes each value is found by all, leases outlive minutes and end with their owners."""
+        """In a team of 20 all nodes find each value, and leased records expire only with their owners."""
         fleet = self.fleet(20, seed=3, weather=Weather(delay_s=0.002))
         for place in (0, 7, 13, 19):
             fleet.nodes[place].put(KEY, "state", bytes([place]), "leased")
@@ -381,7 +381,7 @@ class LargeFleetTests(NodeCase):
                 self.assertEqual(self.values(fleet, place, hashed_key("task 13")), [b"do it"])
 
     def test_no_chatter_about_leases(self) -> None:
-        """Once everything is where it belongs, no replica complains of missing leases any more."""
+        """When all records are at their holders, no replica reports missing leases."""
         fleet = self.fleet(14, seed=5)
         complaints: list[str] = []
         for node in fleet.nodes:
@@ -394,7 +394,7 @@ class LargeFleetTests(NodeCase):
         self.assertEqual(complaints, [])
 
     def test_the_next_in_line_inherits(self) -> None:
-        """When a holder leaves, the node that takes its place among the closest has the record at once."""
+        """When a holder leaves, the next closest node receives its records at once."""
         fleet = self.fleet(14, seed=7)
         self.done(fleet, fleet.nodes[13].put(KEY, "task", b"do it"))
         fleet.nodes[13].vanish()
@@ -407,7 +407,7 @@ class LargeFleetTests(NodeCase):
         self.assertEqual([r.value for r in heir.store.get(KEY)], [b"do it"])
 
     def test_former_replicas_do_not_count(self) -> None:
-        """When newcomers take over a key, what its former holders said is forgotten by those who watch it."""
+        """When new nodes take over a key, watchers discard the reports of its former holders."""
         fleet = self.fleet(10, seed=8)
         self.done(fleet, fleet.nodes[0].put(KEY, "task", b"do it"))
         told = self.watched(fleet.nodes[0])
@@ -423,7 +423,7 @@ class LargeFleetTests(NodeCase):
 
 class JoinTests(NodeCase):
     def test_bootstrap_comes_later(self) -> None:
-        """A node tries again until the one it knows is there."""
+        """A node retries to join until its bootstrap node is available."""
         fleet = self.fleet(1)
         fleet.nodes[0].vanish()
         node = fleet.made(1)
@@ -437,14 +437,14 @@ class JoinTests(NodeCase):
         self.assertEqual(len(fleet.nodes[0].overlay.table), 1)
 
     def test_known_to_oneself_only(self) -> None:
-        """A bootstrap node that is told to join through itself is the first node of its network."""
+        """A bootstrap node with its own address as the known node is the first node of its network."""
         fleet = self.fleet(1)
         node = fleet.made(1)
         fleet.nodes.append(node)
         self.done(fleet, fleet.enter(node, [fleet.address(1)]))
 
     def test_stopped_while_joining(self) -> None:
-        """A node that is stopped while nobody answers leaves nothing behind."""
+        """A node that stops while it joins leaves no state."""
         for seconds in (0.1, 3.0):
             fleet = self.fleet(1)
             node = fleet.made(1)
@@ -456,7 +456,7 @@ class JoinTests(NodeCase):
             self.failureResultOf(joined, NotRunning)
 
     def test_rejoin_through_remembered_contacts(self) -> None:
-        """A restarted node finds the team by those it remembers, though the node that it is told to join by is dead."""
+        """A restarted node rejoins through stored contacts if its bootstrap node is dead."""
         fleet = self.fleet(4)
         fleet.run(31.0)
         fleet.nodes[3].vanish()
@@ -469,7 +469,7 @@ class JoinTests(NodeCase):
         )
 
     def test_first_node_does_not_wait_for_the_dead(self) -> None:
-        """A bootstrap that remembers only dead contacts goes on without them; with living ones it joins them."""
+        """A bootstrap node with only dead stored contacts starts without them."""
         fleet = self.fleet(2)
         fleet.nodes[0].stop()
         fleet.nodes[1].vanish()
@@ -477,7 +477,7 @@ class JoinTests(NodeCase):
         self.done(fleet, fleet.enter(fleet.nodes[0], []), 4.0)
 
     def test_rotten_memory(self) -> None:
-        """Whatever the store remembers as contacts, the node starts."""
+        """A node starts with any stored contacts, including invalid ones."""
         for rotten in (b"", b"\xc1", msgpack.packb(5), msgpack.packb([5, [b"x", "y", 1]]), b"\x91" * 2000):
             fleet = self.fleet(1)
             fleet.nodes[0].stop()
@@ -491,7 +491,7 @@ class WireTests(NodeCase):
     METHODS = ("store", "find_value", "watch", "alive", "let_go", "goodbye!", "push", "missing", "find_node", "ping")
 
     def test_malformed_questions_change_nothing(self) -> None:
-        """A member of the team that sends nonsense to every method gets a no, and nothing is logged or changed."""
+        """Invalid arguments to any method are rejected, without a log entry or a change."""
         fleet = self.fleet(3)
         self.done(fleet, fleet.nodes[0].put(KEY, "state", b"one"))
         rng = random.Random(5)
@@ -510,7 +510,7 @@ class WireTests(NodeCase):
         self.assertEqual([store.records() for store in fleet.stores.values()], before)
 
     def test_half_a_message_is_none(self) -> None:
-        """Where one of several records is malformed, none of them is stored."""
+        """If one of several records is invalid, none of them is stored."""
         fleet = self.fleet(2)
         owner = fleet.nodes[1].identity
         genuine = Record(KEY, "y", owner.public, 9, "team", 60.0, b"y").signed(owner)
@@ -520,7 +520,7 @@ class WireTests(NodeCase):
         self.assertEqual(fleet.stores[0].get(KEY), [])
 
     def test_lying_replica(self) -> None:
-        """A replica that answers nonsense to everything costs its own opinion and no more."""
+        """A replica with invalid replies does not affect the results of the others."""
         fleet = self.fleet(4)
         answers: list[Any] = [None, 5, [], [[]], [[], []], [[5], None], [2**63 - 1], [True], [[None] * 3, [b"", ""]]]
         for answer in answers:

@@ -1,4 +1,4 @@
-"""Tests of ``middleware.entangled.network.tunnel``, ``link``, ``layer``, ``joint`` and ``pipes``, on a turned clock."""
+"""Tests of ``middleware.entangled.network.tunnel``, ``link``, ``layer``, ``joint`` and ``pipes``, in virtual time."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ GREETING = (
 
 
 class Dribbler(Protocol):
-    """Says what it was told to, and never goes on."""
+    """A peer that sends fixed bytes and then nothing."""
 
     def __init__(self, words: bytes = b"") -> None:
         self.words = words
@@ -51,21 +51,21 @@ class Dribbler(Protocol):
         self.is_lost = False
 
     def connectionMade(self) -> None:
-        """Say it."""
+        """Send the bytes."""
         transport: Any = self.transport
         transport.write(self.words)
 
     def dataReceived(self, data: bytes) -> None:
-        """Keep it."""
+        """Store the received bytes."""
         self.heard += data
 
     def connectionLost(self, reason: Any = None) -> None:
-        """Take note."""
+        """Record the loss of the connection."""
         self.is_lost = True
 
 
 class Relay(Protocol):
-    """An HTTP proxy that takes one CONNECT and hands on what comes after it."""
+    """An HTTP proxy that accepts one CONNECT request and forwards the bytes after it."""
 
     def __init__(self, pipes: Pipes, answer: bytes = b"HTTP/1.1 200 Connection established\r\n\r\n") -> None:
         self.pipes = pipes
@@ -74,7 +74,7 @@ class Relay(Protocol):
         self.far: Protocol | None = None
 
     def dataReceived(self, data: bytes) -> None:
-        """Take the request, then hand on."""
+        """Accept the request, then forward."""
         transport: Any = self.transport
         if self.far is not None:
             far: Any = self.far.transport
@@ -96,14 +96,14 @@ class TunnelCase(SynchronousTestCase):
         self.addCleanup(self.end)
 
     def end(self) -> None:
-        """Close all, and leave nothing on the clock."""
+        """Close all ends and check that no timer is left."""
         for end in self.ends:
             end.close()
         self.clock.advance(10.0)
         self.assertEqual(self.clock.getDelayedCalls(), [])
 
     def made(self, host: str = HOST, *urls: Url, port: int = 443, **options: Any) -> tuple[TunnelNetwork, Heard]:
-        """An end, served where it has no URL, and what it hears."""
+        """Create an end, which is a server if it has no URL, and the list of datagrams that it receives."""
         heard: Heard = []
         carrier = self.pipes.carrier(host, port)
         tunnel = TunnelNetwork(carrier, self.clock, random.Random(host), urls, not urls, **options)
@@ -112,7 +112,7 @@ class TunnelCase(SynchronousTestCase):
         return tunnel, heard
 
     def pair(self, url: Url = PLAIN) -> tuple[TunnelNetwork, Heard, TunnelNetwork, Heard]:
-        """Two ends with an open tunnel between them."""
+        """Return two ends with an open tunnel between them."""
         server, served = self.made(is_plain=not url.is_tls)
         client, came = self.made("10.0.0.2", url)
         client.send(b"hello", url.address)
@@ -126,7 +126,7 @@ class TunnelCase(SynchronousTestCase):
         return client, came, server, served
 
     def dribble(self, words: bytes = b"", host: str = "10.6.6.6") -> Dribbler:
-        """Somebody who dials, says that, and waits."""
+        """Connect a peer that sends these bytes and then nothing."""
         dribbler = Dribbler(words)
         self.pipes.carrier(host).dial(Address(HOST, 443), dribbler, lambda why: None)
         self.clock.advance(0.0)
@@ -136,7 +136,7 @@ class TunnelCase(SynchronousTestCase):
 
 class TunnelTests(TunnelCase):
     def test_carry_both_ways(self) -> None:
-        """A URL is dialled when something is sent to its address; that arrives, over TLS or plain; so do answers."""
+        """Sending to the address of a URL dials it; datagrams arrive in both directions, with and without TLS."""
         for url in (URL, PLAIN):
             dialled = len(self.pipes.dialled)
             client, came, server, served = self.pair(url)
@@ -156,7 +156,7 @@ class TunnelTests(TunnelCase):
             self.clock.advance(1.0)
 
     def test_unknown_addresses(self) -> None:
-        """What is sent to an address for which there is no tunnel is counted and lost."""
+        """A datagram to an address without a tunnel is counted and dropped."""
         client, _ = self.made("10.0.0.2", URL)
         for address in (Address("~wss-000000000000", 1), Address("10.0.0.1", 443), Address("~", 1)):
             client.send(b"x", address)
@@ -166,7 +166,7 @@ class TunnelTests(TunnelCase):
         self.assertEqual(client.counters["unsent"], 5)
 
     def test_back_off(self) -> None:
-        """A URL at which nobody is is dialled again when something is sent, less and less often."""
+        """An unreachable URL is dialled again for later datagrams, with increasing intervals."""
         client, _ = self.made("10.0.0.2", URL)
         moments = []
         for _ in range(1200):
@@ -182,7 +182,7 @@ class TunnelTests(TunnelCase):
         self.assertLess(len(moments), 15)
 
     def test_reconnect(self) -> None:
-        """A tunnel whose server was restarted is dialled again, and carries within a second."""
+        """After a restart of its server a tunnel is dialled again and carries datagrams within a second."""
         client, _, server, _ = self.pair(URL)
         self.clock.advance(11.0)
         server.close()
@@ -195,7 +195,7 @@ class TunnelTests(TunnelCase):
         self.assertIn(b"again", [datagram for datagram, _ in served])
 
     def test_let_go_unused(self) -> None:
-        """A tunnel that carried nothing for a minute is closed by who dialled it; one in use stays."""
+        """The client closes a tunnel without traffic for a minute, and keeps one in use."""
         client, _, server, served = self.pair()
         for _ in range(10):
             self.clock.advance(20.0)
@@ -208,7 +208,7 @@ class TunnelTests(TunnelCase):
         self.assertEqual(len(self.pipes.dialled), 1)
 
     def test_notice_half_open(self) -> None:
-        """An end that is cut off without a word is noticed: soon where something is sent to it, else by pings."""
+        """A half-open connection is detected: soon by an end that sends datagrams, otherwise by pings."""
         client, _, server, served = self.pair()
         self.clock.advance(1.0)
         self.pipes.cut(HOST)
@@ -221,7 +221,7 @@ class TunnelTests(TunnelCase):
         self.assertEqual(server.peers, [])
 
     def test_port_in_use(self) -> None:
-        """A port at which another listens is refused by name, and a joint network opens neither then."""
+        """A port in use raises ``PortInUse``, and a joint network then opens neither of its networks."""
         self.made()
         carrier = self.pipes.carrier(HOST, 443)
         other = TunnelNetwork(carrier, self.clock, random.Random(1), is_served=True)
@@ -231,7 +231,7 @@ class TunnelTests(TunnelCase):
         self.assertIsNone(udp.receiver)
 
     def test_through_a_proxy(self) -> None:
-        """Where there is an HTTP proxy the tunnel goes through it by CONNECT, with its login."""
+        """With an HTTP proxy the tunnel uses CONNECT and the login of the proxy."""
         _, served = self.made()
         relay = Relay(self.pipes)
         self.pipes.carrier("10.0.0.200", 3128).listen(lambda host: relay)
@@ -243,7 +243,7 @@ class TunnelTests(TunnelCase):
         self.assertIn(b"Proxy-Authorization: Basic bWU6c2VjcmV0\r\n", relay.asked)
 
     def test_proxy_says_no(self) -> None:
-        """A proxy that refuses, or is none, is a tunnel that cannot be, and the reason is kept."""
+        """A rejection by a proxy, or an invalid reply, sets a fault and does not open the tunnel."""
         for answer in (
             b"HTTP/1.1 407 Proxy Authentication Required\r\n\r\n",
             b"SSH-2.0-box\r\n\r\n",
@@ -258,10 +258,10 @@ class TunnelTests(TunnelCase):
 
 
 class BurdenTests(TunnelCase):
-    """What a tunnel bears: slow readers, dribblers, and those that are no members."""
+    """The load on a tunnel server by slow readers, incomplete handshakes and strangers."""
 
     def test_slow_reader(self) -> None:
-        """For who reads nothing at most 64 KiB wait, and the newest is dropped: later it gets the oldest, in order."""
+        """For a peer that does not read, at most 64 KiB are queued and the newest datagrams are dropped."""
         client, came, server, _ = self.pair()
         (address,) = server.peers
         reader = self.pipes.streams[0]
@@ -280,7 +280,7 @@ class BurdenTests(TunnelCase):
         self.assertTrue(20 < len(numbers) < 60, len(numbers))
 
     def test_deaf_talker(self) -> None:
-        """Who reads nothing, but goes on talking, is given up after half a minute."""
+        """A peer that sends but does not read is disconnected after half a minute."""
         server, served = self.made(is_plain=True)
         talker = self.dribble(GREETING % 1, "127.0.0.1")
         self.clock.advance(0.1)
@@ -297,7 +297,7 @@ class BurdenTests(TunnelCase):
         self.assertEqual(server.peers, [])
 
     def test_heartbeats_pass_bulk(self) -> None:
-        """On a link of 50 kB a second that is flooded with long datagrams short ones pass within half a second."""
+        """On a saturated link of 50 kB/s short datagrams overtake long ones and arrive within half a second."""
         client, came, server, served = self.pair()
         self.pipes.rate = 50_000.0
         late: list[float] = []
@@ -318,7 +318,7 @@ class BurdenTests(TunnelCase):
         self.assertGreater(client.counters["dropped"], 500)
 
     def test_garbage_is_let_go(self) -> None:
-        """Who speaks no TLS, or no WebSocket, is cut off at once; who never ends its greeting, in time."""
+        """A peer without TLS or WebSocket is disconnected at once; an incomplete handshake ends by a timeout."""
         server, _ = self.made()
         idle, half = self.dribble(), self.dribble(b"\x16\x03\x01")
         self.clock.advance(HEAD_S - 1.0)
@@ -338,7 +338,7 @@ class BurdenTests(TunnelCase):
         self.assertTrue(page.is_lost and page.heard.startswith(b"HTTP/1.1 400"))
 
     def test_bear_one_address(self) -> None:
-        """Of one address so many connections are borne and no more; others are served all the same."""
+        """The number of connections per address is bounded; other addresses are served."""
         server, _ = self.made()
         crowd = [self.dribble() for _ in range(100)]
         self.clock.advance(0.1)
@@ -349,7 +349,7 @@ class BurdenTests(TunnelCase):
         self.assertEqual(len(client.peers), 1)
 
     def test_bear_many_addresses(self) -> None:
-        """Of five hundred dribblers from as many addresses few are borne at a time; a member gets through meanwhile."""
+        """The number of incomplete handshakes is bounded for all addresses; a member still connects."""
         server, served = self.made()
         crowd = [self.dribble(host=f"10.7.{n // 250}.{n % 250}") for n in range(500)]
         self.assertEqual(sum(not one.is_lost for one in crowd), MAX_BEGUN)
@@ -362,7 +362,7 @@ class BurdenTests(TunnelCase):
         self.assertEqual(len(server._links), 1)
 
     def test_behind_a_reverse_proxy(self) -> None:
-        """Served plain, those that a proxy brings are counted by the address that it names."""
+        """Behind a reverse proxy connections are counted by the forwarded address."""
         server, _ = self.made(is_plain=True)
         one = [self.dribble(GREETING % 1, "127.0.0.1") for _ in range(40)]
         others = [self.dribble(GREETING % n, "127.0.0.1") for n in range(2, 12)]
@@ -371,7 +371,7 @@ class BurdenTests(TunnelCase):
         self.assertFalse(any(each.is_lost for each in others))
 
     def test_strangers_are_let_go(self) -> None:
-        """Who opens a tunnel and is never answered by the node, whatever it sends, is let go; an answered one stays."""
+        """A peer that the node never answers is disconnected; an answered one stays."""
         client, _, server, served = self.pair()
         stranger, _ = self.made("10.0.0.3", PLAIN)
         for second in range(int(UNANSWERED_S) + 2):
@@ -383,7 +383,7 @@ class BurdenTests(TunnelCase):
         self.assertEqual((len(client.peers), len(server.peers)), (1, 1))
 
     def test_full_house(self) -> None:
-        """When all places are taken, strangers make room for a newcomer, and members are never put out."""
+        """When all places are taken, a new connection replaces a stranger and never a member."""
         server, served = self.made(is_plain=True)
         members = []
         for n in range(MAX_LINKS - 1):
@@ -410,7 +410,7 @@ class BurdenTests(TunnelCase):
 
 class JointTests(TunnelCase):
     def test_pick_by_address(self) -> None:
-        """A tunnel's address is served by the tunnel, any other by UDP; both hand to one receiver."""
+        """A joint network sends to tunnel addresses by tunnel and to others by UDP, with one receiver for both."""
         board = Switchboard(self.clock, random.Random(1))
         server, served = self.made()
         plain = board.network("10.0.0.9", 7000)
@@ -429,7 +429,7 @@ class JointTests(TunnelCase):
         plain.send(b"back", joint.address)
         self.clock.advance(0.1)
         self.assertEqual(sorted(heard), [(b"back", plain.address), (b"back", URL.address)])
-        self.assertEqual(joint.counters["sent"], 1)  # the switchboard counts for all its ports together
+        self.assertEqual(joint.counters["sent"], 1)  # the switchboard has one counter for all its ports
         self.assertEqual(joint.counters["tunnel opened"], 1)
         joint.close()
         joint.close()
@@ -443,7 +443,7 @@ class CertificateTests(SynchronousTestCase):
         skip = "the certificate is not read by another library: no cryptography"
 
     def test_others_read_it(self) -> None:
-        """Another library reads key and certificate: they belong together, and the signature is right."""
+        """Another library reads the key and the certificate, which match, and verifies the signature."""
         from cryptography import x509
         from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat, load_pem_private_key
 
@@ -464,7 +464,7 @@ class TlsTests(SynchronousTestCase):
         self.server = Tls(server_context(PEM), is_server=True)
 
     def shake(self) -> None:
-        """Let both ends greet."""
+        """Complete the handshake."""
         said = self.client.opening()
         while not (self.client.is_open and self.server.is_open):
             _, answer = self.server.received(said)
@@ -473,7 +473,7 @@ class TlsTests(SynchronousTestCase):
         self.server.received(said)
 
     def test_carry(self) -> None:
-        """After the handshake bytes come out as they went in, cut anyhow, and cannot be read in between."""
+        """After the handshake bytes arrive unchanged in any segmentation, and are encrypted in transit."""
         self.shake()
         for source, sink in ((self.client, self.server), (self.server, self.client)):
             wrapped = source.wrapped(b"in the clear" * 3000)
@@ -482,7 +482,7 @@ class TlsTests(SynchronousTestCase):
             self.assertEqual(came, b"in the clear" * 3000)
 
     def test_fault(self) -> None:
-        """What is no TLS, and a record that was changed, end it with a reason; nothing is raised."""
+        """Input other than TLS, and a modified record, set a fault and raise no exception."""
         self.server.received(b"GET / HTTP/1.1\r\n\r\n")
         self.assertIn("TLS", self.server.fault)
         self.assertEqual(self.server.received(b"more")[0], b"")
