@@ -9,7 +9,7 @@ ROOM = 640
 
 
 class Gate(OpenDoor):
-    """Admit a peer if its certificate begins with ``pass`` and its key is not in ``refused``.
+    """Admit a peer if its pass begins with ``pass`` and its key is not in ``refused``.
 
     ``forbidden`` contains pairs of a public key and a method, ``unwritable`` pairs of a public key and the name of a
     slot.
@@ -43,7 +43,7 @@ class Gate(OpenDoor):
         return self.may_store(slot)
 
     def authority(self, owner: bytes) -> Authority:
-        """Return the result of ``judge`` for this owner with a valid certificate."""
+        """Return the result of ``judge`` for this owner with a valid pass."""
         return Authority(self.refused.get(owner, ""))
 
     def certificate(self, owner: bytes) -> bytes:

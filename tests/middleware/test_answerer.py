@@ -13,7 +13,7 @@ from tests.middleware.test_endpoint import DELAY, EndpointCase
 
 
 class CallTests(EndpointCase):
-    """Behaviour of ``Answerer``."""
+    """Tests of ``Answerer``."""
 
     def setUp(self) -> None:
         """Open a session."""

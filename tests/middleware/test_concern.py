@@ -104,7 +104,7 @@ class CompareAndSetTests(ConcernCase):
         self.assertEqual(self.values(fleet, 1), [b"1"])
 
     def test_a_former_life_is_not_overwritten(self) -> None:
-        """A node that lost its store does not overwrite records of its former run by compare-and-set."""
+        """A node that lost its store does not overwrite its earlier records by compare-and-set."""
         fleet = self.fleet(3)
         old = self.done(fleet, fleet.nodes[2].put(KEY, "a", b"old"))
         fleet.nodes[2].vanish()
@@ -367,7 +367,7 @@ class CutTests(ConcernCase):
         self.assertEqual([node.replica.is_sure() for node in fleet.nodes], [True, True, False, False])
 
     def test_a_door_that_shuts(self) -> None:
-        """A new node whose only peer failed before it sent the member list waits until this peer returns."""
+        """A new node waits for its only known peer if that peer failed before it sent the member list."""
         fleet = self.fleet(3)
         self.cut(fleet, 2, 3)
         self.joined(fleet, 1, 2)
@@ -419,7 +419,7 @@ class CutTests(ConcernCase):
             self.assertEqual([type(self.outcome(fleet, put, 0.5)) for put in puts], [Stored] * 3)
 
     def test_who_comes_back_behind_a_cut(self) -> None:
-        """A node that has not met its team does not regard the few known members as all, and denies no record."""
+        """A node that has not met its team does not report a key as empty on the replies of a few members."""
         fleet = self.fleet(3)
         self.cut(fleet, 2)
         self.assertEqual(self.outcome(fleet, fleet.nodes[0].put(KEY, "a", b"x")), 2)

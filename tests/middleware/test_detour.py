@@ -186,7 +186,7 @@ class DetourTests(SynchronousTestCase):
             self.assertEqual(self.call(each, self.bootstrap), BOOTSTRAP)
 
     def test_tunnel_alone(self) -> None:
-        """A node that knows only a tunnel joins through it at once and never regards itself as the first."""
+        """A node that knows only a tunnel joins through it at once and never starts a team of one."""
         site = Site(self.world, 3, [self.world.url()])
         site.block()
         self.world.sites.append(site)

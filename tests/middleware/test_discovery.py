@@ -62,7 +62,7 @@ class DiscoveryTests(FleetCase):
         self.assertIn(c.contact, a.overlay.contacts())
 
     def test_newcomer_is_not_whole_before_it_met_all(self) -> None:
-        """A node that joins through the LAN regards its view as whole only after it met all members."""
+        """The roster of a node that joins through the LAN is whole only after the node met all members."""
         lan = self.lan()
         for place in range(6):
             lan.on(place)
@@ -76,7 +76,7 @@ class DiscoveryTests(FleetCase):
         self.assertEqual(len(newcomer.overlay.contacts()), 6)
 
     def test_first_of_a_network_waits_a_moment(self) -> None:
-        """A node without replies regards itself as the first of its team after ``LISTEN`` seconds, not before."""
+        """A node without replies starts a team as its first node after ``LISTEN`` seconds, not before."""
         lan = self.lan()
         lan.nodes.append(node := lan.made(0))
         node.stop()
@@ -165,7 +165,7 @@ class DiscoveryTests(FleetCase):
         self.assertLessEqual(a.discovery.counters["greeted"], 2)
 
     def test_known_node_that_is_gone_is_no_bar(self) -> None:
-        """A node whose known node is dead joins through a node on the LAN."""
+        """If the known node of a node is dead, the node joins through another one on the LAN."""
         lan = self.lan()
         first = lan.on(0)
         lan.run(1.0)

@@ -86,10 +86,10 @@ class ClosedCase(EndpointCase, LogCase):
 
 
 class PassTests(ClosedCase):
-    """The certificate in a handshake, and its check."""
+    """The pass in a handshake, and its check."""
 
     def test_first_answer_still_takes_one_round_trip(self) -> None:
-        """With certificates of maximum size the first request fits into the INIT; the reply has the INIT's source."""
+        """With passes of maximum size the first request fits into the INIT; the reply has the INIT's source."""
         answer = bytes(ANSWER_ROOM - 20)
         seen: list[tuple[Contact, Address]] = []
         self.a.on_seen.add(lambda contact, address: seen.append((contact, address)))
@@ -100,7 +100,7 @@ class PassTests(ClosedCase):
         self.assertEqual(seen, [(self.to_b, self.to_a.address)])
 
     def test_refused_by_the_responder(self) -> None:
-        """A node without a valid certificate gets the reason, its request does not run, and no session is left."""
+        """A node without a valid pass gets the reason, its request does not run, and no session is left."""
         self.at_b.refused[self.to_a.public] = EXPIRED
         self.b.expose("look", lambda peer: self.runs.append(peer), early=True)
         text = self.refused(self.a.ask(self.to_b, "look"), EXPIRED, 2 * DELAY)
@@ -121,7 +121,7 @@ class PassTests(ClosedCase):
         self.assertEqual(len(self.kept(self.to_b, DATA)), 1)
 
     def test_said_once(self) -> None:
-        """Each side logs each rejection once, with a remedy; a node with a new certificate is admitted."""
+        """Each side logs each rejection once, with a remedy; a node with a new pass is admitted."""
         for count, code in enumerate((REVOKED, EXPIRED), start=1):
             self.at_b.refused[self.to_a.public] = code
             for _ in range(5):
@@ -132,7 +132,7 @@ class PassTests(ClosedCase):
         self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 2)), 2)
 
     def test_foreign_passes(self) -> None:
-        """A missing certificate and an oversized one are rejected as foreign; the oversized one is not checked."""
+        """A missing pass and an oversized one are rejected as foreign, the oversized one without a check."""
         self.at_a.shown += b"!"
         self.refused(self.a.ask(self.to_b, "echo", 1), FOREIGN)
         self.assertEqual(self.at_b.judged, [])
@@ -151,7 +151,7 @@ class PassTests(ClosedCase):
         self.assertEqual(first, second)
 
     def test_a_forged_init_reaches_no_door(self) -> None:
-        """An INIT with a wrong team secret, or without room for a certificate, is dropped before the check."""
+        """An INIT with a wrong team secret, or without room for a pass, is dropped before the check."""
         for secret, hello in ((b"x" * 32, Hello(self.at_a.life, self.at_a.shown, ROOM)), (TEAM, Hello())):
             own = Credentials.of(Identity(b"m" * 32), secret)
             init = Invitation(own, exchange_key(self.to_b.public), bytes(range(32)), 5, b"", hello).datagram()
@@ -223,7 +223,7 @@ class LifeTests(ClosedCase):
         return end, contact
 
     def test_the_older_one_is_told(self) -> None:
-        """A later run is admitted; the earlier one gets one rejection as superseded, in its session and later."""
+        """A later incarnation is admitted; the earlier one is rejected as superseded, in its session and later."""
         self.got(self.a.ask(self.to_b, "echo", 1))
         later, _ = self.life(2, 2)
         self.got(later.ask(self.to_b, "echo", 2))
@@ -235,7 +235,7 @@ class LifeTests(ClosedCase):
         self.assertTrue(all(meaning(SUPERSEDED) in line for line in self.log))
 
     def test_a_copy_is_doubled(self) -> None:
-        """A node with the same run number but another nonce, or a lower number, is rejected as doubled."""
+        """An incarnation with the same number but another nonce, or with a lower number, is rejected as doubled."""
         self.at_a.life = Life(5, self.at_a.life.nonce)
         self.got(self.a.ask(self.to_b, "echo", 1))
         for number, nonce in ((5, 2), (4, 3)):
@@ -258,7 +258,7 @@ class LifeTests(ClosedCase):
         self.assertEqual(len(self.log), 2)
 
     def test_two_that_knock_at_once(self) -> None:
-        """Of two nodes with one run and concurrent INITs the first to confirm is admitted, the other rejected."""
+        """Of two nodes with one incarnation number and concurrent INITs only the first to confirm is admitted."""
         copy, _ = self.life(1, 2)
         first, second = self.a.ask(self.to_b, "add", 1, changes=True), copy.ask(self.to_b, "add", 2, changes=True)
         self.clock.advance(3)
@@ -268,7 +268,7 @@ class LifeTests(ClosedCase):
         self.assertEqual(self.runs, [1])
 
     def test_a_recording_sets_no_life(self) -> None:
-        """A recorded INIT of an earlier run does not change the known runs."""
+        """A recorded INIT of an earlier incarnation does not change the table of incarnations."""
         self.got(self.a.ask(self.to_b, "echo", 1))
         recorded = self.kept(self.to_b, INIT)[0]
         later, _ = self.life(2, 2)
@@ -279,7 +279,7 @@ class LifeTests(ClosedCase):
         self.assertEqual(self.got(later.ask(self.to_b, "echo", 4)), 4)
 
     def test_lives(self) -> None:
-        """The latest run is valid, the previous one superseded, any other one doubled; no run number is valid."""
+        """The latest incarnation is valid, the previous one superseded, others doubled; number 0 is always valid."""
         lives, one, two = Lives(), Life(1, b"1" * 8), Life(2, b"2" * 8)
         self.assertFalse(lives.met(b"a", one))
         self.assertEqual(lives.judge(b"a", two), "")
@@ -291,7 +291,7 @@ class LifeTests(ClosedCase):
         self.assertEqual(lives.judge(b"a", one), "")
 
     def test_tables_are_bounded(self) -> None:
-        """The tables of runs and of logged rejections are bounded; the oldest entries are removed first."""
+        """The tables of incarnations and of logged rejections are bounded; the oldest entries are removed first."""
         self.patch(door, "MAX_LIVES", 3)
         self.patch(door, "MAX_NOTED", 3)
         lives, noted = Lives(), Noted()
@@ -309,7 +309,7 @@ class LifeTests(ClosedCase):
         self.assertEqual(sum(noted.is_new(3.0, number, FOREIGN) for number in range(1000)), 3)
 
     def test_next_life(self) -> None:
-        """The number of a run exceeds the last one and, if that was lost, the number of any earlier start by time."""
+        """An incarnation number exceeds the last one and is at least the Unix time of the start."""
         self.assertEqual([next_life(0, 0.0), next_life(7, 5.0), next_life(7, 1e9)], [1, 8, 10**9])
 
 
@@ -494,7 +494,7 @@ class MemberTests(FleetCase, LogCase):
         self.failureResultOf(stored, NoAnswer)
 
     def test_a_recording_parts_nobody(self) -> None:
-        """A recorded INIT with an expired certificate is rejected; its sender keeps its membership and leases."""
+        """A recorded INIT with an expired pass is rejected; its sender keeps its membership and leases."""
         fleet = self.gated(3)
         init = [d for d, to in self.recorded(fleet, 2) if d[0] == INIT][0]
         self.done(fleet, fleet.nodes[2].put(KEY, "here", b"2", "leased"))

@@ -157,7 +157,7 @@ class ManyTests(FleetCase):
         for place in (0, 2, 3, 4):
             fleet.nodes[place].replica.keep(newer)
         self.assertGreater(cost(301), 60)
-        fleet.run(40.0)  # meanwhile the replicas were reconciled
+        fleet.run(40.0)  # the replicas reconcile in this time
         self.assertLess(cost(301), 25)
 
     def test_newcomers_get_all_leases(self) -> None:

@@ -28,7 +28,7 @@ DIGEST = "from tests.middleware.test_invariants import digests; print(digests())
 
 
 def digests() -> list[str]:
-    """Return the digests of all datagrams and events of one run of every workload, with tasks and leases."""
+    """Return the digests of all datagrams and events of one run of every workload, of tasks and of leases."""
     schedule, tasks, leases = Schedule(1, DiskFleet), Tasks(3), Leases(3)
     schedule.run([workload(schedule) for workload in WORKLOADS.values()])
     tasks.run()

@@ -164,7 +164,7 @@ class LargeTests(FleetCase):
         self.assertNotIn(far.address, knocked)
 
     def test_one_without_a_radio_keeps_its_contacts(self) -> None:
-        """A node that hears no other node regards itself as disconnected and keeps its contacts."""
+        """A node that hears no other node keeps its contacts, because it counts as disconnected."""
         fleet = self.large()
         before = len(fleet.nodes[5].overlay.contacts())
         fleet.nodes[5]._membership.sounding.pace.wait = 1.0

@@ -85,7 +85,7 @@ class LedgerTests(SynchronousTestCase):
         self.assertEqual((self.ledger.entry(ANN, 1), len(self.ledger)), (None, 0))
 
     def test_another_life(self) -> None:
-        """A restarted caller may use lower request numbers; the settled requests of its former run stay settled."""
+        """A restarted caller may use lower request numbers; its earlier settled requests stay settled."""
         self.run_one(ANN, 9 * LIFE + 5, 9 * LIFE + 5, 1.0)
         self.run_one(ANN, 2 * LIFE + 1, 2 * LIFE, 2.0)
         self.assertFalse(self.ledger.is_settled(ANN, 2 * LIFE + 1))
@@ -93,7 +93,7 @@ class LedgerTests(SynchronousTestCase):
         self.assertIsNotNone(self.ledger.entry(ANN, 9 * LIFE + 5))
 
     def test_lives_are_bounded(self) -> None:
-        """The number of runs that the ledger remembers per caller is bounded."""
+        """The ledger remembers a bounded number of restarts per caller."""
         for life in range(100):
             self.ledger.settle(ANN, life * LIFE + 7, 1.0)
         known = [life for life in range(100) if self.ledger.is_settled(ANN, life * LIFE)]

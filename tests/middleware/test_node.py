@@ -83,7 +83,7 @@ class VerbTests(NodeCase):
         self.assertEqual(len(self.values(fleet, 1)), 12)
 
     def test_earlier_life_is_stepped_over(self) -> None:
-        """A node that lost its store overwrites the records of its former run, even at the same sequence number."""
+        """A node that lost its store overwrites its earlier records, even at the same sequence number."""
         for writes in (1, 3):
             fleet = self.fleet(3, seed=writes)
             for number in range(writes):

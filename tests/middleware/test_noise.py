@@ -30,7 +30,7 @@ def _sides(vector: dict[str, Any], psk: bytes | None) -> tuple[Initiator, Respon
 
 
 class NoiseTests(SynchronousTestCase):
-    """Behaviour of ``Initiator`` and ``Responder``."""
+    """Tests of ``Initiator`` and ``Responder``."""
 
     def setUp(self) -> None:
         """Load the test vectors."""

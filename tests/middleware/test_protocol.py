@@ -25,7 +25,7 @@ LARGE = bytes(range(256)) * 6
 
 
 class Dice(random.Random):
-    """A deterministic random generator that returns bytes counting up from ``start``, and numbers of them."""
+    """A random generator with fixed output: bytes that count up from ``start``, and numbers made of them."""
 
     def __init__(self, start: int) -> None:
         super().__init__(0)
@@ -47,7 +47,7 @@ class Dice(random.Random):
 
 
 class Doorway(Gate):
-    """An admission check with a short certificate."""
+    """An admission check with a short pass."""
 
     def __init__(self, name: str, seed: int) -> None:
         super().__init__(seed, seed, f"pass of {name}".encode())

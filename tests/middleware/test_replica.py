@@ -109,7 +109,7 @@ class ReplicaTests(SynchronousTestCase):
         self.assertEqual([held.name for held in self.replica.held(KEY)], [record(sequence=5).name])
 
     def test_who_may_store(self) -> None:
-        """A leased record is accepted only from its owner, a team record from any node, with a valid signature."""
+        """A leased record is accepted from its owner only; a record from another node needs a valid signature."""
         forged = Record(KEY, "f", DOG.public, 1, "team", 1.0, b"v", bytes(64))
         self.assertEqual(self.stored(record(lifetime="leased"), record("t"), forged, peer=self.cat), [-1, 0, -1])
         self.assertEqual(self.stored(record(lifetime="leased"), forged), [0, 0])

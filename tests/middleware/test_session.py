@@ -1,4 +1,4 @@
-"""Tests of sessions."""
+"""Tests of the encryption and the replay window of sessions."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from middleware.entangled.wire.session import MAX_PLAIN, OVERHEAD, WINDOW, Sessi
 
 
 class SessionTests(SynchronousTestCase):
-    """Behaviour of ``Session``."""
+    """Tests of ``Session``."""
 
     def setUp(self) -> None:
         """Create the two ends of one session."""

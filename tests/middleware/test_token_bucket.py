@@ -1,4 +1,4 @@
-"""Tests of ``middleware.entangled.token_bucket``."""
+"""Tests of ``middleware.entangled.token_bucket``, a rate limit."""
 
 from __future__ import annotations
 

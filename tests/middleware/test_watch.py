@@ -90,7 +90,7 @@ class WatchTests(SynchronousTestCase):
         self.assertEqual(self.told, [[record(DOG)], []])
 
     def test_stop(self) -> None:
-        """After a stop the subscriber receives no change, and the renewal is ended."""
+        """After a stop the subscriber receives no change, and the end is reported once."""
         self.watch.stop()
         self.watch.view.replace(CAT.node_id, [record(DOG)])
         self.watch.settle()
@@ -102,7 +102,7 @@ COUNT = 10
 
 class SubscriberTests(FleetCase):
     def asked(self, fleet: Fleet) -> list[tuple[int, float | None]]:
-        """Record the holders that receive watch requests from now on, with the requested TTL if any."""
+        """Return a list that receives the holder and the optional TTL of each later watch request."""
         asked: list[tuple[int, float | None]] = []
         for place, node in enumerate(fleet.nodes):
 
@@ -114,7 +114,7 @@ class SubscriberTests(FleetCase):
         return asked
 
     def large(self, fleet: Fleet, seconds: float) -> None:
-        """Advance the clock for nodes that regard their network as large."""
+        """Advance the clock with all nodes set to a large network."""
         for _ in range(round(seconds / 0.5)):
             for node in fleet.nodes:
                 node.overlay.is_large = True

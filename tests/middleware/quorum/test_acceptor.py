@@ -202,7 +202,7 @@ class NumberTests(SynchronousTestCase):
             self.assertEqual(member.prepare(huge, 1.0).kind, Kind.GRANTED)
 
     def test_another_life(self) -> None:
-        """A restarted proposer waits for the lease of its former run, as its device may still act (L2)."""
+        """A restarted proposer waits for the end of its earlier lease, because its device may still act (L2)."""
         member = Member(LEASE)
         member.lease(LOW, 1, 0.0)
         self.assertEqual(member.prepare(MID, 1.0).kind, Kind.GRANTED)

@@ -24,7 +24,7 @@ def reply(kind: Kind, counter: int = 9, accepted: Ballot = NONE, value: bytes | 
 
 class ConcludeTests(SynchronousTestCase):
     def test_conclude(self) -> None:
-        """A round is won, decided, held, outbid or silent by its replies; the highest accepted value is completed."""
+        """The replies make a round won, decided, held, outbid or silent; the highest accepted value is completed."""
         yes, held = reply(Kind.GRANTED), Reply(Kind.HELD, Ballot(4, b""), remaining=2.5)
         old, new = reply(Kind.GRANTED, 9, LOW, b"old"), reply(Kind.GRANTED, 9, MID, b"new")
         outbid = reply(Kind.OUTBID, 9, LOW, b"x")

@@ -120,7 +120,7 @@ class RoundTests(SynchronousTestCase):
         self.assertFalse(self.successResultOf(asked.outcome).tally.is_won)
 
     def test_sent_at_counts_the_latest_majority(self) -> None:
-        """The grants count from the send time of the request that completed the majority."""
+        """The grants count from the earliest request of the latest majority."""
         asked = self.round()
         self.answer(0, YES)
         self.clock.advance(0.25)

@@ -1,1 +1,1 @@
-"""Tests of how nodes reach each other through routers."""
+"""Tests of the paths between nodes through NAT routers."""

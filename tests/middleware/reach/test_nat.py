@@ -22,10 +22,10 @@ def nat(kind: NatKind) -> Nat:
 
 
 class NatTests(SynchronousTestCase):
-    """Behaviour of ``Nat``."""
+    """Tests of ``Nat``."""
 
     def test_what_each_kind_lets_in(self) -> None:
-        """After one datagram to A, each NAT type admits the right ones of A, A's other port and another host."""
+        """After a datagram to A, each NAT type filters datagrams from A, its other port and another host correctly."""
         kinds: list[tuple[NatKind, list[bool]]] = [
             ("full", [True, True, True]),
             ("addr", [True, True, False]),

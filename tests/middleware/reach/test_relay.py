@@ -139,7 +139,7 @@ class UpgradeTests(SynchronousTestCase):
         self.assertEqual([step for _, step in self.upgrades.due(151.0)], [0])
 
     def test_only_one_of_the_two(self) -> None:
-        """The node behind a NAT tries later than its peer, and waits longer while its peer tries."""
+        """Of two peers the one that ``is_behind`` tries later, and waits longer while the other one tries."""
         self.upgrades.add(self.public, True, 0.0)
         self.assertEqual(self.tried(PAUSES[0] + TURN), [PAUSES[0] + TURN])
         now = PAUSES[0] + 2 * TURN

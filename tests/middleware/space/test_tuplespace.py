@@ -138,7 +138,7 @@ class TupleSpaceTests(SpaceCase):
             fleet.nodes[place].vanish()
         fleet.run(12.0)
         began = fleet.clock.seconds()
-        # Half of the members are missing, so the put cannot be confirmed; the blocked read returns nevertheless.
+        # Half of the members are missing, so the put cannot be confirmed, but the blocked read returns.
         spaces[5].put(("go",)).addErrback(lambda failure: failure.trap(NoAnswer))
         fleet.run(1.5)
         self.assertLess(waiting[0] - began, 1.0)
@@ -306,7 +306,7 @@ class ClaimTests(SpaceCase):
         self.assertEqual(self.done(fleet, waiting, 1.0), ("job", 1))
 
     def test_get_behind_another_call_of_the_same_node(self) -> None:
-        """A get continues if another call of its node, which holds the tuple, does not win it."""
+        """A blocked get takes a tuple after another call of the same node tried to take it and failed."""
         fleet, (a, b, c) = self.spaces(3)
         b.read(("bell", int)).addErrback(lambda failure: failure.trap(NotRunning))  # keeps the shelf of b open
         self.done(fleet, a.put(("job", 1)), 1.0)
