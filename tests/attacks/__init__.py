@@ -1,1 +1,1 @@
-"""The attacks S1 to S12, a module each: what an outsider, a bad member or a thief may try, and what stops it."""
+"""Attacks by outsiders, malicious members and thieves, one module each, numbered as in the threat model."""

@@ -24,7 +24,7 @@ class ExplanationTests(SynchronousTestCase):
         self.assertTrue(text.startswith("epoch 1: dog2, 3 of 3 agree\n  by nearest 1 from reports "), text)
 
     def test_who_differs_and_in_what(self) -> None:
-        """Who named another, knew other reports or used another version is named, with what it is."""
+        """An agent with another winner, other reports or another version is listed with the difference."""
         missed = [THREE[0], THREE[2]]
         moved = [THREE[0], THREE[1], member(3, 1.25)]
         for other, what in (
