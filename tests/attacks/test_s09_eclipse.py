@@ -36,7 +36,7 @@ class OutsiderTests(SiegeCase):
         return {contact.public for node in nodes for contact in node.overlay.contacts()}
 
     def test_ten_thousand_around_a_key(self) -> None:
-        """Ten thousand identities next to a key, named by all that was ever asked, enter no table; the key is read."""
+        """Ten thousand identities near a key enter no table, although a member names them; the key stays readable."""
         team = self.village()
         for name in ("dog", "cat", "pig", "cow"):
             team.enlist(name)
