@@ -176,7 +176,7 @@ class CertificateTests(SiegeCase):
         return code
 
     def test_passes_that_do_not_hold(self) -> None:
-        """One that is over, not yet valid, somebody else's, another team's, cut short or none is refused by name."""
+        """An expired, early, stolen, truncated or missing certificate, or one of another team, is refused."""
         self.team = team = self.village()
         other = self.village(seed=2)
         secret = team.houses[0].kept.membership.secrets[0][1]

@@ -57,7 +57,7 @@ class AmplificationTests(SiegeCase):
         return self.sent[VICTIM]
 
     def test_every_kind(self) -> None:
-        """Every answer before the address is verified is at most as long as its request."""
+        """No answer to an unverified address is longer than its request."""
         secret = self.house.team.secret
         own = Credentials.of(Identity(b"i" * 32), secret)
         remote = exchange_key(self.house.public)

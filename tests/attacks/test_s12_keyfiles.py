@@ -35,7 +35,7 @@ class FileTests(SiegeCase):
         operator.made(self.folder / "operator", self.signer)
 
     def test_made_for_the_owner_alone(self) -> None:
-        """New and replaced key files, and those of the store, have the mode 0600 under any umask."""
+        """New and replaced key files, and the files of the store, have the mode 0600 under any umask."""
         before = os.umask(0)
         self.addCleanup(os.umask, before)
         membership.made(self.folder / "other", self.paper)

@@ -49,7 +49,7 @@ class JoinTests(SiegeCase):
         self.terms = terms
 
     def check_true_team(self, answer: Answer) -> None:
-        """Let the hostile member ``answer`` each KNOCK first, then a bootstrap node; the true team has to be joined."""
+        """Let the hostile member ``answer`` each KNOCK before a bootstrap node; the real team must be joined."""
         network = self.team.board.network(*DOOR)
         answered: list[Knock] = []
 

@@ -286,7 +286,7 @@ class GuessTests(PageCase):
         self.assertLess(looked, 250)
 
     def test_lock_out_nobody(self) -> None:
-        """Meanwhile who is signed in goes on, an invitation signs in, and so do this machine and a known address."""
+        """During an attack sessions are renewed; invitations, loopback and known addresses can sign in."""
         for number in range(1000):
             self.refused(self.vaio, f"guess{number}", f"10.{number // 250}.{number % 250}.1")
         now = self.now()
@@ -312,7 +312,7 @@ class LogTests(SynchronousTestCase):
 
 class RebindingTests(SynchronousTestCase):
     def test_rebind_a_local_name(self) -> None:
-        """A name of the LAN that is not the node's own is refused; its own and those of the settings serve."""
+        """A Host header with an unknown local name is refused; the node's and the configured names are accepted."""
         board, state = Board(MemoryDesk(), OpenSessions()), state_of([], [], {}, node="vaio")
         client = create_app(lambda: state, board, hosts=("vaio", "vaio.local", "robots.lan")).test_client()
 

@@ -177,7 +177,7 @@ class RightsTests(StopCase):
         self.assertEqual(set(self.team.is_on().values()), {True})
 
     def test_a_revoked_operator_releases_nothing(self) -> None:
-        """A release record that an operator signs after its revocation is not obeyed, whichever member sends it."""
+        """A release record that an operator signs after its revocation is not obeyed, from any sender."""
         self.stop(self.ann)
         [stop] = self.stops(self.dogs[0])
         own = self.bob.kept.membership.identity
@@ -267,7 +267,7 @@ class LossTests(StopCase):
         self.assertEqual(set(self.team.is_on().values()), {False})
 
     def test_a_stop_outlives_its_author(self) -> None:
-        """Its author is revoked and its record is gone: all stand, newcomers too, until its id is released."""
+        """A stop stays in force until its release, even if its author is revoked and its record is lost."""
         self.stop(self.bob)
         stop = self.stops(self.dogs[0])
         self.team.tell(self.team.signer.revoke(self.bob.public, "bob", self.team.wall()))

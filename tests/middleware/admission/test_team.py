@@ -192,7 +192,7 @@ class RotationTests(VillageCase):
 
 class StrangersTests(VillageCase):
     def test_certificate_of_another_team(self) -> None:
-        """A node with the team's secret but another operator's certificate is refused as foreign; both log it once."""
+        """A node with the team's secret but another operator's certificate is refused, and both nodes log it once."""
         village = self.village()
         first = village.houses[0].kept.membership
         stranger = operator(9).founded("spy", ("device",), village.wall(), village.dice, first.secrets[0][1])
