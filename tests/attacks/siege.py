@@ -19,7 +19,7 @@ SOURCE = Address("10.6.6.6", 666)
 
 
 class PaperDoor(OpenDoor):
-    """The admission check of an attacker: it accepts every peer and shows any certificate."""
+    """The admission check of an attacker, which accepts every peer and presents any certificate."""
 
     def __init__(self, shown: bytes, room: int = 640, life: int = 1) -> None:
         self.shown = shown
@@ -40,7 +40,7 @@ class SiegeCase(VillageCase):
     def attacker(
         self, team: Village, identity: Identity, secret: bytes, shown: bytes, at: Address = SOURCE, life: int = 1
     ) -> Endpoint:
-        """Return an endpoint that shows an arbitrary certificate, stopped when the test ends."""
+        """Return an endpoint that presents an arbitrary certificate, stopped when the test ends."""
         network = team.board.network(*at)
         dice = random.Random(f"attacker {at}")
         endpoint = Endpoint(identity, secret, network, team.clock, dice, PaperDoor(shown, life=life))

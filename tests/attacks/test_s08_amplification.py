@@ -218,7 +218,7 @@ class RelayTests(SiegeCase):
         self.assertLessEqual(len(relay), MAX_PAIRS)
 
     def test_no_carrying_in_circles(self) -> None:
-        """Relayed datagrams are not forwarded again, nor are those that are too long, empty or for the sender."""
+        """A relay does not forward datagrams that were relayed, are too long or empty, or address their sender."""
         relay, _, sent = self.relay()
         session: Any = OneSession(b"a" * 32)
         far: Any = OneSession(b"c" * 32, relayed(b"d" * 20))

@@ -98,7 +98,7 @@ class RevocationTests(RevocationCase):
         """A copy of the member's store on another machine is refused, with an older or newer life number."""
         self.revoke()
         self.team.run(IN_FORCE)
-        for number, life in enumerate((1, 2**62)):  # with an older life number it also hears of the newer one
+        for number, life in enumerate((1, 2**62)):  # with an older life number the refusal may also name the newer life
             told = self.refusals(self.bare(number, life), self.others[:3])
             self.assertLessEqual(told, {"revoked", "doubled"} if life == 1 else {"revoked"})
 

@@ -172,7 +172,7 @@ class MintTests(PageCase):
             self.assertEqual(self.vaio.sessions.visitor(text, self.now()), NOBODY)
 
     def test_serve_a_page_oneself(self) -> None:
-        """Her own web node accepts no code or token, because it lacks the role gateway."""
+        """Eve's web node accepts no code or token, because it lacks the role gateway."""
         self.assertEqual(self.refused(self.eve, CODE), 403)
         self.assertEqual(self.role(self.eve, TokenKey(self.eve.node.entangled.identity).token(self.claim())), "anyone")
 

@@ -295,7 +295,7 @@ class LossTests(StopCase):
             house.node.replica._notify_gone([record])
 
     def test_a_stop_that_is_not_saved_says_so(self) -> None:
-        """A node that cannot store a stop obeys it, and its answer says that the stop is not saved."""
+        """A node that cannot store a stop obeys it, and answers that the stop is not saved."""
         store: Any = self.dogs[0].node.store
         self.patch(store, "written", lambda: fail(Unwritable("the disk is full")))
         self.assertEqual(self.stop(self.ann)["dog1"], STANDS + UNSAVED)

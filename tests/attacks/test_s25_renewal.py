@@ -83,7 +83,7 @@ class RenewalCase(SiegeCase):
 
 class RevokedBootstrapTests(RenewalCase):
     def test_backdated(self) -> None:
-        """Of a revoked bootstrap node's renewals only those that the operator kept are valid, whatever their dates."""
+        """After a bootstrap node's revocation only the renewals kept by the operator are valid, for any dates."""
         old = self.word()
         self.team.days = 300
         kept = self.renew(old)
@@ -154,7 +154,7 @@ class SelfRenewalTests(RenewalCase):
         self.assertEqual(self.said(forged), FOREIGN)
 
     def test_a_bootstrap_node_beside_others(self) -> None:
-        """A bootstrap node whose renewal lapsed cannot renew itself while there is another bootstrap node."""
+        """A bootstrap node with a lapsed renewal cannot renew itself while there is another bootstrap node."""
         old, own = pass_of(self.thief), self.keys[1]
         self.team.days = 300
         mine = [self.renew(old, ago, own) for ago in (0, 200 * DAY)]

@@ -83,7 +83,7 @@ class ConvertTests(SynchronousTestCase):
         self.assertNotIn("hunter2", error.problem + error.remedy)
 
     def test_says_what_is_known(self) -> None:
-        """An unknown key names the nearest one; a missing one has an example; what is no table says so."""
+        """The error names the nearest key for an unknown one, and an example for a missing one."""
         error = self.assertRaises(Invalid, convert_table, {"nam": "a"}, _Table)
         self.assertIn("nearest is name", error.remedy)
         error = self.assertRaises(Invalid, convert_table, {}, _Table)

@@ -87,7 +87,7 @@ class JoiningTests(VillageCase):
         self.assertEqual(names, ["pupil-1", "kim", "pupil-2", "used"])
 
     def test_code_made_while_the_others_are_gone(self) -> None:
-        """A node that suddenly lost all peers cannot publish a code, and its error says when to retry."""
+        """A node that suddenly lost all peers cannot publish a code; the one-line error names the time to wait."""
         village = self.village(bootstraps=3)
         village.run(5.0)
         for house in village.houses[1:]:

@@ -32,7 +32,7 @@ class WeightedVoteTests(SynchronousTestCase):
         self.assertEqual(found.choice, "red")
 
     def test_no_decision_below_quorum(self) -> None:
-        """Half of the weight is not enough, and the reason says so."""
+        """Half of the weight is not enough, and the reason names the missing majority."""
         found = self.vote.find([vote("a", "red", 2.5)])
         self.assertEqual((found.choice, found.assigned_agent), ("", None))
         self.assertIn("more than half of 5", found.reason)

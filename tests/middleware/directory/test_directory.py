@@ -133,7 +133,7 @@ class Neighbour:
             self.say()
 
     def beat(self) -> None:
-        """Renew the own records in the current table."""
+        """Renew this device's records in the current table."""
         for slot, lease in self.own.items():
             if slot in self.table.slots:
                 record, _ = self.table.slots[slot]

@@ -127,7 +127,7 @@ class DeviceTests(SynchronousTestCase):
         self.assertEqual(devices_of([record(cat.packed(), CAT, "dog")]), [])
 
     def test_one_name_twice(self) -> None:
-        """Devices of the same name get a part of their ids as a suffix; a device under two keys counts once."""
+        """Devices of the same name get a part of their ids as a suffix; two records of one device do not."""
         cat = Device(CAT.node_id.hex(), "dog", joined=1)
         records = [record(DEVICE.packed()), record(cat.packed(), CAT)]
         self.assertEqual([d.name for d, _ in devices_of(records)], [f"dog-{d.uuid[:6]}" for d in (cat, DEVICE)])

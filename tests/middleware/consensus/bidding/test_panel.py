@@ -85,7 +85,7 @@ class PanelTests(SynchronousTestCase):
         self.assertEqual((self.panel.due(ME, 1.0), self.panel.is_written), (1.0, True))
 
     def test_few_changes_are_written(self) -> None:
-        """A change of action is written at once, of the assigned agent after a pause, others only if announced."""
+        """A change of action is written at once, of the assigned agent after a pause, others only if needed."""
         self.full()
         self.panel.wrote(ME, 1.0)
         self.assertEqual(self.panel.due(ME, 9.0), math.inf)

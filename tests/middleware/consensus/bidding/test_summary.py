@@ -23,7 +23,7 @@ batches = st.lists(st.lists(st.tuples(places, costs, st.integers(0, 2)), max_siz
 
 
 def unsigned(place: int, cost: float | None, revision: int) -> Bid:
-    """Return a bid without a signature; the same place and revision always give the same bid."""
+    """Return a bid without a signature; equal arguments give an equal bid."""
     agent = AGENTS[place]
     return Bid(agent.public, None if cost is None else Report(agent.node_id.hex(), cost), revision)
 

@@ -120,7 +120,7 @@ class CharterTests(RoomCase):
 
 class NumberTests(RoomCase):
     def test_believed(self) -> None:
-        """An outlier among the members' numbers is ignored unless it is the only number."""
+        """A high number that a single member of three reports does not count."""
         self.assertEqual(believed([5, 7, 3], 3), 7)
         self.assertEqual(believed([2**61, 7, 3], 3), 7)
         self.assertEqual(believed([2**61, 2**60], 3), 2**60)
