@@ -1,1 +1,1 @@
-"""The attacks S1 to S12, a module each: what an outsider, a bad member or a thief may try, and what stops it."""
+"""Attacks S1 to S25 by outsiders, malicious members and thieves, one module each, with the defence that stops them."""

@@ -1,9 +1,9 @@
 """Try every method and every record namespace of a running team as each kind of insider.
 
-``python -m tests.attacks.role_matrix`` prints the counts.  The subjects are a viewer, a device, a gateway, and an
-operator whose certificate was revoked.  Each has a real key and a real certificate, and speaks the real protocol.  The
-role table (``middleware.admission.roles``) says which attempts are forbidden: each of these has to be refused by every
-node, and the state of the team has to stay as it was.
+``python -m tests.attacks.role_matrix`` prints the counts. The subjects are a viewer, a device, a gateway, and an
+operator with a revoked certificate. Each has a real key and a real certificate, and uses the real protocol. The role
+table (``middleware.admission.roles``) lists the forbidden attempts: every node has to refuse each of them, and the
+state of the team must not change.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ ARGUMENTS: dict[str, Sequence[object]] = {
 
 @dataclass
 class Counts:
-    """The outcome of the attempts of one subject; ``wrong`` names those that did not end as the role table says."""
+    """The outcome of the attempts of one subject; ``wrong`` lists those with another outcome than in the role table."""
 
     subject: str
     methods: int = 0
@@ -77,7 +77,7 @@ class Counts:
 
 
 def list_slots(owner: bytes) -> list[Slot]:
-    """Slots of ``owner``: the key of each namespace's example, with the name of each."""
+    """Return slots of ``owner`` with the key of each namespace's example and the name of each."""
     examples = [namespace.slot(owner) for namespace in NAMESPACES.values()]
     keys = dict.fromkeys(slot.key for slot in examples)
     names = dict.fromkeys([*(slot.name for slot in examples), "x"])
@@ -85,7 +85,7 @@ def list_slots(owner: bytes) -> list[Slot]:
 
 
 class Insider:
-    """A subject of the trial: its key, its roles by the operator's present word, and its end of the wire."""
+    """A subject of the trial: its key, its current roles, and its endpoint."""
 
     def __init__(self, team: VirtualTeam, name: str, roles: Sequence[str], port: int) -> None:
         rng = random.Random(f"insider {name}")
@@ -100,14 +100,14 @@ class Insider:
 
 
 class Trial:
-    """One team and one insider who tries everything at each of its nodes."""
+    """One team and one insider that tries everything at each of its nodes."""
 
     def __init__(self, subject: str, seed: int = 1) -> None:
         self.counts = Counts(subject)
         self.team = VirtualTeam(seed, camera_fps=0.5, dogs=("dog1", "dog2"), faults=True)
         self.nodes = {name: service.assembly.node for name, service in self.team.services.items()}
         for node in self.nodes.values():
-            _ = node.entangled.seat, node.councils, node.dissemination  # their methods are exposed with their first use
+            _ = node.entangled.seat, node.councils, node.dissemination  # their methods are exposed at their first use
             node.entangled.endpoint.expose(UNLISTED_METHOD, lambda peer: None, changes=True)
         is_revoked = subject == REVOKED_OPERATOR
         self.insider = Insider(self.team, "mallory", [OPERATOR] if is_revoked else [subject], 7601)
@@ -125,9 +125,9 @@ class Trial:
             self.insider.roles = ()
 
     def run(self) -> Counts:
-        """Try what the table forbids, compare the state of the team, try the rest, and return the counts.
+        """Try the forbidden attempts, compare the state of the team, try the allowed ones, and return the counts.
 
-        Records are tried first-hand and through an accomplice with the role device.
+        Records are sent directly and through an accomplice with the role device.
         """
         before = self._state()
         for name, node in self.nodes.items():
@@ -161,7 +161,7 @@ class Trial:
                 self.counts.wrong.append(f"{name} {method}: {outcome!r}")
 
     def _try_allowed(self, name: str, contact: Contact) -> None:
-        """Call what the table allows, without arguments; the peer is forgotten by ``goodbye``, so that comes last."""
+        """Call the allowed methods without arguments; ``goodbye`` is last, because it removes the peer."""
         allowed = [method for method in METHODS if may_call(self.insider.roles, method) and method != "goodbye"]
         for method in (*allowed, *(["goodbye"] if may_call(self.insider.roles, "goodbye") else [])):
             self.counts.allowed += 1
@@ -205,7 +205,7 @@ class Trial:
         return [node.entangled.contact for node in self.nodes.values()]
 
     def _state(self) -> dict[tuple[str, Any], object]:
-        """Everything in the team that an insider without the right must not change."""
+        """Return the state of the team that an insider without the right must not change."""
         found: dict[tuple[str, Any], object] = {}
         for name, node in self.nodes.items():
             for record in node.store.records():
@@ -231,7 +231,7 @@ def _is_refusal(outcome: object) -> bool:
 
 
 def try_everything(subject: str) -> Counts:
-    """Let ``subject`` try everything at a team of its own."""
+    """Let ``subject`` try everything at a new team."""
     trial = Trial(subject)
     try:
         return trial.run()
@@ -240,7 +240,7 @@ def try_everything(subject: str) -> Counts:
 
 
 def main() -> int:
-    """Print one line for each subject; the exit code is 1 where an attempt did not end as the role table says."""
+    """Print one line for each subject; the exit code is 1 if an attempt had another outcome than in the role table."""
     found = [try_everything(subject) for subject in SUBJECTS]
     lines = [line for counts in found for line in (str(counts), *(f"    {wrong}" for wrong in counts.wrong))]
     sys.stdout.write("\n".join([*lines, f"{len(METHODS)} methods, {len(KINDS)} namespaces", ""]))

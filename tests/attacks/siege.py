@@ -1,4 +1,4 @@
-"""Attackers of a closed team: endpoints that hold the key and pass of a member and obey no rule."""
+"""Attackers of a closed team: endpoints with a member's key and certificate that violate the protocol."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SOURCE = Address("10.6.6.6", 666)
 
 
 class PaperDoor(OpenDoor):
-    """The door of an attacker: an open one that shows whatever it likes."""
+    """The admission check of an attacker, which accepts every peer and presents any certificate."""
 
     def __init__(self, shown: bytes, room: int = 640, life: int = 1) -> None:
         self.shown = shown
@@ -35,12 +35,12 @@ class PaperDoor(OpenDoor):
 
 
 class SiegeCase(VillageCase):
-    """A test of a closed team and of those who attack it."""
+    """A test with a closed team and its attackers."""
 
     def attacker(
         self, team: Village, identity: Identity, secret: bytes, shown: bytes, at: Address = SOURCE, life: int = 1
     ) -> Endpoint:
-        """An endpoint that shows what it likes, stopped when the test ends."""
+        """Return an endpoint that presents an arbitrary certificate, stopped when the test ends."""
         network = team.board.network(*at)
         dice = random.Random(f"attacker {at}")
         endpoint = Endpoint(identity, secret, network, team.clock, dice, PaperDoor(shown, life=life))
@@ -49,21 +49,21 @@ class SiegeCase(VillageCase):
         return endpoint
 
     def insider(self, team: Village, name: str, *which: str, at: Address = SOURCE) -> tuple[Endpoint, Identity]:
-        """The bare hands of a member with these roles: a good pass, and no manners."""
+        """Return an endpoint with a valid certificate for these roles, but without the checks of a node."""
         paper = team.paper(name, *which)
         secret = paper.secrets[0][1]
         return self.attacker(team, paper.identity, secret, paper.shown, at), paper.identity
 
 
 class OneSession:
-    """What those who take datagrams look at of a session."""
+    """The attributes of a session that receivers of datagrams read."""
 
     def __init__(self, public: bytes, at: Address = SOURCE) -> None:
         self.contact = Contact(public, at)
 
 
 def events_of(case: SynchronousTestCase) -> list[dict[str, Any]]:
-    """The events that are logged from now on until the test ends."""
+    """Return a list that collects all log events until the test ends."""
     events: list[dict[str, Any]] = []
     observer: Any = events.append
     globalLogPublisher.addObserver(observer)

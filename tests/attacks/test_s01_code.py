@@ -1,4 +1,4 @@
-"""Attack S1: to have code run by what is sent: pickles, marshalled code, YAML tags, format strings."""
+"""Attack S1: execute code from received content: pickles, marshalled code, YAML tags, format strings."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ UNSAFE = (
 )
 CALLS = ("eval", "exec", "compile", "__import__", "execfile", "input")
 ALLOWED = {
-    # What an operator signed and the owner of this node allowed; tests/swarmnode/test_deploy.py has its rules.
+    # The content is signed by an operator that the node's owner allowed; see tests/swarmnode/test_deploy.py.
     ("middleware.deployment.module", "exec"),
     ("middleware.deployment.module", "compile"),
 }
 LOADERS = {
-    # Named by the settings of the node's owner, or by a table in the tree.
+    # The name comes from the settings of the node's owner, or from a table in the source.
     "swarmnode.sandbox",
     *("agents.behaviour", "agents.registry", "drivers.registry", "middleware.consensus.servant"),
     *("middleware.consensus.strategy", "swarmnode.driver.catalogue", "swarmnode.command"),
@@ -43,13 +43,13 @@ FIRED: list[str] = []
 
 
 def fire(what: str) -> str:
-    """What the pickles of the corpus would call."""
+    """Record a call; the pickles of the corpus would call this function."""
     FIRED.append(what)
     return what
 
 
 class Mine:
-    """An object whose pickle calls ``fire`` when it is read."""
+    """An object with a pickle that calls ``fire`` when it is loaded."""
 
     def __reduce__(self) -> tuple[object, tuple[str]]:
         return fire, ("a pickle was read",)
@@ -71,7 +71,7 @@ TEXTS = tuple(each.decode("latin-1") for each in CORPUS)
 
 
 def trees() -> Iterator[tuple[str, ast.Module]]:
-    """Every module that runs on a node."""
+    """Return every module that runs on a node."""
     for room in ROOMS:
         for path in sorted((ROOT / room).rglob("*.py")):
             parts = path.relative_to(ROOT).with_suffix("").parts
@@ -79,7 +79,7 @@ def trees() -> Iterator[tuple[str, ast.Module]]:
 
 
 def faults_of(module: str, tree: ast.Module) -> list[str]:
-    """What in a module could run content as code."""
+    """Return the places in a module that could execute received content."""
     fixed = _constants(tree)
     return [
         f"{module} line {getattr(node, 'lineno', 0)}: {why}"
@@ -89,7 +89,7 @@ def faults_of(module: str, tree: ast.Module) -> list[str]:
 
 
 def _constants(tree: ast.Module) -> set[str]:
-    """The names that are given nothing but constants in a module."""
+    """Return the names that a module assigns only constants to."""
     given: dict[str, bool] = {}
     for node in ast.walk(tree):
         if isinstance(node, ast.Assign):
@@ -141,7 +141,7 @@ def _of_call(module: str, call: ast.Call, fixed: set[str]) -> Iterator[str]:
 
 
 def _is_fixed(node: ast.AST | None, fixed: set[str]) -> bool:
-    """Whether a text is written in the source, as a whole or in parts."""
+    """Return whether a text is constant in the source, as a whole or in parts."""
     if isinstance(node, ast.IfExp):
         return _is_fixed(node.body, fixed) and _is_fixed(node.orelse, fixed)
     if isinstance(node, ast.BinOp):
@@ -159,12 +159,12 @@ def _last(node: ast.AST) -> str:
 
 class TreeTests(SynchronousTestCase):
     def test_nothing_in_the_tree_runs_content(self) -> None:
-        """No module of a node evaluates, unpickles, formats by or loads anything that it was sent."""
+        """No module of a node evaluates, unpickles, formats with or loads received content."""
         found = [fault for module, tree in trees() for fault in faults_of(module, tree)]
         self.assertEqual(found, [])
 
     def test_the_check_bites(self) -> None:
-        """Each forbidden thing is found where it stands."""
+        """The check finds each forbidden construct."""
         for source in (
             "import pickle",
             "from yaml import load",
@@ -194,12 +194,12 @@ class ContentTests(FleetCase):
         self.events = events_of(self)
 
     def test_the_corpus_fires(self) -> None:
-        """The corpus is no dud: read as what it is, it fires."""
+        """The corpus works: unpickling it calls ``fire``."""
         pickle.loads(CORPUS[0])
         self.assertEqual(FIRED, ["a pickle was read"])
 
     def test_values_stay_bytes(self) -> None:
-        """As values of records they come out at another node as they went in, and nothing fires."""
+        """The corpus passes through records unchanged, and no code runs."""
         fleet = self.fleet(3)
         for place, value in enumerate(CORPUS):
             key = hashed_key(f"corpus {place}")
@@ -209,7 +209,7 @@ class ContentTests(FleetCase):
         self.assertEqual(FIRED, [])
 
     def test_messages_stay_data(self) -> None:
-        """As methods, arguments, answers and reasons they are data or malformed, and nothing fires."""
+        """As methods, arguments, answers and reasons the corpus is data or malformed, and no code runs."""
         for text, raw in zip(TEXTS, CORPUS, strict=True):
             for message in (Question(1, text[:60], (raw, text, [raw])), Answer(1, {text: raw}), Told("t", (raw,))):
                 self.assertEqual(decoded(encoded(message)), message)
@@ -220,7 +220,7 @@ class ContentTests(FleetCase):
         self.assertEqual(FIRED, [])
 
     def test_a_team_hears_them(self) -> None:
-        """As names of devices and texts to people they reach the team as they are; no log line expands them."""
+        """As text messages the corpus arrives unchanged, and no log line expands it."""
         swarm = self.swarm(2)
         heard: list[str] = []
         swarm.nodes[1].on_message(heard.append)
@@ -237,7 +237,7 @@ class ContentTests(FleetCase):
         self.assertFalse([line for line in logged if "<class" in line or "49" in line and "7*7" in line])
 
     def test_any_bytes_as_methods(self) -> None:
-        """A method that nobody exposed is refused by name, whatever it is called."""
+        """A method that is not exposed is refused, whatever its name."""
         fleet = self.fleet(2)
         dice = random.Random(3)
         names = ["__class__", "endpoint.stop", "eval", *(dice.randbytes(8).hex() for _ in range(20))]

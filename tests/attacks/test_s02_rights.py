@@ -1,4 +1,4 @@
-"""Attack S2: to do what one has no right to: others' records, older ones, an expired certificate, the wrong role."""
+"""Attack S2: act without the right: others' records, old records, an expired certificate, the wrong role."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ NAMES = ("order", "member", "result", "council", "done", "verdict/1", "source", 
 
 class MethodTests(SiegeCase):
     def test_every_method_by_every_role(self) -> None:
-        """What a role may not call does not run and is refused by its name; what it may is not refused for its role."""
+        """A method that a role may not call does not run and is refused with "role"; allowed methods are not."""
         team = self.village()
         house = team.houses[0]
         ran: list[str] = []
@@ -34,7 +34,7 @@ class MethodTests(SiegeCase):
             self.every(team, attacker, (role,), ran)
 
     def every(self, team: Any, attacker: Any, which: tuple[str, ...], ran: list[str]) -> None:
-        """Try every method, and one that nobody put into the table."""
+        """Try every method, and one that the table does not list."""
         contact = team.contact(team.houses[0])
         refused = team.houses[0].node.endpoint.counters["refused"]
         team.houses[0].node.endpoint.expose("made.up", lambda peer: ran.append("made.up"))
@@ -43,7 +43,7 @@ class MethodTests(SiegeCase):
         asked = {name: attacker.ask(contact, name, changes=True) for name in names}
         outcomes = {name: self.outcome(team, each, 0.05) for name, each in asked.items()}
         for name in set(names) - {each for each in names if may_call(which, each)}:
-            attacker.tell(contact, name)  # what is told without a question is refused as well
+            attacker.tell(contact, name)  # a notification without a request is refused as well
         team.run(1.0)
         allowed = [name for name in names if may_call(which, name)]
         self.assertEqual(sorted(ran), sorted(allowed), which)
@@ -56,14 +56,14 @@ class MethodTests(SiegeCase):
     @settings(max_examples=60)
     @given(st.sets(st.sampled_from(ROLES)), st.sampled_from([*METHODS, "made.up", ""]), st.sampled_from(ROLES))
     def test_more_roles_allow_no_less(self, which: set[str], method: str, more: str) -> None:
-        """With one role more nobody may do less, and without any nobody may do anything."""
+        """An additional role never removes a right, and without roles there are no rights."""
         self.assertLessEqual(may_call(which, method), may_call(which | {more}, method))
         self.assertFalse(may_call((), method))
 
 
 class RecordTests(SiegeCase):
     def test_every_kind_by_every_role(self) -> None:
-        """A record of a kind that its owner's role may not write is not held, and its writer is told why."""
+        """A record of a kind that its owner's role forbids is not stored, and its sender gets the reason."""
         team = self.village()
         house = team.houses[0]
         kinds = set()
@@ -83,7 +83,7 @@ class RecordTests(SiegeCase):
 
 class OwnerTests(SiegeCase):
     def setUp(self) -> None:
-        """A team of three with a record of the first, and a member gone bad."""
+        """Create a team of three with a record of the first member, and a malicious member."""
         super().setUp()
         self.team = self.village()
         for name in ("dog", "cat"):
@@ -95,13 +95,13 @@ class OwnerTests(SiegeCase):
         self.bad, self.own = self.insider(self.team, "bad", "device", "operator", "gateway", "bootstrap")
 
     def held(self) -> list[Record]:
-        """What the record's replicas hold, which is the same everywhere."""
+        """Return the record at its replicas, which must be equal everywhere."""
         found = [house.node.replica.held(self.key) for house in self.team.houses]
         self.assertTrue(all(each == found[0] for each in found))
         return found[0]
 
     def attack(self, record: Record) -> None:
-        """Bring a record in by every method that takes one, at every node."""
+        """Send a record with every method that accepts one, to every node."""
         packed, key = [record.packed()], record.key
         for house in self.team.houses:
             contact = self.team.contact(house)
@@ -119,7 +119,7 @@ class OwnerTests(SiegeCase):
         self.team.run(0.5)
 
     def test_anything_of_it_changed(self) -> None:
-        """With any field changed, with another signature, or signed by another key, it is refused everywhere."""
+        """A record with a changed field, another signature or another signer is refused everywhere."""
         other = Identity(b"z" * 32)
         newer = replace(self.record, sequence=self.record.sequence + 9)
         for record in (
@@ -137,14 +137,14 @@ class OwnerTests(SiegeCase):
             self.assertEqual(self.held(), [self.record])
 
     def test_an_older_one(self) -> None:
-        """One that its owner did sign once, with a lower number, does not come back."""
+        """An older version that its owner had signed does not replace the record."""
         first = Record(self.key, "slot", self.record.owner, 1, "team", self.record.ttl, b"true")
         older = first.signed(self.team.houses[0].kept.membership.identity)
         self.attack(older)
         self.assertEqual(self.held(), [self.record])
 
     def test_a_deleted_one(self) -> None:
-        """What its owner removed stays removed, whoever has kept the record."""
+        """A removed record stays removed, even if another node has kept it."""
         self.outcome(self.team, self.team.houses[0].node.remove(self.key, "slot"))
         self.attack(self.record)
         self.assertEqual([record.value for record in self.held()], [None])
@@ -152,7 +152,7 @@ class OwnerTests(SiegeCase):
     @settings(max_examples=25)
     @given(st.data())
     def test_any_mixture(self, data: Any) -> None:
-        """Whatever is changed in whatever way, the record holds."""
+        """No combination of changes replaces the record."""
         changed = replace(
             self.record,
             name=data.draw(st.sampled_from(["slot", "", "other"])),
@@ -169,14 +169,14 @@ class OwnerTests(SiegeCase):
 
 class CertificateTests(SiegeCase):
     def refused(self, number: int, shown: bytes, life: Identity, secret: bytes) -> str:
-        """What a member with that pass is told, on both sides."""
+        """Return the code with which a member with this certificate is refused."""
         attacker = self.attacker(self.team, life, secret, shown, SOURCE._replace(port=700 + number))
         code = self.refusal(self.team, attacker.ask, self.team.houses[0], 3.0)
         self.assertNotIn(life.public, [each.public for each in self.team.houses[0].node.overlay.contacts()])
         return code
 
     def test_passes_that_do_not_hold(self) -> None:
-        """One that is over, not yet valid, somebody else's, another team's, cut short or none is refused by name."""
+        """An expired, early, stolen, truncated or missing certificate, or one of another team, is refused."""
         self.team = team = self.village()
         other = self.village(seed=2)
         secret = team.houses[0].kept.membership.secrets[0][1]

@@ -1,4 +1,4 @@
-"""Attack S3: datagrams from where they do not come from, answers from elsewhere, with guessed numbers, or unasked."""
+"""Attack S3: datagrams with spoofed addresses, and answers that are misdirected, guessed or unsolicited."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ PLACES = (STRANGER, Address("10.0.0.2", 2), Address("10.0.0.1", 1), Address("::1
 
 
 def member(ground: Ground) -> Contact:
-    """The member that has a session with the target."""
+    """Return the member that has a session with the target."""
     return Contact(ground.identity.public, ground.other.address)
 
 
@@ -35,11 +35,11 @@ def sealed(ground: Ground, plain: bytes) -> bytes:
 
 
 class Spoofing(RuleBasedStateMachine):
-    """A node with a session, and somebody who can write any address on a datagram but knows no key."""
+    """A node with a session, and an attacker that can spoof any address but knows no key."""
 
     @initialize(seed=st.integers(0, 99))
     def begin(self, seed: int) -> None:
-        """A node with a session and a question under way that nobody will answer."""
+        """Start a node with a session and a pending request that gets no answer."""
         self.ground = Ground()
         self.dice = random.Random(seed)
         self.answers: list[Any] = []
@@ -53,7 +53,7 @@ class Spoofing(RuleBasedStateMachine):
             self.ground.stop()
 
     def fire(self, datagram: bytes, source: Address) -> None:
-        """Hand over one datagram; it may be answered with as much as it had."""
+        """Deliver one datagram; the reply must not be larger."""
         if self.ground.shoot(datagram, source) > len(datagram):
             raise AssertionError("more was sent than had come")
 
@@ -67,34 +67,34 @@ class Spoofing(RuleBasedStateMachine):
 
     @rule(index=st.integers(0, 39), bit=st.integers(0, 11199), source=st.sampled_from(PLACES))
     def bent(self, index: int, bit: int, source: Address) -> None:
-        """What came before, with one bit turned."""
+        """Send a recorded datagram with one changed bit."""
         datagram = bytearray(self.ground.recorded[index % len(self.ground.recorded)])
         datagram[bit // 8 % len(datagram)] ^= 1 << bit % 8
-        if datagram[0] != WHO:  # a nonce that is another one makes no other greeting
+        if datagram[0] != WHO:  # with another nonce it is still the same probe
             self.fire(bytes(datagram), source)
 
     @rule(source=st.sampled_from(PLACES), counter=st.integers(0, 2**64 - 1), size=st.integers(16, 200))
     def guessed_session(self, source: Address, counter: int, size: int) -> None:
-        """DATA under the true number of a session, which travels in clear."""
+        """Send DATA with the real session number, which is not encrypted."""
         [index] = list(self.ground.target._sessions)[:1]
         head = bytes([DATA]) + index.to_bytes(4, "little") + counter.to_bytes(8, "little")
         self.fire(head + self.dice.randbytes(size), source)
 
     @rule(source=st.sampled_from(PLACES), size=st.integers(50, 1300))
     def guessed_handshake(self, source: Address, size: int) -> None:
-        """RESP under the true number of a handshake that is under way."""
+        """Send RESP with the real number of a pending handshake."""
         for index in list(self.ground.target._peers._openings)[:1]:
             self.fire(bytes([RESP]) + index.to_bytes(4, "little") + self.dice.randbytes(size), source)
 
     @rule(source=st.sampled_from(PLACES), key=st.booleans())
     def greeting(self, source: Address, key: bool) -> None:
-        """A HERE that nobody asked for, under another key or even under the team's."""
+        """Send an unsolicited HERE under another key or under the team's key."""
         secret = derived_key(TEAM, b"greet") if key else bytes(32)
         self.fire(here(secret, self.dice.randbytes(16), self.dice.randbytes(32), self.dice), source)
 
     @invariant()
     def nothing_changed(self) -> None:
-        """What the node remembers is what it was, and nothing was answered that nobody said."""
+        """The state of the node is unchanged, and no request was answered."""
         if hasattr(self, "ground"):
             assert self.ground.state() == self.before
             assert self.answers == []
@@ -102,11 +102,11 @@ class Spoofing(RuleBasedStateMachine):
 
 class SpoofingTests(SynchronousTestCase):
     def test_any_sequence(self) -> None:
-        """No sequence of forged, bent, recorded and guessed datagrams changes what a node remembers."""
+        """No sequence of forged, changed, recorded and guessed datagrams changes the state of a node."""
         run_state_machine_as_test(Spoofing, settings=SEQUENCES)
 
     def test_the_machine_notices(self) -> None:
-        """A node that believed one of them is found out."""
+        """A node that accepts one of them is detected."""
         ground = Ground()
         self.addCleanup(ground.stop)
         before = ground.state()
@@ -121,7 +121,7 @@ class ElsewhereTests(SynchronousTestCase):
         self.counters = self.ground.target.counters
 
     def test_answer_of_another_member(self) -> None:
-        """A member that guessed the number of a question to somebody else does not get its answer believed."""
+        """An answer from another member with a guessed request number is ignored."""
         ground = self.ground
         silent = Contact(Identity(b"s" * 32).public, Address("10.0.0.7", 7))
         asked = ground.target.ask(silent, "echo", 1)
@@ -133,7 +133,7 @@ class ElsewhereTests(SynchronousTestCase):
         self.failureResultOf(asked, NoAnswer)
 
     def test_greeting_from_elsewhere(self) -> None:
-        """A HERE from another address than was greeted is dropped and counted, though its token be right."""
+        """A HERE with the right token from another address than the probed one is dropped and counted."""
         ground = self.ground
         greeted = ground.target.greet(Address("10.0.0.8", 8))
         [token] = list(ground.target.greeter._pending)
@@ -145,7 +145,7 @@ class ElsewhereTests(SynchronousTestCase):
         self.failureResultOf(greeted, NoAnswer)
 
     def test_greeting_with_a_guessed_token(self) -> None:
-        """One from the right address with another token is dropped as well."""
+        """A HERE from the right address with another token is dropped."""
         ground = self.ground
         at = Address("10.0.0.8", 8)
         greeted = ground.target.greet(at)
@@ -156,7 +156,7 @@ class ElsewhereTests(SynchronousTestCase):
         self.failureResultOf(greeted, NoAnswer)
 
     def test_who_of_a_stranger(self) -> None:
-        """Who does not hold the team's key hears nothing on a WHO."""
+        """A WHO without the team's key gets no answer."""
         datagram = who(bytes(32), bytes(16), random.Random(1))
         self.assertEqual(self.ground.shoot(datagram), 0)
         self.assertEqual(self.counters["forged"], 1)

@@ -1,4 +1,4 @@
-"""Attack S4: to play a recording: at once, later, after a restart, to others, from elsewhere, to other teams."""
+"""Attack S4: replay a recording at once, later, after a restart, to other nodes, and to other teams."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ELSEWHERE = Address("10.9.9.9", 99)
 
 
 class ReplayCase(SiegeCase):
-    """A team of four whose work of some seconds was recorded whole."""
+    """A team of four with a complete recording of some seconds of work."""
 
     def setUp(self) -> None:
         """Record joins, writes, reads, watches, calls and a removal."""
@@ -40,7 +40,7 @@ class ReplayCase(SiegeCase):
         self.team.tape = None
 
     def expose(self) -> None:
-        """A method that counts how often it ran."""
+        """Expose a method that counts its calls."""
 
         def add(peer: object, number: int) -> int:
             self.runs.append(number)
@@ -49,7 +49,7 @@ class ReplayCase(SiegeCase):
         self.team.houses[0].node.endpoint.expose("add", add, changes=True)
 
     def work(self, team: Village) -> None:
-        """What a team does: write, read, watch, remove, call."""
+        """Let the team write, read, watch, remove and call."""
         first, second = team.houses[1].node, team.houses[2].node
         key = hashed_key("task")
         team.houses[3].node.watch(key, lambda records: None)
@@ -63,18 +63,18 @@ class ReplayCase(SiegeCase):
             self.successResultOf(each)
 
     def states(self, team: Village) -> list[str]:
-        """The hash of what each node remembers that lasts."""
+        """Return the hash of each node's lasting state."""
         found = []
         for house in team.houses:
             endpoint = house.node.endpoint
             half = endpoint._half_open
             self.assertLessEqual(len(half._unconfirmed), MAX_UNCONFIRMED)
             self.assertLessEqual(len(half._responses), MAX_RESPONSES)
-            # What an INIT that is fresh enough opens and nobody can confirm: bounded, and nothing is sent by it.
+            # Sessions of a fresh INIT that were never confirmed are limited in number, and send nothing.
             for session in list(half._unconfirmed.values()):
                 half.forget(session)
             half.clear()
-            # A recording of an earlier life looks like a copy of that node: said once for each member, and no more.
+            # A recording from before a restart looks like a copy of the node, and is logged once for each member.
             self.assertLessEqual(len(endpoint._noted._logged), len(team.houses))
             timers = sorted(call.getTime() for call in team.clock.getDelayedCalls())
             noted, endpoint._noted = endpoint._noted, Noted()
@@ -88,7 +88,7 @@ class ReplayCase(SiegeCase):
         to: Callable[[int], SwitchboardNetwork] | None = None,
         source: Address | None = None,
     ) -> None:
-        """Send the whole tape again in no time; nobody may run, log or remember anything because of it."""
+        """Send the whole recording again at once; no method may run, and no state may change."""
         places = [house.node._network for house in team.houses]
         known: list[Any] = [network for network, _, _ in self.tape.heard]
         number = {id(network): place for place, network in enumerate(dict.fromkeys(known))}
@@ -104,11 +104,11 @@ class ReplayCase(SiegeCase):
         self.assertLessEqual(self.bytes_out(team) - bytes_out, received)
 
     def bytes_out(self, team: Village) -> int:
-        """Bytes that a team's nodes have sent since it was frozen."""
+        """Return the bytes that a team's nodes have sent since ``freeze``."""
         return self.sent[id(team)]
 
     def freeze(self, team: Village) -> None:
-        """Let nothing that is sent arrive: an answer to a recording would be the work of the one who plays it."""
+        """Drop all sent datagrams, because an answer to a replay would be the attacker's work."""
         for house in team.houses:
             network: Any = house.node._network
 
@@ -120,14 +120,14 @@ class ReplayCase(SiegeCase):
 
 class ReplayTests(ReplayCase):
     def test_the_tape_is_rich(self) -> None:
-        """The recording has each kind of datagram that a team sends, and many of them."""
+        """The recording contains many datagrams, and each kind that a team sends."""
         kinds = {datagram[0] for _, datagram, _ in self.tape.heard}
         self.assertGreaterEqual(kinds, {0x11, 0x12, 0x13, 0x14, 0x15})
         self.assertGreater(len(self.tape.heard), 200)
         self.assertEqual(self.runs, [0, 1, 2, 3, 4])
 
     def test_at_once(self) -> None:
-        """Played at once to the same nodes, from another address, where no session moves to, and to other nodes."""
+        """A replay at once to the same nodes, from another address, and to other nodes has no effect."""
         self.freeze(self.team)
         self.replay(self.team)
         self.replay(self.team, source=ELSEWHERE)
@@ -138,13 +138,13 @@ class ReplayTests(ReplayCase):
         self.replay(self.team, to=lambda place: network_of(self.team.houses[(place + 1) % count]))
 
     def test_after_responses_are_forgotten(self) -> None:
-        """Played when no response is remembered any more."""
+        """A replay after the cached responses have expired has no effect."""
         self.team.run(4 * KEPT_S)
         self.freeze(self.team)
         self.replay(self.team)
 
     def test_after_a_restart(self) -> None:
-        """Played to the next life of each node, which shares no session with the one before."""
+        """A replay after a restart of the nodes has no effect, because they share no session with the recording."""
         for house in self.team.houses:
             self.team.close(house, is_sudden=True)
         self.team.run(1.0)
@@ -157,7 +157,7 @@ class ReplayTests(ReplayCase):
         self.replay(self.team)
 
     def test_to_another_team(self) -> None:
-        """Played to another team, which answers nothing at all."""
+        """A replay to another team gets no answer."""
         other = self.village(seed=2)
         for name in ("dog", "cat", "pig"):
             other.enlist(name)
@@ -167,7 +167,7 @@ class ReplayTests(ReplayCase):
         self.assertEqual(self.bytes_out(other), 0)
 
     def test_after_a_rotation(self) -> None:
-        """Played when the team has another secret and nobody goes by the one before: nobody answers a single one."""
+        """A replay after a rotation of the secret gets no answer."""
         members = [house.public for house in self.team.houses]
         self.team.tell(self.team.signer.rotate(2, members, self.team.wall(), 5.0, self.team.dice))
         self.team.run(60.0)
@@ -177,7 +177,7 @@ class ReplayTests(ReplayCase):
         self.replay(self.team)
 
     def test_the_hash_notices(self) -> None:
-        """One datagram that nobody played before does change the hash."""
+        """One datagram that is not a replay changes the hash."""
         before = self.states(self.team)
         asked = self.team.houses[1].node.call(self.team.contact(self.team.houses[0]), "add", 9, changes=True)
         self.team.run(0.1)

@@ -1,4 +1,4 @@
-"""Attack S5: parts that never make a whole, overlap, claim to be many, or come from a thousand members at once."""
+"""Attack S5: fragments that never form a message, overlap, claim huge sizes, or come from a thousand members."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ HALF = MAX_MESSAGE // 2
 
 
 def part(number: int, total: int, place: int, data: bytes, is_wanted: bool = False) -> bytes:
-    """A PART as anybody can make it."""
+    """Return an arbitrary fragment (PART)."""
     head = bytes([PART, 2 if is_wanted else 0]) + number.to_bytes(8, "little")
     return head + total.to_bytes(4, "little") + place.to_bytes(2, "little") + data
 
 
 class CourierCase(SynchronousTestCase):
-    """A courier, and members by their keys."""
+    """A fragmenter, and members by number."""
 
     def setUp(self) -> None:
         self.clock = HeapClock()
@@ -51,11 +51,11 @@ class CourierCase(SynchronousTestCase):
         self.courier.on_part(session, plain)
 
     def bytes_in(self) -> int:
-        """What is reserved for parcels that come in."""
+        """Return the bytes reserved for incoming messages."""
         return self.courier._bytes_in.total()
 
     def send_whole(self, member: int, number: int, size: int) -> None:
-        """A lawful message in its parts, in order."""
+        """Send a valid message in fragments, in order."""
         for place in range(-(-size // PART_BYTES)):
             here = min(PART_BYTES, size - place * PART_BYTES)
             self.take(member, part(number, size, place, bytes(here), True))
@@ -63,7 +63,7 @@ class CourierCase(SynchronousTestCase):
 
 class FragmentTests(CourierCase):
     def test_never_completed(self) -> None:
-        """One member has at most its own share in assembly, and after ten seconds nothing any more."""
+        """One member has at most its share of incomplete messages, and ten seconds later none."""
         for number in range(2000):
             self.take(1, part(number, HALF, 0, bytes(PART_BYTES)))
         self.assertLessEqual(self.bytes_in(), MAX_IN_OF_PEER)
@@ -72,7 +72,7 @@ class FragmentTests(CourierCase):
         self.assertEqual((self.bytes_in(), len(self.courier._assemblies)), (0, 0))
 
     def test_lies_about_its_size(self) -> None:
-        """Parts beyond the end, 65,535 of them, too large ones and other totals are malformed and reserve nothing."""
+        """Fragments with invalid sizes or positions, or another total, are malformed and reserve nothing."""
         wrong = (
             part(1, 2**32 - 1, 0, bytes(PART_BYTES)),
             part(1, MAX_MESSAGE + 1, 0, bytes(PART_BYTES)),
@@ -90,7 +90,7 @@ class FragmentTests(CourierCase):
         self.assertEqual(self.counters["malformed"], len(wrong) + 1)
 
     def test_overlapping(self) -> None:
-        """Of two parts for one place the message is as long as it said, and it is delivered once."""
+        """With overlapping fragments the message has its announced length, and is delivered once."""
         size = 3 * PART_BYTES
         for fill in (b"a", b"b", b"a"):
             for place in (0, 2):
@@ -101,7 +101,7 @@ class FragmentTests(CourierCase):
         self.assertEqual(self.counters["repeated"], 1)
 
     def test_interleaved_from_a_thousand(self) -> None:
-        """A thousand members with parcels that they never finish stay within the cap, also in real memory."""
+        """A thousand members with unfinished messages stay within the limit, also in allocated memory."""
         tracemalloc.start()
         self.addCleanup(tracemalloc.stop)
         base, _ = tracemalloc.get_traced_memory()
@@ -113,7 +113,7 @@ class FragmentTests(CourierCase):
         self.assertLess(used - base, MAX_IN * 1.1)
 
     def test_others_get_through(self) -> None:
-        """With all the room taken by parcels that hardly grow, one of 64 KiB comes in within two seconds."""
+        """If slowly growing messages take all the space, another one of 64 KiB arrives within two seconds."""
         for member in range(2, 200):
             self.take(member, part(1, 64 * KIB, 0, bytes(PART_BYTES)))
         self.assertGreater(self.bytes_in(), MAX_IN - 64 * KIB)
@@ -128,7 +128,7 @@ class FragmentTests(CourierCase):
         self.assertEqual(self.delivered, [((1).to_bytes(32, "little"), 64 * KIB)])
 
     def test_busy_ones_are_not_pushed_out(self) -> None:
-        """A parcel that grows quickly is not what makes room for others."""
+        """A message that grows quickly is not evicted."""
         for member in range(2, 120):
             self.take(member, part(1, 64 * KIB, 0, bytes(PART_BYTES)))
         size = 60 * KIB
@@ -142,7 +142,7 @@ class FragmentTests(CourierCase):
 
 class EndToEndTests(SynchronousTestCase):
     def test_a_transfer_beside(self) -> None:
-        """While a member fills its share with parcels that never end, another message of 64 KiB of its own passes."""
+        """While a member fills its share with unfinished messages, its other message of 64 KiB arrives."""
         ground = Ground()
         self.addCleanup(ground.stop)
         session = next(iter(ground.other._sessions.values()))

@@ -1,4 +1,4 @@
-"""Attack S6: whatever bytes there are, wherever bytes are taken: a bounded run of every target of ``tests/fuzz``."""
+"""Attack S6: arbitrary bytes at every decoder: a bounded run of every target of ``tests/fuzz``."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ SLOWEST_S = 0.25
 
 
 class MutationTests(SynchronousTestCase):
-    """Nothing raises, nothing is logged, what is refused leaves no trace, and no answer is longer than its question."""
+    """No input raises or is logged, a refused one leaves no trace, and no answer is longer than its request."""
 
     def test_every_target(self) -> None:
-        """The kept inputs and some mutations of them, at an open port, sealed, in handshakes and for each decoder."""
+        """All targets accept the stored inputs and some mutations of them without a violation."""
         for name, (check, count) in TARGETS.items():
             with self.subTest(target=name):
                 inputs, dice = seeds(name), random.Random(f"s6/{name}/1")
@@ -42,11 +42,11 @@ class MutationTests(SynchronousTestCase):
     @BOUNDED
     @given(st.integers(0, 255), st.binary(max_size=200))
     def test_any_paper(self, kind: int, data: bytes) -> None:
-        """Any bytes at all, and any change of what is lawful."""
+        """Arbitrary bytes as a statement, certificate, join request or reply cause no violation."""
         paper.check(bytes([kind]) + data)
 
     def test_paper_is_quick(self) -> None:
-        """No statement, pass, knock or welcome of any kind takes long to refuse, not even a large one."""
+        """Statements, certificates, join requests and replies are refused quickly, including large ones."""
         dice = random.Random(8)
         large = [bytes([kind]) + dice.randbytes(65_000) for kind in range(4)]
         large += [bytes([kind]) + b"\x91" * 65_000 for kind in range(4)]
@@ -57,7 +57,7 @@ class MutationTests(SynchronousTestCase):
             self.assertLess(time.thread_time() - began, SLOWEST_S)
 
     def test_the_targets_notice(self) -> None:
-        """The lawful ones are believed, so that a target which refuses everything would be found out."""
+        """Valid inputs are accepted, and a target that would refuse everything is detected."""
         for kind, each in paper.LAWFUL.items():
             for place, whole in enumerate(each):
                 paper.check(bytes([paper.KINDS.index(kind) + 4 * place]) + whole)

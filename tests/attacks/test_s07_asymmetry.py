@@ -1,4 +1,4 @@
-"""Attack S7: to make a node work more than it costs: floods of handshakes, knocks, greetings, hails."""
+"""Attack S7: make a node do more work than the attacker: floods of handshakes, join requests and probes."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ SECONDS = 3
 
 
 class FloodCase(SiegeCase):
-    """A node of a closed team whose costly deeds are counted while it is flooded."""
+    """A node of a closed team that is flooded while its expensive operations are counted."""
 
     def setUp(self) -> None:
-        """Count exchanges of keys, signatures checked, bytes and log lines."""
+        """Count key exchanges, checked signatures, bytes and log lines."""
         super().setUp()
         self.team: Village = self.village()
         self.house = self.team.houses[0]
@@ -72,7 +72,7 @@ class FloodCase(SiegeCase):
         return [str(each.get("log_format")) for each in self.events if each["log_level"] >= LogLevel.info]
 
     def flood(self, made: Callable[[int], bytes], seconds: int = SECONDS) -> int:
-        """Send what ``made`` makes from a thousand addresses; the bytes that were sent by the flood."""
+        """Send datagrams of ``made`` from a thousand addresses; return the bytes sent."""
         total = 0
         for number in range(PER_SECOND * seconds):
             datagram = made(number)
@@ -84,20 +84,20 @@ class FloodCase(SiegeCase):
         return total
 
     def answers(self) -> list[bytes]:
-        """What was sent to the addresses of the flood."""
+        """Return the datagrams sent to the addresses of the flood."""
         return [datagram for datagram, to in self.sent if to.port == 999]
 
 
 class FloodTests(FloodCase):
     def test_forged_handshakes(self) -> None:
-        """INITs of a good form and a wrong mac cost a hash each: no keys are exchanged, nothing is sent or kept."""
+        """INITs with a wrong MAC cost one hash each: no key exchange, no answer, no state."""
         dice = random.Random(1)
         self.flood(lambda number: bytes([INIT]) + dice.randbytes(1300))
         self.assertEqual((len(self.exchanges), self.lines), (0, []))
         self.assertEqual(self.answers(), [])
 
     def handshakes(self) -> Callable[[int], bytes]:
-        """INITs of who holds the team's secret (a member gone bad), with ever new ephemeral keys."""
+        """Return INITs of a malicious member with the team's secret, with new ephemeral keys."""
         own = Credentials.of(Identity(b"i" * 32), self.house.team.secret)
         remote, dice = exchange_key(self.house.public), random.Random(2)
         hello = Hello(room=640)
@@ -111,7 +111,7 @@ class FloodTests(FloodCase):
         return made
 
     def test_handshakes_of_a_member(self) -> None:
-        """From a member that floods without reading what comes back, as many keys are exchanged as one second has."""
+        """A member that floods and ignores the answers causes only a limited rate of key exchanges."""
         received = self.flood(self.handshakes())
         self.assertLessEqual(len(self.exchanges), QUIET_RATE * (SECONDS + 2))
         self.assertLessEqual(sum(map(len, self.answers())), received)
@@ -123,7 +123,7 @@ class FloodTests(FloodCase):
         self.assertLess(QUIET_RATE, MOST_RATE)
 
     def test_others_still_come_in(self) -> None:
-        """While a member floods, another one opens a session in one more round trip, by the cookie."""
+        """During a flood another member opens a session in one additional round trip, with the cookie."""
         made = self.handshakes()
         self.flood(made, 1)
         friend, _ = self.insider(self.team, "friend")
@@ -132,7 +132,7 @@ class FloodTests(FloodCase):
         self.assertEqual(len(self.successResultOf(asked)), 8)
 
     def test_knocks(self) -> None:
-        """KNOCKs that name no invitation cost a look into a table; few are answered and few lines are logged."""
+        """KNOCKs without an invitation cost one table lookup; few are answered, and few lines are logged."""
         dice = random.Random(3)
         received = self.flood(lambda number: bytes([knock.KNOCK]) + dice.randbytes(knock.KNOCK_BYTES - 1))
         answers = self.answers()
@@ -142,7 +142,7 @@ class FloodTests(FloodCase):
         self.assertLessEqual(len(self.lines), 20 + SECONDS)
 
     def test_knocks_of_who_knows_the_id(self) -> None:
-        """KNOCKs that name a true invitation and do not open are dropped; no signature is checked for any."""
+        """KNOCKs that name a real invitation but cannot be decrypted are dropped without a signature check."""
         code = self.team.invite("dog")
         [invite] = self.team.houses[0].team.roll.invites()
         self.assertTrue(code)
@@ -153,7 +153,7 @@ class FloodTests(FloodCase):
         self.assertEqual(self.answers(), [])
 
     def test_knocks_of_who_has_the_code(self) -> None:
-        """Of KNOCKs with a true code, each by another key, so many signatures are checked as one second has."""
+        """KNOCKs with a real code, each with another key, cause only a limited rate of signature checks."""
         code, packed, terms = self.team.signer.invite("pig", ("device",), 1, self.team.wall(), 900.0, random.Random(5))
         self.team.tell(terms)
         self.team.tell(packed)
@@ -170,14 +170,14 @@ class FloodTests(FloodCase):
         self.assertNotEqual(drawn(self.team.signer.public, dice).text, code.text)
 
     def test_hails(self) -> None:
-        """Of HAILs twenty a second are answered, each with as much as came."""
+        """Twenty HAILs per second are answered, each with the size of the request."""
         self.flood(lambda number: hail(number.to_bytes(16, "little")))
         answers = self.answers()
         self.assertLessEqual(len(answers), RATE * (SECONDS + 1))
         self.assertLessEqual({len(datagram) for datagram in answers}, {HAIL_BYTES})
 
     def test_questions_of_a_member(self) -> None:
-        """Of questions without end a member gets so many answered as it may ask; the others are refused as busy."""
+        """A member's requests are limited in rate, and those beyond the limit are refused as busy."""
         bad, _ = self.insider(self.team, "bad")
         contact = self.team.contact(self.house)
         self.outcome(self.team, bad.ask(contact, "ping", bytes(8), changes=True))
@@ -205,7 +205,7 @@ class FloodTests(FloodCase):
         self.assertGreater(ran[-1], began + seconds + 5.0)
 
     def test_a_cookie_of_another(self) -> None:
-        """A cookie pays for the address that it was given to, and for no other."""
+        """A cookie is valid only for the address that received it."""
         made = self.handshakes()
         self.flood(made, 1)
         self.assertEqual(made(1)[-MAC:], bytes(MAC))

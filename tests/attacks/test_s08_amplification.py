@@ -1,4 +1,4 @@
-"""Attack S8: to have a node send more than was sent to it, to somebody else, or for strangers."""
+"""Attack S8: make a node send more than it received, to a third party, or on behalf of strangers."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ VICTIM = Address("10.7.7.7", 77)
 
 class AmplificationTests(SiegeCase):
     def setUp(self) -> None:
-        """A team of eight, so that answers are long, and a count of what one of them sends to whom."""
+        """Create a team of eight, for long answers, and count the bytes that one node sends to each address."""
         super().setUp()
         self.team = self.village()
         for name in ("dog", "cat", "pig", "cow", "hen", "fox", "owl"):
@@ -50,14 +50,14 @@ class AmplificationTests(SiegeCase):
         self.dice = random.Random(1)
 
     def back(self, datagram: bytes, seconds: float = 2.0) -> int:
-        """The bytes that a victim gets because of one datagram that claims to come from it."""
+        """Return the bytes that a victim receives after one datagram with its address as source."""
         self.sent.clear()
         self.network.receiver(datagram, VICTIM)
         self.team.run(seconds)
         return self.sent[VICTIM]
 
     def test_every_kind(self) -> None:
-        """Of everything that is answered before an address is proved the answer is no longer than the question."""
+        """No answer to an unverified address is longer than its request."""
         secret = self.house.team.secret
         own = Credentials.of(Identity(b"i" * 32), secret)
         remote = exchange_key(self.house.public)
@@ -87,7 +87,7 @@ class AmplificationTests(SiegeCase):
         self.assertLessEqual(max(ratios.values()), 1.0, ratios)
 
     def test_again_and_again(self) -> None:
-        """A recorded INIT that is sent a hundred times is answered by no more than came."""
+        """A recorded INIT sent a hundred times gets at most as many bytes as it has."""
         own = Credentials.of(Identity(b"i" * 32), self.house.team.secret)
         made = Invitation(own, exchange_key(self.house.public), bytes(31) + b"\x02", 9, b"", Hello(room=640))
         datagram = made.datagram()
@@ -95,7 +95,7 @@ class AmplificationTests(SiegeCase):
         self.assertLessEqual(back, 100 * len(datagram))
 
     def test_others_are_not_drawn_in(self) -> None:
-        """A stranger's datagram makes a node write to nobody else either, beyond what it does by itself."""
+        """Strangers' datagrams do not make a node send more to third parties."""
         self.team.run(10.0)
         self.sent.clear()
         self.team.run(5.0)
@@ -111,7 +111,7 @@ class AmplificationTests(SiegeCase):
 
 class IntroductionTests(SiegeCase):
     def test_knocks_at_a_victim(self) -> None:
-        """However many introductions a member makes, a node writes no more to an address that it names than a share."""
+        """The rate of bytes to an address that a member names in introductions is limited."""
         team = self.village()
         bad, _ = self.insider(team, "bad")
         self.outcome(team, bad.ask(team.contact(team.houses[0]), "ping", bytes(8), changes=True))
@@ -143,7 +143,7 @@ class IntroductionTests(SiegeCase):
 
 class RelayTests(SiegeCase):
     def test_a_stranger_is_not_carried_for(self) -> None:
-        """Only in a session anything is carried: the same bytes in the open are dropped."""
+        """A relay forwards only in a session: the same bytes without one are dropped."""
         team = self.village()
         team.enlist("dog")
         network: Any = network_of(team.houses[0])
@@ -154,7 +154,7 @@ class RelayTests(SiegeCase):
         self.assertEqual(team.houses[0].node.endpoint.counters["carried"], before)
 
     def test_a_revoked_one_is_not_carried_for(self) -> None:
-        """When a member is revoked nobody carries for it any more."""
+        """A relay stops forwarding for a revoked member."""
         team = self.village()
         team.enlist("dog")
         paper = team.paper("bad")
@@ -175,11 +175,11 @@ class RelayTests(SiegeCase):
         session = next(iter(bad._sessions.values()))
         team.tell(team.signer.revoke(paper.identity.public, "bad", team.wall()))
         team.run(2.0)
-        bad._sessions.setdefault(session.local_index, session)  # it does not listen to what it was told
+        bad._sessions.setdefault(session.local_index, session)  # the attacker ignores the revocation
         self.assertEqual(carry(), 0)
 
     def relay(self) -> tuple[Any, Any, list[int]]:
-        """A relay to whom every id is somebody, its clock, and what it sent."""
+        """Return a relay with a session for every id, its clock, and its sent bytes."""
         clock, sent = HeapClock(), [0]
 
         def send(session: object, plain: bytes) -> None:
@@ -191,7 +191,7 @@ class RelayTests(SiegeCase):
         return Relay(session_of, send, clock, Counter()), clock, sent
 
     def test_quota_of_a_pair(self) -> None:
-        """One pair gets a burst and then 64 kbit/s, and where only one of them speaks, two minutes."""
+        """One pair gets a burst and then 64 kbit/s, and if only one side sends, two minutes."""
         relay, clock, sent = self.relay()
         session: Any = OneSession(b"a" * 32)
         plain = bytes([CARRY]) + b"b" * 20 + bytes(1000)
@@ -207,7 +207,7 @@ class RelayTests(SiegeCase):
         self.assertEqual(sent[0], before)
 
     def test_quota_of_all(self) -> None:
-        """All pairs together get no more than a node has to spare, and there are not more than 256 of them."""
+        """All pairs together are limited to ``ALL_RATE``, and to 256 pairs."""
         relay, clock, sent = self.relay()
         for _ in range(10):
             for number in range(400):
@@ -218,7 +218,7 @@ class RelayTests(SiegeCase):
         self.assertLessEqual(len(relay), MAX_PAIRS)
 
     def test_no_carrying_in_circles(self) -> None:
-        """What comes to a node by others is not carried on, nor is what is too long, empty or for the sender."""
+        """A relay does not forward datagrams that were relayed, are too long or empty, or address their sender."""
         relay, _, sent = self.relay()
         session: Any = OneSession(b"a" * 32)
         far: Any = OneSession(b"c" * 32, relayed(b"d" * 20))

@@ -1,4 +1,4 @@
-"""Attack S9: to surround a key or a node by identities of one's own, to poison tables, to lie in lookups."""
+"""Attack S9: surround a key or a node with the attacker's identities, poison tables, and lie in lookups."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ K = 8
 
 
 def sybils(count: int, seed: int = 1) -> list[Contact]:
-    """Identities that somebody made up, each at an address of its own."""
+    """Return invented identities, each with another address."""
     dice = random.Random(seed)
     return [
         Contact(dice.randbytes(32), Address(f"10.{6 + n // 65025}.{n // 255 % 255}.{1 + n % 254}", 666))
@@ -31,12 +31,12 @@ def sybils(count: int, seed: int = 1) -> list[Contact]:
 
 class OutsiderTests(SiegeCase):
     def everybody(self, team: Village) -> set[bytes]:
-        """The keys that anybody in the team takes for a member's."""
+        """Return the keys that the nodes of the team regard as members."""
         nodes = [house.node for house in team.houses]
         return {contact.public for node in nodes for contact in node.overlay.contacts()}
 
     def test_ten_thousand_around_a_key(self) -> None:
-        """Ten thousand identities next to a key, named by all that was ever asked, enter no table; the key is read."""
+        """Ten thousand identities near a key enter no table, although a member names them; the key stays readable."""
         team = self.village()
         for name in ("dog", "cat", "pig", "cow"):
             team.enlist(name)
@@ -46,7 +46,7 @@ class OutsiderTests(SiegeCase):
         crowd = sorted(sybils(10_000), key=lambda each: int.from_bytes(node_id(each.public)) ^ int.from_bytes(key))
         for house in team.houses:
             self.assertFalse(crowd[0] in house.node.overlay.contacts())
-        bad, _ = self.insider(team, "bad")  # one that got in, and names all the others
+        bad, _ = self.insider(team, "bad")  # a member that names the invented identities
         page = [contact.packed() for contact in crowd[:K]]
         bad.expose("find_node", lambda peer, target: page)
         bad.expose("members", lambda peer, after: page)
@@ -61,7 +61,7 @@ class OutsiderTests(SiegeCase):
         self.assertLessEqual(members, self.everybody(team))
 
     def test_identities_without_certificates(self) -> None:
-        """Who has the team's secret and invents identities is refused, each time by name, and is in no table."""
+        """Invented identities with the team's secret but no certificate are refused, and enter no table."""
         team = self.village()
         secret = team.houses[0].team.secret
         refused = 0
@@ -77,7 +77,7 @@ class OutsiderTests(SiegeCase):
 
 class TableTests(SynchronousTestCase):
     def test_flushed_by_ever_new_ids(self) -> None:
-        """Ten thousand newcomers displace nobody who keeps answering."""
+        """Ten thousand newcomers displace no contact that answers."""
         old, [me] = sybils(40, 3), sybils(1, 2)
         table = RoutingTable(me.node_id, K)
         for contact in old:
@@ -91,7 +91,7 @@ class TableTests(SynchronousTestCase):
         self.assertLess(len(table), 40 * K)
 
     def test_own_id(self) -> None:
-        """Nobody enters as the node itself."""
+        """A contact with the node's own id is not added."""
         [contact] = sybils(1)
         table = RoutingTable(contact.node_id, K)
         table.saw(contact, 0.0)
@@ -100,7 +100,7 @@ class TableTests(SynchronousTestCase):
 
 class InsiderTests(FleetCase):
     def lied(self, fleet: Fleet, share: float) -> list[int]:
-        """Let some members name only each other, hold nothing back and find nothing; gives the honest places."""
+        """Let a share of the members lie in lookups and discard records; return the honest members."""
         dice = random.Random(4)
         count = round(share * len(fleet.nodes))
         liars = sorted(dice.sample(range(1, len(fleet.nodes)), count))
@@ -119,7 +119,7 @@ class InsiderTests(FleetCase):
         return [place for place in range(len(fleet.nodes)) if place not in liars]
 
     def share_read(self, share: float) -> float:
-        """The share of 40 keys that honest members read as they were written, written before anybody lied."""
+        """Return the share of 40 keys, written before the lies, that honest members read correctly."""
         fleet = self.fleet(20)
         fleet.run(10.0)
         values = {hashed_key(f"k{number}"): b"%d" % number for number in range(40)}
@@ -137,12 +137,12 @@ class InsiderTests(FleetCase):
         return right / len(values)
 
     def test_thirty_of_a_hundred(self) -> None:
-        """With 10 % of the members lying every key is read as it was written, with 20 % 99 and with 30 % 95 of 100."""
+        """With 10 % of the members lying all keys are read correctly, with 20 % 99 %, and with 30 % 95 %."""
         for share, least in ((0.10, 1.0), (0.20, 0.99), (0.30, 0.95)):
             self.assertGreaterEqual(self.share_read(share), least, share)
 
     def test_liars_bring_nobody_in(self) -> None:
-        """Whom liars name enters no table before it has proved its key at its address."""
+        """Contacts that liars name enter no table before they prove their key at their address."""
         fleet = self.fleet(12)
         fleet.run(5.0)
         self.lied(fleet, 0.3)

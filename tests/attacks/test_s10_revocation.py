@@ -1,4 +1,4 @@
-"""Attack S10: a member that was stolen or went bad; the operator revokes it, and within ten seconds it is out."""
+"""Attack S10: a stolen or malicious member; within ten seconds of its revocation it is excluded."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ IN_FORCE = 10.0
 
 
 class RevocationCase(SiegeCase):
-    """A team, one of whom is not what it was."""
+    """A team with one malicious member."""
 
     members = 9
 
@@ -27,11 +27,11 @@ class RevocationCase(SiegeCase):
         self.others = [house for house in self.team.houses if house is not self.bad]
 
     def revoke(self) -> None:
-        """The operator says it at the first house."""
+        """Publish the revocation at the first node."""
         self.team.tell(self.team.signer.revoke(self.bad.public, self.bad.name, self.team.wall()))
 
     def out(self, among: list[House]) -> list[str]:
-        """Who of these still has anything to do with it."""
+        """Return the nodes that still have a contact, a session or a membership entry of the revoked member."""
         return [
             house.name
             for house in among
@@ -41,11 +41,11 @@ class RevocationCase(SiegeCase):
         ]
 
     def refusals(self, bare: Any, among: list[House]) -> set[str]:
-        """What hands that go on with the stolen identity are told."""
+        """Return the refusals that an attacker with the stolen identity gets."""
         return {self.refusal(self.team, bare.ask, house, 0.5) for house in among}
 
     def bare(self, at: int = 1, life: int = 2**62) -> Any:
-        """Hands with the identity, the pass and the secret of the stolen store, on another machine, in a later life."""
+        """Return an endpoint with identity, certificate and secret of the stolen store, on another machine."""
         paper: Membership = self.bad.kept.membership
         where = SOURCE._replace(port=600 + at)
         return self.attacker(self.team, paper.identity, paper.secrets[0][1], paper.shown, where, life)
@@ -55,7 +55,7 @@ class TwentyTests(RevocationCase):
     members = 20
 
     def test_out_within_ten_seconds(self) -> None:
-        """After ten seconds nobody of a connected team knows it, and whoever it asks says ``revoked``."""
+        """After ten seconds no connected node has the member, and each refuses it with ``revoked``."""
         self.revoke()
         self.team.run(IN_FORCE)
         self.assertEqual(self.out(self.others), [])
@@ -63,7 +63,7 @@ class TwentyTests(RevocationCase):
         self.assertEqual(self.refusals(self.bare(), self.others), {"revoked"})
 
     def test_after_a_cut(self) -> None:
-        """Those behind a cut hear of it within ten seconds after it heals, wherever the revoked one is."""
+        """Nodes behind a partition exclude the member within ten seconds after it heals."""
         near = self.team.houses[:12]
         far = self.team.houses[12:]
         self.team.board.partition([self.team.address_of(each) for each in near])
@@ -78,7 +78,7 @@ class TwentyTests(RevocationCase):
 
 class RevocationTests(RevocationCase):
     def test_across_a_restart(self) -> None:
-        """Nodes that were restarted since still refuse it, with nobody there to ask."""
+        """Restarted nodes still refuse the member, without any other node to ask."""
         self.revoke()
         self.team.run(IN_FORCE)
         self.team.close(self.bad, is_sudden=True)
@@ -95,15 +95,15 @@ class RevocationTests(RevocationCase):
         self.assertEqual(self.refusals(self.bare(2), self.others[:4]), {"revoked"})
 
     def test_a_copy_of_its_store(self) -> None:
-        """A copy of its store on another machine gets no further, in whatever life."""
+        """A copy of the member's store on another machine is refused, with an older or newer life number."""
         self.revoke()
         self.team.run(IN_FORCE)
-        for number, life in enumerate((1, 2**62)):  # of an older life it is told as well that there is a newer one
+        for number, life in enumerate((1, 2**62)):  # with an older life number the refusal may also name the newer life
             told = self.refusals(self.bare(number, life), self.others[:3])
             self.assertLessEqual(told, {"revoked", "doubled"} if life == 1 else {"revoked"})
 
     def test_its_bootstrap_days_are_over(self) -> None:
-        """A revoked bootstrap lets nobody in: whom it lets in afterwards is refused by all."""
+        """A revoked bootstrap node admits no newcomer."""
         code = self.team.invite("pup")
         self.revoke()
         self.team.run(IN_FORCE)
@@ -113,7 +113,7 @@ class RevocationTests(RevocationCase):
         self.assertNotIn("pup", self.team.members())
 
     def test_what_it_wrote_on_lease_goes(self) -> None:
-        """What it said of itself on lease is gone when it is; what it wrote for the team stays, as signed."""
+        """Leased records of the revoked member expire."""
         key = hashed_key("devices")
         self.outcome(self.team, self.bad.node.put(key, "dog7", b"here", "leased"))
         self.assertEqual(len(self.outcome(self.team, self.others[0].node.get(key))), 1)
@@ -122,7 +122,7 @@ class RevocationTests(RevocationCase):
         self.assertEqual(self.outcome(self.team, self.others[0].node.get(key)), [])
 
     def test_after_the_secret_is_rotated(self) -> None:
-        """With another secret it cannot even open a handshake: nobody answers a thing."""
+        """After a rotation of the secret the revoked member gets no answer to a handshake."""
         self.revoke()
         members = [house.public for house in self.others]
         self.team.run(2.0)

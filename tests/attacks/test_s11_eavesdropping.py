@@ -1,7 +1,7 @@
-"""Attack S11: to read along: names, tasks, positions, words and keys in everything that a team sends.
+"""Attack S11: read names, tasks, positions, messages and keys in the datagrams of a team.
 
-Here every byte on the switchboard is searched; ``tests/live/test_eavesdropping.py`` does the same to real datagrams
-with a socket that hears all of loopback.
+This module searches every byte on the switchboard; ``tests/live/test_eavesdropping.py`` does the same for real
+datagrams on loopback.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ PLACE = b'{"x": 12.345678, "y": -7.891011}'
 
 
 def forms(secret: bytes) -> set[bytes]:
-    """How a secret may stand in a datagram."""
+    """Return the encodings in which a secret could appear in a datagram."""
     return {secret, secret.hex().encode(), base64.b64encode(secret)[:-2], secret[::-1]}
 
 
 def found(stream: Iterable[bytes], needles: Iterable[bytes]) -> list[bytes]:
-    """Which of the needles stand in any of the datagrams."""
+    """Return the needles that occur in any of the datagrams."""
     whole = b"\0\0\0\0".join(stream)
     return [needle for needle in needles if needle in whole]
 
 
 class EavesdroppingTests(SiegeCase):
     def setUp(self) -> None:
-        """Joining by code, writing, reading, watching, calling, leaving, all of it on tape."""
+        """Record a join by code, writes, reads, watches and calls."""
         super().setUp()
         self.team = self.village()
         self.tape = Tape()
@@ -51,20 +51,20 @@ class EavesdroppingTests(SiegeCase):
         self.heard = [datagram for _, datagram, _ in self.tape.heard]
 
     def test_nothing_is_readable(self) -> None:
-        """No name, task, position or word of a person stands in any datagram, whole or as hexadecimal or base64."""
+        """No datagram contains a name, task, position or message, in plain text, hexadecimal or base64."""
         self.assertGreater(len(self.heard), 100)
         self.assertGreater(sum(map(len, self.heard)), 50_000)
         needles = set().union(*(forms(word.encode()) for word in (*WORDS, "device.message", "find_value", "place")))
         self.assertEqual(found(self.heard, needles | {PLACE, b"12.345678", b"-7.8910", b"capabilities"}), [])
 
     def test_nobody_is_told_by_its_key(self) -> None:
-        """Neither public keys nor node ids nor keys of records travel in clear: who listens cannot tell who talks."""
+        """No datagram contains a public key, node id or record key, which would identify the peers."""
         keys = [house.public for house in self.team.houses]
         needles = set().union(*(forms(each) for each in (*keys, *map(node_id, keys), self.key)))
         self.assertEqual(found(self.heard, needles), [])
 
     def test_no_secret_and_no_pass(self) -> None:
-        """Nor do secrets of the team, seeds of identities, passes, or what the operator signed."""
+        """No datagram contains the team's secrets, identity seeds, certificates or statements of the operator."""
         secret = self.team.houses[0].team.secret
         seeds = [house.kept.membership.seed for house in self.team.houses]
         shown = [house.kept.membership.shown for house in self.team.houses]
@@ -74,14 +74,14 @@ class EavesdroppingTests(SiegeCase):
         self.assertEqual(found(self.heard, needles), [])
 
     def test_the_ear_hears(self) -> None:
-        """The search finds what does stand in clear: the fingerprint of the team in an ECHO."""
+        """The search finds the only plain text, the fingerprint of the team in an ECHO."""
         self.outcome(self.team, self.dog.node.endpoint.hail(self.team.address(0)))
         heard = [datagram for _, datagram, _ in self.tape.heard]
         fingerprint = self.team.houses[0].team.door.fingerprint
         self.assertEqual(found(heard, [fingerprint]), [fingerprint])
 
     def test_the_same_word_looks_different(self) -> None:
-        """The same message twice shares no eight bytes with itself, so that repetition tells nothing."""
+        """Two equal messages share no eight bytes, which hides the repetition."""
         contact = self.team.contact(self.team.houses[0])
         start = len(self.tape.heard)
         for _ in range(2):

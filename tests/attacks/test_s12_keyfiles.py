@@ -1,4 +1,4 @@
-"""Attack S12: to come by keys: from files that others can read, from logs, from what a node says of itself."""
+"""Attack S12: get keys from files that other users can read, from logs, or from a node's answers."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.middleware.admission.paper import operator as drawn
 
 class FileTests(SiegeCase):
     def setUp(self) -> None:
-        """A membership and an operator's key, each in its file."""
+        """Write a membership and an operator's key, each to a file."""
         super().setUp()
         self.folder = Path(self.mktemp())
         self.folder.mkdir()
@@ -35,7 +35,7 @@ class FileTests(SiegeCase):
         operator.made(self.folder / "operator", self.signer)
 
     def test_made_for_the_owner_alone(self) -> None:
-        """New and replaced files, and those of the store, have the mode 0600, whatever the process lets others read."""
+        """New and replaced key files, and the files of the store, have the mode 0600 under any umask."""
         before = os.umask(0)
         self.addCleanup(os.umask, before)
         membership.made(self.folder / "other", self.paper)
@@ -48,7 +48,7 @@ class FileTests(SiegeCase):
             self.assertEqual(stat.S_IMODE(path.stat().st_mode), 0o600, path)
 
     def test_readable_by_others(self) -> None:
-        """With any right for anybody else each of them is refused, and the remedy is named."""
+        """A key file with any permission for other users is refused, and the error names the remedy."""
         for path, load in self.files.items():
             for mode in (0o640, 0o604, 0o660, 0o606, 0o620, 0o602, 0o601, 0o610, 0o777):
                 path.chmod(mode)
@@ -58,7 +58,7 @@ class FileTests(SiegeCase):
             load(path)
 
     def test_no_file_at_all(self) -> None:
-        """A folder, a link to nowhere and rubbish are refused by name, and no content of them is said."""
+        """A folder, a dangling link and invalid content are refused, and the error does not contain the content."""
         (self.folder / "dir").mkdir()
         (self.folder / "nowhere").symlink_to(self.folder / "gone")
         (self.folder / "rubbish").write_bytes(b'{"seed": "topsecretseed"')
@@ -69,24 +69,24 @@ class FileTests(SiegeCase):
                 self.assertNotIn("topsecretseed", str(error))
 
     def test_one_for_the_other(self) -> None:
-        """An operator's key is no membership, and a membership is no operator's key."""
+        """An operator's key file is not accepted as a membership, and the reverse."""
         self.assertRaises(BadKeyFile, MembershipFile, self.folder / "operator")
         self.assertRaises(BadKeyFile, operator.load, self.folder / "membership")
 
     def test_a_member_has_no_operators_key(self) -> None:
-        """The operator's secret stands in no member's file."""
+        """A member's file does not contain the operator's secret."""
         self.assertNotIn(self.signer.seed.hex(), (self.folder / "membership").read_text())
         self.assertNotIn(self.signer.seed.hex(), str(keyfile.read(self.folder / "membership")))
 
 
 class SaidTests(SiegeCase):
     def setUp(self) -> None:
-        """Everything that is logged is kept, with its fields."""
+        """Record all log events with their fields."""
         super().setUp()
         self.events = events_of(self)
 
     def secrets(self, team: Any) -> list[str]:
-        """Every secret of a team, in the forms that a text may have."""
+        """Return every secret of a team, in the forms in which a text could contain it."""
         raw = [team.signer.seed]
         for house in team.houses:
             kept = house.kept.membership
@@ -94,7 +94,7 @@ class SaidTests(SiegeCase):
         return [form for each in raw for form in (each.hex(), repr(each)[2:-1], base64.b64encode(each).decode()[:-1])]
 
     def test_nothing_in_logs(self) -> None:
-        """A team joins, invites, admits, refuses, revokes, rotates and restarts, and no secret or code is logged."""
+        """No log event contains a secret or code while a team joins, invites, admits, refuses, revokes and rotates."""
         team = self.village()
         dog = team.welcome("dog")
         code = team.invite("cat")
@@ -117,7 +117,7 @@ class SaidTests(SiegeCase):
         self.assertEqual([each for each in (*self.secrets(team), code) if each in text], [])
 
     def test_nothing_in_representations(self) -> None:
-        """What stands for an identity, a membership, an operator or a welcome in a traceback shows no secret."""
+        """The ``repr`` of an identity, a membership, an operator and a join reply contains no secret."""
         team = self.village()
         house = team.houses[0]
         shown = [
@@ -130,7 +130,7 @@ class SaidTests(SiegeCase):
         self.assertEqual([each for each in self.secrets(team) if each in "\n".join(shown)], [])
 
     def test_nothing_is_told_to_members(self) -> None:
-        """What any member may ask for holds neither another's seed nor the operator's key."""
+        """The answers that any member can request contain neither another member's seed nor the operator's key."""
         team = self.village()
         team.enlist("dog")
         bare, _ = self.insider(team, "eye", "viewer")

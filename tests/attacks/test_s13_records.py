@@ -1,4 +1,4 @@
-"""Attack S13: records of owners that no certificate covers: invented keys, revoked keys, and one owner that floods."""
+"""Attack S13: records of owners without a certificate: invented keys, revoked keys, and one owner that floods."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ STOP = bytes(range(16))
 
 
 def written(owner: Identity, key: bytes, name: str, value: bytes = b"\xc3", sequence: int = 1) -> Record:
-    """A team record with a good signature of its owner."""
+    """Return a team record with a valid signature of its owner."""
     return Record(key, name, owner.public, sequence, "team", 3600.0, value).signed(owner)
 
 
 class RecordCase(SiegeCase):
-    """A team of four that are in touch."""
+    """A team of four connected nodes."""
 
     def setUp(self) -> None:
         super().setUp()
@@ -40,27 +40,27 @@ class RecordCase(SiegeCase):
         self.team.run(10.0)
 
     def forged(self, owner: Identity) -> list[Record]:
-        """The release of a stop, a task, and something else, as their owner would write them."""
+        """Return a release of a stop, a task and another record, signed by ``owner``."""
         release = msgpack.packb(Statement({}, (STOP,), "nobody").packed())
         return [written(owner, HALT, SLOT, release), written(owner, TASKS, "t1"), written(owner, OTHER, "x")]
 
     def holders(self, records: list[Record], among: list[House]) -> list[str]:
-        """Which of these houses have any of the records in their stores."""
+        """Return the nodes that store any of the records."""
         return [h.name for h in among if any(h.node.store.slot(record.slot) is not None for record in records)]
 
     def read(self, records: list[Record], house: House) -> list[Record]:
-        """Which of the records a house reads, by a majority."""
+        """Return the given records that a node reads with the consistency level majority."""
         keys = dict.fromkeys(record.key for record in records)
         found = [self.outcome(self.team, house.node.get(key)) for key in keys]
         return [record for each in found for record in each if record in records]
 
     def watch(self, records: list[Record], house: House) -> list[Watch]:
-        """The watches of a house on the keys of the records."""
+        """Watch the keys of the records at a node."""
         keys = dict.fromkeys(record.key for record in records)
         return [house.node.watch(key, lambda found: None, keep=True) for key in keys]
 
     def works(self, house: House) -> None:
-        """A house writes a record and a tuple, and the operator invites somebody there."""
+        """Check that a node can write a record and a tuple, and publish an invitation."""
         put = house.node.put(hashed_key("own"), "slot", b"\xc3")
         self.assertGreaterEqual(self.outcome(self.team, put), 3)
         space = TupleSpace(house.node, self.team.clock, random.Random(7), "yard")
@@ -70,7 +70,7 @@ class RecordCase(SiegeCase):
         self.team.invite("pup")
 
     def accomplice(self) -> House:
-        """A member whose node holds, hands over and shows whatever it likes."""
+        """Return a member with a node that accepts, transfers and returns any record."""
         house = self.team.houses[-1]
         house.node.replica.may_store = house.node.replica.may_stay = lambda slot: True
         return house
@@ -83,7 +83,7 @@ class InventedKeyTests(RecordCase):
         self.records = self.forged(self.invented)
 
     def test_brought_by_a_viewer(self) -> None:
-        """By no method that takes records a viewer brings in what it signed with an invented key."""
+        """A viewer cannot store records signed with an invented key by any method that accepts records."""
         team = self.team
         viewer, own = self.insider(team, "eye", VIEWER)
         viewer.expose("watch", lambda peer, key, digest, ttl=8.0: [0, [[], None]], changes=True)
@@ -111,7 +111,7 @@ class InventedKeyTests(RecordCase):
         self.assertEqual(self.read(self.records, team.houses[0]), [])
 
     def test_told_by_a_lying_replica(self) -> None:
-        """What a replica answers to a read, a watch or a fetch is not believed of an owner that nobody certified."""
+        """A reader ignores records of uncertified owners in a replica's answers to a read, a watch or a fetch."""
         team, house = self.team, self.team.houses[0]
         liar, _ = self.insider(team, "eye", VIEWER)
         by_key = {record.key: record for record in self.records}
@@ -139,7 +139,7 @@ class InventedKeyTests(RecordCase):
         self.assertEqual(self.holders(self.records, [house]), [])
 
     def test_handed_over_by_an_accomplice(self) -> None:
-        """A whole node that keeps such records hands them to nobody, and no read or watch of others shows them."""
+        """A node that stores such records cannot transfer them, and no read or watch of other nodes returns them."""
         team = self.team
         accomplice = self.accomplice()
         others = [house for house in team.houses if house is not accomplice]
@@ -180,13 +180,13 @@ class RevokedKeyTests(RecordCase):
         self.later = written(self.boss.kept.membership.identity, TASKS, "later", sequence=2**40)
 
     def revoke(self) -> None:
-        """The operator of the team revokes it."""
+        """Revoke the member and stop its node."""
         self.team.tell(self.team.signer.revoke(self.boss.public, self.boss.name, self.team.wall()))
         self.team.run(10.0)
         self.team.close(self.boss, is_sudden=True)
 
     def test_what_it_ordered_before(self) -> None:
-        """What a revoked operator ordered is gone from every store and every watch when the revocation arrives."""
+        """A revoked operator's records disappear from every store and watch when the revocation arrives."""
         watches = [watch for house in self.others for watch in self.watch([self.before], house)]
         self.team.run(3.0)
         self.assertEqual([watch.records for watch in watches], [[self.before]] * len(watches))
@@ -196,7 +196,7 @@ class RevokedKeyTests(RecordCase):
         self.assertEqual(self.read([self.before], self.others[0]), [])
 
     def test_its_stop_stays(self) -> None:
-        """A stop that it ordered before stays in force, across restarts too, and it cannot lift it itself."""
+        """A stop of a revoked operator stays in force, also across restarts, and the operator cannot release it."""
         stop = msgpack.packb(Statement({STOP: "boss"}).packed())
         self.outcome(self.team, self.boss.node.put(HALT, SLOT, stop))
         self.revoke()
@@ -217,7 +217,7 @@ class RevokedKeyTests(RecordCase):
             self.assertNotEqual(house.node.store.slot(release.slot), release)
 
     def test_what_it_signs_afterwards(self) -> None:
-        """What it signs afterwards is refused from the hands of a member, and of an accomplice's whole node."""
+        """Records signed after the revocation are refused from a member, and from an accomplice's node."""
         self.revoke()
         bad, _ = self.insider(self.team, "bad", DEVICE)
         for house in self.others:
@@ -232,7 +232,7 @@ class RevokedKeyTests(RecordCase):
         self.assertEqual(self.read([self.later], honest[0]), [])
 
     def test_after_a_restart(self) -> None:
-        """A node that was off meanwhile neither shows nor keeps what its store has of it, once it hears."""
+        """A node that was off during the revocation drops the stored records when it learns of it."""
         sleeper = self.others[1]
         self.team.close(sleeper)
         self.revoke()
@@ -251,7 +251,7 @@ class RevokedKeyTests(RecordCase):
 
 class FloodTests(RecordCase):
     def test_it_fills_its_own_share_only(self) -> None:
-        """One device that floods every store fills its own share of it, and everybody else goes on."""
+        """A device that floods every store fills only its own share, and all other members can write."""
         team = self.team
         bad, own = self.insider(team, "bad", DEVICE)
         names = [f"{number}" for number in range(JUNK)]
@@ -271,7 +271,7 @@ class FloodTests(RecordCase):
         self.assertEqual(self.outcome(team, asked), [0], "a full owner can still delete")
 
     def test_it_blocks_no_reads(self) -> None:
-        """A member whose share is full at all replicas but one cannot make the reads of a key fail."""
+        """A member with a full share at all replicas but one cannot make the reads of a key fail."""
         team = self.team
         bad, own = self.insider(team, "bad", OPERATOR)
         for house in team.houses[1:]:
@@ -288,7 +288,7 @@ class FloodTests(RecordCase):
 
 class GuestTests(RecordCase):
     def test_second_hand(self) -> None:
-        """A node that joined after the guest left has its record, believes it, and still does after a restart."""
+        """A node that joined after a guest left accepts the guest's record, also after a restart."""
         team = self.team
         guest = team.move_in(team.houses[0].team.guest(bytes(range(32)), "phone"))
         team.run(5.0)

@@ -1,4 +1,4 @@
-"""Attack S14: to outlive a revocation, to fill the membership list, and to be a member that nobody can revoke."""
+"""Attack S14: evade a revocation, fill the membership list, or be a member that cannot be revoked."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ BOOT = identity("boot")
 
 class BackdatingTests(SiegeCase):
     def setUp(self) -> None:
-        """Make a team with a bootstrap node that was revoked, and one member that this node let in before."""
+        """Create a team with a malicious bootstrap node, and a code with five uses."""
         super().setUp()
         self.team: Village = self.village(bootstraps=2)
         self.thief = self.team.houses[1]
@@ -35,20 +35,20 @@ class BackdatingTests(SiegeCase):
         self.packed = known[1]
 
     def mint(self, seed: int, begin: int) -> tuple[Identity, bytes]:
-        """A member that the thief lets in by the code, with a certificate that begins whenever it likes."""
+        """Return a member that the malicious node admits with the code, with a certificate that starts at ``begin``."""
         own = Identity(bytes([seed]) * 32)
         came = (own.public, "", proof(self.code.key, own.public, ""))
         thief = self.thief.kept.membership.identity
         return own, chained(thief, self.grant, (self.packed, self.invite), came, f"dog-{seed}", begin)
 
     def enter(self, own: Identity, shown: bytes, port: int) -> str:
-        """The code with which the first node refuses that member; empty where it is let in."""
+        """Return the code with which the first node refuses the member, or "" if it admits it."""
         secret = self.team.houses[0].kept.membership.secrets[0][1]
         endpoint = self.attacker(self.team, own, secret, shown, SOURCE._replace(port=port))
         return self.refusal(self.team, endpoint.ask, self.team.houses[0], 4.0)
 
     def test_backdated_members(self) -> None:
-        """Members that a revoked bootstrap node makes are refused, whatever their dates; a kept member stays."""
+        """Members admitted by a revoked bootstrap node are refused, whatever their dates; a kept member stays."""
         kept, shown = self.mint(1, int(self.team.wall()))
         self.assertEqual(self.enter(kept, shown, 701), "")
         revoke = self.team.signer.revoke(self.thief.public, "boot1", self.team.wall(), kept=[kept.public])
@@ -61,7 +61,7 @@ class BackdatingTests(SiegeCase):
         self.assertNotIn("dog-2", self.team.members())
 
     def test_revoked_with_all(self) -> None:
-        """Without a list the members that a bootstrap node let in go with it."""
+        """A revocation without kept members also revokes the members that the bootstrap node admitted."""
         own, shown = self.mint(1, int(self.team.wall()))
         self.enter(own, shown, 701)
         self.assertIn("dog-1", self.team.members())
@@ -70,14 +70,14 @@ class BackdatingTests(SiegeCase):
         self.assertNotIn("dog-1", self.team.members())
 
     def test_more_uses_than_the_code_has(self) -> None:
-        """A bootstrap node that lets in more by a code than it is good for finds no room on the list for them."""
+        """A bootstrap node cannot list more members for a code than the code has uses."""
         codes = [self.enter(*self.mint(number, int(self.team.wall())), 700 + number) for number in range(1, 9)]
         self.assertEqual(codes, [""] * 5 + [UNLISTED] * 3)
 
 
 class RoomTests(SiegeCase):
     def test_room_for_the_operator(self) -> None:
-        """A list that a bootstrap node filled takes the operator's revocation, which makes room again."""
+        """A membership list that a bootstrap node filled accepts the operator's revocation, which frees space."""
         signer = operator(1)
         roll = Roll(signer.public)
         grant = granted(signer, "boot", "bootstrap")
@@ -102,7 +102,7 @@ class RoomTests(SiegeCase):
 
 class UnlistedTests(SiegeCase):
     def test_who_is_met_is_listed(self) -> None:
-        """A member that shows a grant which it kept to itself is on every list after its first session."""
+        """A member with an unlisted grant is on every list after its first session, and can be revoked."""
         team = self.village()
         team.enlist("cat")
         hidden, own = self.insider(team, "ghost", "viewer")
@@ -116,7 +116,7 @@ class UnlistedTests(SiegeCase):
         self.assertIsInstance(error, NotAdmitted)
 
     def test_any_key_can_be_revoked(self) -> None:
-        """A key that is on no list can be revoked, and its certificate is refused from then on."""
+        """An unlisted key can be revoked, and its certificate is refused from then on."""
         team = self.village()
         paper = team.paper("ghost", "viewer")
         public = paper.identity.public
@@ -127,7 +127,7 @@ class UnlistedTests(SiegeCase):
 
 class GuestTests(SiegeCase):
     def test_guests_of_one_gateway_are_few(self) -> None:
-        """A node lets in so many guests of one gateway at a time, and refuses the others by name."""
+        """A node admits a limited number of guests of one gateway, and refuses the others with the reason."""
         team = self.village()
         paper = team.paper("gate", "gateway")
         refused = []

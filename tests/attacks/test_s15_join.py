@@ -1,4 +1,4 @@
-"""Attack S15: a member answers a newcomer in the operator's place, or with terms that the operator never gave."""
+"""Attack S15: a member replies to a newcomer instead of a bootstrap node, or with forged terms."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ Answer = Callable[[bytes, Knock], bytes]
 
 
 class JoinTests(SiegeCase):
-    """A team with a code that is open, and a hostile member that knows all that a member knows."""
+    """A team with an open code, and a hostile member with the knowledge of a member."""
 
     def setUp(self) -> None:
         super().setUp()
@@ -49,7 +49,7 @@ class JoinTests(SiegeCase):
         self.terms = terms
 
     def check_true_team(self, answer: Answer) -> None:
-        """Let the hostile member ``answer`` each KNOCK first, then a bootstrap node; the true team has to be joined."""
+        """Let the hostile member ``answer`` each KNOCK before a bootstrap node; the real team must be joined."""
         network = self.team.board.network(*DOOR)
         answered: list[Knock] = []
 
@@ -74,17 +74,17 @@ class JoinTests(SiegeCase):
         self.assertEqual(membership.secrets[0][1], self.team.houses[0].kept.membership.secrets[0][1])
 
     def signer(self, identity: Identity, granted: Identity, role: str, terms: bytes = b"") -> Signer:
-        """A node that answers with the true operator's grant for the key of ``granted``, by the true or other terms."""
+        """Return a node that replies with the operator's grant for ``granted``, and with the real or other terms."""
         grant = self.team.signer.grant(granted.public, "eye", (role,), self.team.wall())
         return Signer(identity, grant, terms or self.terms)
 
     def give(self, signer: Signer, shown: bytes) -> Answer:
-        """Answer each KNOCK with a pass and a secret that the operator never gave."""
+        """Answer each KNOCK with a certificate and secret that the operator did not issue."""
         given = Welcome(shown, ((9, b"x" * 32, 0),))
         return lambda datagram, heard: knock.welcome(self.invitation, heard, given, signer, self.rng)
 
     def forge(self, heard: Knock, operator: Operator, terms: bytes) -> bytes:
-        """Make a complete WELCOME by another operator: invitation, bootstrap node, pass and all."""
+        """Return a complete WELCOME of another operator, with its invitation, bootstrap node and certificate."""
         boot, now = Identity(b"b" * 32), int(self.team.wall())
         grant = operator.grant(boot.public, "boot", ("bootstrap",), now)
         invite = Invite(self.invitation, "dog", ("device",), 1, now, now + 3600, 3600)
@@ -94,21 +94,21 @@ class JoinTests(SiegeCase):
         return knock.welcome(self.invitation, heard, given, Signer(boot, grant, terms), self.rng)
 
     def test_another_operator(self) -> None:
-        """A member that answers for an operator of its own, with terms of its own making, is not believed."""
+        """A reply for another operator with its own terms is rejected."""
         impostor = Operator("yard", b"i" * 32, {"presence_lease": 9.0})
         false = Code(self.code.secret ^ 1, mark_of(impostor.public))
         terms = seal_terms(false, TermsContent(impostor.public, "yard", impostor.settings), self.rng)
         self.check_true_team(lambda datagram, heard: self.forge(heard, impostor, terms))
 
     def test_another_operator_with_the_true_terms(self) -> None:
-        """The true terms name the true operator, so a bootstrap node of another one cannot answer with them."""
+        """The real terms name the real operator, which rejects a reply by another operator's bootstrap node."""
         impostor = Operator("yard", b"i" * 32)
         self.check_true_team(lambda datagram, heard: self.forge(heard, impostor, self.terms))
 
     def test_an_operator_with_the_same_mark(self) -> None:
-        """Twenty bits of the operator's key are no proof: without the code's secret nobody seals terms for it."""
+        """An operator key with the same 20-bit mark is not enough: sealing terms needs the code's secret."""
         impostor = Operator("yard", b"i" * 32)
-        # A search for a key with the mark of the code takes a minute; instead the code has the mark of the key.
+        # A search for a key with the code's mark takes a minute; instead the code gets the mark of the key.
         code = Code(self.code.secret, mark_of(impostor.public))
         self.invitation = code.key.public
         false = Code(self.code.secret ^ 1, code.mark)
@@ -119,12 +119,12 @@ class JoinTests(SiegeCase):
         self.assertRaises(Forged, knock.opened_welcome, said, code, NEWCOMER.public, b"e" * 32)
 
     def test_secrets_of_a_member(self) -> None:
-        """A member without the role bootstrap can give no secret and no pass in the true operator's name."""
+        """A member without the role bootstrap cannot issue a secret or certificate in the operator's name."""
         signer = self.signer(self.eye.team.identity, self.eye.team.identity, "viewer")
         self.check_true_team(self.give(signer, self.eye.kept.membership.shown))
 
     def test_a_grant_of_another_node(self) -> None:
-        """The terms, a grant and the newcomer's own pass, which every member knows, do not let another key sign."""
+        """The terms, a grant and the newcomer's certificate, known to every member, do not let another key sign."""
         self.team.knock(self.code.text, seed=NEWCOMER.seed)
         self.team.run(8.0)
         admission = self.eye.team.roll.admitted(NEWCOMER.public)
@@ -133,7 +133,7 @@ class JoinTests(SiegeCase):
         self.check_true_team(self.give(signer, admission.shown))
 
     def test_terms_of_another_invitation(self) -> None:
-        """Terms that the operator sealed for another code open with that code only."""
+        """Terms sealed for another code can be opened only with that code."""
         other = self.team.signer.invite("cat", ("device",), 1, self.team.wall(), 3600.0, random.Random(9))
         statement = opened(self.team.signer.public, other.terms)
         assert isinstance(statement, Terms)
@@ -142,7 +142,7 @@ class JoinTests(SiegeCase):
         self.check_true_team(self.give(signer, self.team.houses[0].kept.membership.shown))
 
     def test_an_old_answer(self) -> None:
-        """The recorded answer to an earlier attempt, by the true bootstrap node, does not open for a later one."""
+        """A recorded reply of the real bootstrap node cannot be opened in a later attempt."""
         boot = self.team.houses[0].team.identity
         old = Knock(NEWCOMER.public, bindings.crypto_scalarmult_base(b"o" * 32), "", b"")
         answer = self.give(self.signer(boot, boot, "bootstrap"), self.team.houses[0].kept.membership.shown)
@@ -150,7 +150,7 @@ class JoinTests(SiegeCase):
         self.check_true_team(lambda datagram, heard: recorded)
 
     def test_a_forged_refusal(self) -> None:
-        """A refusal that a member without the role bootstrap signs does not end the attempt."""
+        """A refusal signed by a member without the role bootstrap does not end the attempt."""
         signer = self.signer(self.eye.team.identity, self.eye.team.identity, "viewer")
         self.check_true_team(lambda datagram, heard: knock.refusal(self.invitation, heard, "used", signer, self.rng))
 
@@ -159,7 +159,7 @@ class JoinTests(SiegeCase):
         self.check_true_team(lambda datagram, heard: knock.hint(knock.id_of(datagram), "used"))
 
     def test_an_invitation_without_terms(self) -> None:
-        """A newcomer with a code of an older version is let in by nobody, and is told to ask for another code."""
+        """A newcomer with a code of an older version is refused with the advice to request another code."""
         village = self.village(seed=3)
         old = village.signer.invite("dog", ("device",), 1, village.wall(), 3600.0, village.dice)
         village.tell(old.invite)
@@ -173,7 +173,7 @@ class SettingsTests(SynchronousTestCase):
     @settings(max_examples=100)
     @given(LINE, LINE)
     def test_no_text_becomes_structure(self, kind: str, membership: str) -> None:
-        """Text in a settings file for a newcomer is read back as that text; it opens no table and sets no other key."""
+        """Text in generated settings is read back as the same text; it adds no table and no key."""
         text = settings_text("dog", membership, ["edge"], None, (), {"kind": kind})
         found = tomllib.loads(text)
         self.assertEqual(set(found), {"node"})
@@ -181,6 +181,6 @@ class SettingsTests(SynchronousTestCase):
         self.assertEqual(set(found["node"]), {"name", "membership", "store", "roles", "kind"})
 
     def test_keys_that_may_be_given(self) -> None:
-        """No key that runs code, opens a page, grants a right or names a file can be given to newcomers."""
+        """Newcomers cannot receive settings that run code, open a page, grant a right or name a file."""
         for key in ("name", "store", "membership", "team_key", "roles", "host", "known_nodes", "tunnels", "deployment"):
             self.assertNotIn(key, SHARED)

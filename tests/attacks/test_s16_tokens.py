@@ -1,4 +1,4 @@
-"""Attack S16: members who want to be operators of the page: tokens, invitations, TLS, failover and guessing."""
+"""Attack S16: members try to become operators of the page: tokens, invitations, TLS, failover and guessing."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ IN_FORCE = 3.0
 
 
 class TokenTeam(VirtualTeam):
-    """Two web nodes with the role gateway (and a third one), and a viewer, eve, who runs whatever she likes."""
+    """Three web nodes with the role gateway, and a viewer, eve, with arbitrary code."""
 
     def __init__(self) -> None:
         super().__init__(16, dogs=(), others=("pi", "nuc", "eve"))
@@ -53,7 +53,7 @@ class TokenTeam(VirtualTeam):
 
 @dataclass
 class Web:
-    """The web node's part of a node."""
+    """The parts of a web node that handle sessions and failover."""
 
     sessions: SignedSessions
     fallbacks: TeamFallbacks
@@ -73,7 +73,7 @@ class PageCase(SynchronousTestCase):
         self.token = self.signed(self.vaio)
 
     def web(self, name: str, port: int) -> Web:
-        """The page of a node, which tells the team where it is."""
+        """Return the page of a node, which announces its address to the team."""
         service = self.team.services[name]
         node, rng = service.assembly.node, random.Random(name)
         settings = replace(service.settings, web=replace(service.settings.web, code=CODE))
@@ -93,23 +93,23 @@ class PageCase(SynchronousTestCase):
         return self.successResultOf(web.sessions.sign_in(proof, source, self.now()))
 
     def refused(self, web: Web, proof: str, source: str = HOME, later: float = 0.0) -> int:
-        """The status with which a sign-in is refused."""
+        """Return the status with which a sign-in is refused."""
         failure = self.failureResultOf(web.sessions.sign_in(proof, source, self.now() + later), Refusal)
         return int(failure.value.status)
 
     def role(self, web: Web, token: str) -> str:
-        """What a token lets do at a web node."""
+        """Return the role that a token gives at a web node."""
         return web.sessions.visitor(token, self.now()).role
 
     def passes(self, web: Web, token: str) -> dict[str, Token]:
-        """What the visitor with a token is given for the other web nodes, by the name of the node."""
+        """Return the visitor's tokens for the other web nodes, by the name of the node."""
         who = web.sessions.visitor(token, self.now())
         nodes = {each.node.uuid: name for name, each in self.webs.items()}
         pages = [page.node for page in web.fallbacks.here() if not page.is_self]
         return {nodes[uuid]: token for uuid, token in web.sessions.passes(who, pages, self.now()).items()}
 
     def tell(self, packed: bytes) -> None:
-        """The operator of the team says something, and it is heard."""
+        """Publish a statement of the operator, and wait for its distribution."""
         self.successResultOf(Deferred.fromCoroutine(self.vaio.node.team.tell(packed)))
         self.run_for(IN_FORCE)
 
@@ -118,21 +118,21 @@ class PageCase(SynchronousTestCase):
         self.tell(self.team.operator.revoke(web.node.entangled.identity.public, name, self.now()))
 
     def rotate(self) -> None:
-        """The operator gives the others a new secret, at once."""
+        """Give the other members a new secret, effective at once."""
         members = [self.webs[name].node.entangled.identity.public for name in ("vaio", "nuc")]
         self.tell(self.team.operator.rotate(2, members, self.now(), 0.0, random.Random(2)))
 
     def secrets(self) -> list[bytes]:
-        """Every secret of the team that anybody has."""
+        """Return every secret of the team."""
         found = [secret for web in self.webs.values() for _, secret, _ in web.node.team.membership.secrets]
         return list(dict.fromkeys(found))
 
     def minted(self, claim: Claim, audience: Web) -> list[str]:
-        """An operator's tokens, made of all that eve has: her own key, and whatever the members have in common."""
+        """Return operator tokens forged with eve's key and with all knowledge that members share."""
         own = TokenKey(self.eve.node.entangled.identity)
         at = audience.node.entangled.identity.node_id
         found = [own.token(claim), own.token(claim, at)]
-        # In the name of the web node, under every key that can be derived from what all members know.
+        # Sign in the name of the web node, with every key that can be derived from the members' knowledge.
         for secret in self.secrets():
             page = hashlib.blake2s(secret, person=b"page").hexdigest()
             for known in (secret, hashlib.blake2s(page.encode()).digest(), hashlib.blake2s(secret).digest()):
@@ -143,7 +143,7 @@ class PageCase(SynchronousTestCase):
 
 
 def old_token(secret: bytes, until: int, limit: int) -> str:
-    """An operator's token as the nodes of earlier versions derived it from the team's secret."""
+    """Return an operator's token in the format of earlier versions, derived from the team's secret."""
     key = hashlib.blake2s(hashlib.blake2b(secret, digest_size=32).digest(), person=b"swarmweb").digest()
     payload = bytes((2, 1 << 1)) + until.to_bytes(5, "big") + limit.to_bytes(5, "big") + bytes(8) + b"eve"
     mac = hashlib.blake2s(payload, key=key, digest_size=16, person=b"swarmweb").digest()
@@ -156,7 +156,7 @@ class MintTests(PageCase):
         return Claim("ab" * 8, "eve", "operator", end, limit=end)
 
     def test_mint_a_token(self) -> None:
-        """No token that a viewer can make is one at any web node, neither as a session nor as an invitation."""
+        """No token that a viewer can forge is valid at any web node, as a session or as an invitation."""
         self.assertEqual(self.role(self.vaio, self.token.text), "operator")
         for web in (self.vaio, self.pi, self.nuc):
             for text in self.minted(self.claim(), web):
@@ -164,7 +164,7 @@ class MintTests(PageCase):
                 self.assertIn(self.refused(web, text, f"10.0.{len(text)}.1"), (401, 429))
 
     def test_mint_after_revoke_and_rotate(self) -> None:
-        """Neither does she after she is revoked and the secret rotated, with the old secrets or the new one."""
+        """After her revocation and a rotation, forged tokens with old and new secrets stay invalid."""
         self.revoke("eve")
         self.rotate()
         self.assertGreater(len(self.secrets()), 1)
@@ -172,12 +172,12 @@ class MintTests(PageCase):
             self.assertEqual(self.vaio.sessions.visitor(text, self.now()), NOBODY)
 
     def test_serve_a_page_oneself(self) -> None:
-        """At her own web node nobody is let in, by code or token: the node has not the role gateway."""
+        """Eve's web node accepts no code or token, because it lacks the role gateway."""
         self.assertEqual(self.refused(self.eve, CODE), 403)
         self.assertEqual(self.role(self.eve, TokenKey(self.eve.node.entangled.identity).token(self.claim())), "anyone")
 
     def test_invite_beyond_oneself(self) -> None:
-        """Whoever was invited until tomorrow invites nobody for longer."""
+        """A guest cannot invite another guest for longer than the guest's own invitation."""
         who = self.vaio.sessions.visitor(self.token.text, self.now())
         invited = self.signed(self.vaio, self.vaio.sessions.token(who, "guest", "operator", self.now(), 3600.0).text)
         guest = self.vaio.sessions.visitor(invited.text, self.now())
@@ -187,7 +187,7 @@ class MintTests(PageCase):
 
 class StandingTests(PageCase):
     def test_revoked_gateway(self) -> None:
-        """What a revoked gateway signed lets in nobody at once, without a restart, nor what was made of it since."""
+        """Tokens of a revoked gateway, and all tokens derived from them, are invalid at once, without a restart."""
         signed = self.signed(self.pi)
         given = self.passes(self.pi, signed.text)
         self.assertEqual(self.role(self.vaio, given["vaio"].text), "operator")
@@ -211,13 +211,13 @@ class StandingTests(PageCase):
         self.assertEqual(self.role(self.vaio, made[0].text), "anyone")
 
     def test_revoked_gateway_serves_nobody(self) -> None:
-        """A gateway that hears that it is revoked, or is a viewer now, lets in nobody, signed in or not."""
+        """A gateway that learns of its revocation, or is now a viewer, accepts no visitors."""
         for name, web in (("pi", self.pi), ("nuc", self.nuc)):
             signed = self.signed(web)
             self.assertEqual(self.role(web, signed.text), "operator")
             if name == "pi":
                 self.revoke(name)
-                # It may be put out before it hears of it; it knows as soon as anybody tells it.
+                # The gateway may be disconnected before the revocation arrives; it reacts as soon as a peer sends it.
                 public = web.node.entangled.identity.public
                 web.node.team._gossip.add(self.team.operator.revoke(public, name, self.now()))
             else:
@@ -227,7 +227,7 @@ class StandingTests(PageCase):
             self.assertEqual(self.refused(web, CODE), 403)
 
     def test_role_taken_away(self) -> None:
-        """The tokens of a gateway that is a viewer now are worth nothing elsewhere."""
+        """Tokens of a gateway that is now a viewer are invalid at other nodes."""
         given = self.passes(self.nuc, self.signed(self.nuc).text)["vaio"]
         self.assertEqual(self.role(self.vaio, given.text), "operator")
         public = self.nuc.node.entangled.identity.public
@@ -237,7 +237,7 @@ class StandingTests(PageCase):
 
 class FailoverTests(PageCase):
     def test_advertise_a_page(self) -> None:
-        """A viewer's page is on nobody's list, its origin may ask nothing, and no token is made for it."""
+        """A viewer's page is not listed, its origin is not allowed, and no token is issued for it."""
         told = {page.node for page in self.pi.fallbacks.here()}
         self.assertIn(self.vaio.node.uuid, told)
         for web in (self.vaio, self.pi, self.nuc):
@@ -248,7 +248,7 @@ class FailoverTests(PageCase):
         self.assertEqual(self.vaio.sessions.passes(who, [], self.now()), {})
 
     def test_use_a_token_elsewhere(self) -> None:
-        """What was made for one web node lets in nobody at another, so it is worth nothing to whoever sees it there."""
+        """A token for one web node is invalid at all others, and thus useless to them."""
         given = self.passes(self.vaio, self.token.text)
         self.assertEqual(sorted(given), ["nuc", "pi"])
         for name, token in given.items():
@@ -259,14 +259,14 @@ class FailoverTests(PageCase):
             self.assertEqual((self.role(web, self.token.text), self.role(web, self.token.ticket)), ("anyone",) * 2)
 
     def test_wait_with_a_token(self) -> None:
-        """What takes a page to another web node lasts minutes, and is renewed there by the session alone."""
+        """A failover token is valid for minutes, and only the session at the new web node renews it."""
         given = self.passes(self.vaio, self.token.text)["pi"]
         self.assertLessEqual(given.until - self.now(), 900.0)
         roles = [self.pi.sessions.visitor(given.text, given.until + late).role for late in (-1.0, 1.0)]
         self.assertEqual(roles, ["operator", "anyone"])
 
     def test_sign_out_everywhere(self) -> None:
-        """Who signs out at one web node is signed out at those to which the page went, too."""
+        """Signing out at one web node also ends the sessions at the web nodes of a failover."""
         given = self.passes(self.vaio, self.token.text)["pi"]
         moved = self.pi.sessions.renewed(self.pi.sessions.visitor(given.text, self.now()), self.now())
         self.assertEqual(self.role(self.pi, moved.text), "operator")
@@ -278,7 +278,7 @@ class FailoverTests(PageCase):
 
 class GuessTests(PageCase):
     def test_guess_from_many_addresses(self) -> None:
-        """Of ten thousand guesses, each from an address of its own, in an hour, few are looked at."""
+        """Of ten thousand guesses in an hour, each from another address, few are checked."""
         looked = 0
         for number in range(10_000):
             source = f"10.{number // 250}.{number % 250}.1"
@@ -286,7 +286,7 @@ class GuessTests(PageCase):
         self.assertLess(looked, 250)
 
     def test_lock_out_nobody(self) -> None:
-        """Meanwhile who is signed in goes on, an invitation signs in, and so do this machine and a known address."""
+        """During an attack sessions are renewed; invitations, loopback and known addresses can sign in."""
         for number in range(1000):
             self.refused(self.vaio, f"guess{number}", f"10.{number // 250}.{number % 250}.1")
         now = self.now()
@@ -301,7 +301,7 @@ class GuessTests(PageCase):
 
 class LogTests(SynchronousTestCase):
     def test_read_the_log(self) -> None:
-        """The log says where the page is, and neither the code nor a link with it."""
+        """The log contains the page's address, but neither the code nor a link with it."""
         self.patch(os, "environ", {**os.environ, "XDG_RUNTIME_DIR": self.mktemp()})
         with capturedLogs() as said:
             invitation.invited("s16", "127.0.0.1", lambda: 8080, CODE)
@@ -312,7 +312,7 @@ class LogTests(SynchronousTestCase):
 
 class RebindingTests(SynchronousTestCase):
     def test_rebind_a_local_name(self) -> None:
-        """A name of the LAN that is not the node's own is refused; its own and those of the settings serve."""
+        """A Host header with an unknown local name is refused; the node's and the configured names are accepted."""
         board, state = Board(MemoryDesk(), OpenSessions()), state_of([], [], {}, node="vaio")
         client = create_app(lambda: state, board, hosts=("vaio", "vaio.local", "robots.lan")).test_client()
 
@@ -330,7 +330,7 @@ class TlsTests(PageCase):
         skip = "TLS IS NOT TESTED: missing OpenSSL or cryptography (pip install 'swarm-node[tls]')"
 
     def test_sign_a_leaf(self) -> None:
-        """No key that follows from the team's secrets is that of a web node's authority; each node has its own."""
+        """No key that can be derived from the team's secrets is a web node's TLS authority; each node has another."""
         from webnode.certificate import authority
         from webnode.tls import door
 

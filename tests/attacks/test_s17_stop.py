@@ -1,4 +1,4 @@
-"""Attack S17: a member tries to release a stop, to disable later ones, or to have one forgotten."""
+"""Attack S17: a member tries to release a stop, to disable later stops, or to have one forgotten."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ SEQUENCES, STEPS = 3, 25
 
 
 class HaltingTeam(Village):
-    """A closed team each of whose nodes answers ``device.halt``; ``halts`` are those of the present lives, by name."""
+    """A closed team with ``device.halt`` at each node; ``halts`` are the current ones, by name."""
 
     def __init__(self, seed: int) -> None:
         self.halts: dict[str, Halt] = {}
         super().__init__(seed)
 
     def open(self, house: House) -> None:
-        """Begin a life of a node, which stands until it has learnt of the stops."""
+        """Start a node, which stands still until it has learned of the stops."""
         super().open(house)
         node: Any = house.node
         halt = answer_halt(node, self.rng(house.place), node._chores.later, lambda stops, words: None)
@@ -52,13 +52,13 @@ class HaltingTeam(Village):
         return {name: halt.is_on for name, halt in self.halts.items()}
 
     def reopen(self, house: House) -> None:
-        """The next life of a node on the store of the last one."""
+        """Restart a node with its store."""
         self.close(house, is_sudden=True)
         self.open(house)
 
 
 class StopCase(SiegeCase):
-    """A team of an operator ``ann``, a second operator ``bob`` and two robots."""
+    """A team with an operator ``ann``, a second operator ``bob`` and two robots."""
 
     def setUp(self) -> None:
         super().setUp()
@@ -70,7 +70,7 @@ class StopCase(SiegeCase):
         self.assertEqual(set(self.team.is_on().values()), {False})
 
     def stop(self, house: House, others: Sequence[House] | None = None) -> dict[str, str]:
-        """An operator stops the team; what each of those that are told says, by name."""
+        """Let an operator stop the team; return the answers of the nodes, by name."""
         return self.said(self.team.halt(house).stop(house.name, self.contacts(others)))
 
     def release(self, house: House, stops: Sequence[bytes], others: Sequence[House] | None = None) -> dict[str, str]:
@@ -88,14 +88,14 @@ class StopCase(SiegeCase):
         return list(self.team.halt(house).stops)
 
     def ask(self, bare: Any, house: House, *arguments: object) -> Any:
-        """What comes of one call by an attacker."""
+        """Return the result of one call by an attacker."""
         return self.outcome(self.team, bare.ask(self.team.contact(house), METHOD, *arguments, changes=True), 0.2)
 
     def record(self, own: Identity, fields: object, sequence: int = 1) -> Record:
         return Record(HALT, SLOT, own.public, sequence, "team", 600.0, msgpack.packb(fields)).signed(own)
 
     def store(self, bare: Any, record: Record) -> None:
-        """Have every node hold a record, where it takes it."""
+        """Send a record to every node."""
         for house in self.team.houses:
             asked = bare.ask(self.team.contact(house), "store", [record.packed()], changes=True)
             self.outcome(self.team, asked, 0.2)
@@ -104,7 +104,7 @@ class StopCase(SiegeCase):
 
 class DisablingTests(StopCase):
     def test_no_number_disables_a_stop(self) -> None:
-        """An operator's key that sends the greatest numbers, in calls and records, prevents no later stop."""
+        """Huge numbers in an operator's calls and records prevent no later stop."""
         bare, own = self.insider(self.team, "thief", OPERATOR)
         for number in (2**53, 2**63, 2**64 - 1):
             for house in self.team.houses:
@@ -115,7 +115,7 @@ class DisablingTests(StopCase):
         self.assertEqual(set(self.team.is_on().values()), {True})
 
     def test_releases_in_advance_disable_no_stop(self) -> None:
-        """Releases of invented ids, as many as fit into the table and more, end no stop and prevent none."""
+        """Releases of invented ids, more than the table can hold, end no stop and prevent none."""
         bare, own = self.insider(self.team, "thief", OPERATOR)
         self.stop(self.bob)
         dice = random.Random(1)
@@ -130,7 +130,7 @@ class DisablingTests(StopCase):
         self.assertEqual(set(self.team.is_on().values()), {True})
 
     def test_thousands_of_stops_displace_none(self) -> None:
-        """An operator's key that sends thousands of stops fills its own places; others' stops need their release."""
+        """An operator with thousands of stops fills only its own share; other operators' stops stay in force."""
         [stop] = self.only_stop(self.ann)
         _, own = self.insider(self.team, "thief", OPERATOR)
         dice = random.Random(1)
@@ -147,14 +147,14 @@ class DisablingTests(StopCase):
         self.assertFalse(self.team.halt(dog).is_on)
 
     def only_stop(self, house: House) -> list[bytes]:
-        """The stop that an operator has just made."""
+        """Let an operator stop the team, and return the stops."""
         self.stop(house)
         return self.stops(house)
 
 
 class RightsTests(StopCase):
     def test_only_who_may_order(self) -> None:
-        """By call and by record, no role but operator and gateway stops the team or releases a stop."""
+        """By call and by record, only the roles operator and gateway stop the team or release a stop."""
         self.stop(self.ann)
         [stop] = self.stops(self.dogs[0])
         for number, role in enumerate(ROLES):
@@ -169,7 +169,7 @@ class RightsTests(StopCase):
         self.assertEqual({role for role in ROLES if may_call((role,), METHOD)}, {OPERATOR, GATEWAY})
 
     def test_invented_keys_release_nothing(self) -> None:
-        """A viewer signs a release with a key that it invented: replicas may take it, and no node goes on."""
+        """A viewer's release, signed with an invented key, is not obeyed."""
         self.stop(self.ann)
         [stop] = self.stops(self.dogs[0])
         bare, _ = self.insider(self.team, "eye", VIEWER)
@@ -177,7 +177,7 @@ class RightsTests(StopCase):
         self.assertEqual(set(self.team.is_on().values()), {True})
 
     def test_a_revoked_operator_releases_nothing(self) -> None:
-        """The record of a release that an operator signs after it was revoked is not obeyed, whoever hands it on."""
+        """A release record that an operator signs after its revocation is not obeyed, from any sender."""
         self.stop(self.ann)
         [stop] = self.stops(self.dogs[0])
         own = self.bob.kept.membership.identity
@@ -190,7 +190,7 @@ class RightsTests(StopCase):
         self.assertEqual(set(self.team.is_on().values()), {True})
 
     def test_junk_changes_nothing(self) -> None:
-        """Calls and records of the wrong shape are refused or ignored, and break no node."""
+        """Malformed calls and records are refused or ignored."""
         self.stop(self.ann)
         [stop] = self.stops(self.dogs[0])
         bare, own = self.insider(self.team, "thief", OPERATOR)
@@ -219,7 +219,7 @@ class RightsTests(StopCase):
 
 class ReplayTests(StopCase):
     def test_a_replayed_release_ends_no_later_stop(self) -> None:
-        """Every datagram of a release is played again after the next stop, and the released record is stored again."""
+        """A replay of all datagrams and records of a release does not end a later stop."""
         self.stop(self.ann)
         first = self.stops(self.dogs[0])
         tape = Tape()
@@ -240,7 +240,7 @@ class ReplayTests(StopCase):
         self.assertEqual(set(self.team.is_on().values()), {True})
 
     def test_a_released_stop_does_not_come_back(self) -> None:
-        """The record of a released stop, stored again by a replica that was away, stops nothing."""
+        """The record of a released stop, stored again, stops nothing."""
         self.stop(self.ann)
         stop = self.stops(self.dogs[0])
         [old] = [record for record in self.dogs[0].node.store.get(HALT) if record.owner == self.ann.public]
@@ -254,7 +254,7 @@ class ReplayTests(StopCase):
 
 class LossTests(StopCase):
     def test_a_restart_of_all_releases_nothing(self) -> None:
-        """All nodes end at once without a word and come back: all stand at once, before they have asked anybody."""
+        """After a sudden restart of all nodes all stand still at once, before they contact any peer."""
         self.assertEqual(self.stop(self.ann)["dog1"], STANDS)
         for house in self.team.houses:
             self.team.close(house, is_sudden=True)
@@ -267,7 +267,7 @@ class LossTests(StopCase):
         self.assertEqual(set(self.team.is_on().values()), {False})
 
     def test_a_stop_outlives_its_author(self) -> None:
-        """Its author is revoked and its record is gone: all stand, newcomers too, until its id is released."""
+        """A stop stays in force until its release, even if its author is revoked and its record is lost."""
         self.stop(self.bob)
         stop = self.stops(self.dogs[0])
         self.team.tell(self.team.signer.revoke(self.bob.public, "bob", self.team.wall()))
@@ -289,20 +289,20 @@ class LossTests(StopCase):
         self.assertEqual(set(self.team.is_on().values()), {False})
 
     def lose(self, house: House, slot: Slot) -> None:
-        """Let a replica drop a record, as it does when its time is over."""
+        """Let a replica drop a record, like an expired one."""
         record = house.node.store.slot(slot)
         if record is not None and house.node.store.discard(slot):
             house.node.replica._notify_gone([record])
 
     def test_a_stop_that_is_not_saved_says_so(self) -> None:
-        """A node whose disk takes nothing stands, and does not acknowledge the stop as one that would outlast it."""
+        """A node that cannot store a stop obeys it, and answers that the stop is not saved."""
         store: Any = self.dogs[0].node.store
         self.patch(store, "written", lambda: fail(Unwritable("the disk is full")))
         self.assertEqual(self.stop(self.ann)["dog1"], STANDS + UNSAVED)
         self.assertTrue(self.team.halt(self.dogs[0]).is_on)
 
     def test_a_damaged_note_stands(self) -> None:
-        """A node that cannot read what it noted of the stops stands until that is released by its id."""
+        """A node with a corrupt stored entry stands still until that stop is released by its id."""
         self.dogs[0].node.store.note("halt/stops", b"\xc1junk")
         self.team.reopen(self.dogs[0])
         self.team.run(3.0)
@@ -311,7 +311,7 @@ class LossTests(StopCase):
         self.assertEqual(set(self.team.is_on().values()), {False})
 
     def test_a_stop_of_an_earlier_version_stands(self) -> None:
-        """A stop of an earlier version has to be released by its id; a release of an earlier version ends none."""
+        """A stop of an earlier version must be released by its id; a release of an earlier version ends none."""
         own = self.bob.kept.membership.identity
         bare, _ = self.insider(self.team, "dog3", DEVICE)
         self.store(bare, self.record(own, [7, True, "bob"]))
@@ -322,7 +322,7 @@ class LossTests(StopCase):
         self.assertEqual(set(self.team.is_on().values()), {False})
 
     def test_more_senders_than_places(self) -> None:
-        """More operators stop than there are places: each further one stops as well, and all has to be released."""
+        """Beyond the maximum number of senders each further stop is in force, and must be released."""
         dog, dice = self.team.halt(self.dogs[0]), random.Random(1)
         for number in range(MAX_SENDERS + 40):
             peer = Contact(number.to_bytes(32, "big"), SOURCE)
@@ -336,7 +336,7 @@ class LossTests(StopCase):
 
 class SequenceTests(StopCase):
     def test_stop_holds_on_whole_nodes(self) -> None:
-        """Stops, releases, partitions, restarts, a viewer's messages: a stop is kept until a release names it."""
+        """Through stops, releases, partitions, restarts and a viewer's messages, a stop holds until its release."""
         bare, own = self.insider(self.team, "eye", VIEWER)
         for seed in range(SEQUENCES):
             dice = random.Random(seed)
@@ -349,7 +349,7 @@ class SequenceTests(StopCase):
             self.assertEqual(set(self.team.is_on().values()), {False}, seed)
 
     def step(self, dice: random.Random, bare: Any, own: Identity, number: int) -> None:
-        """One thing that happens, and what must hold after it."""
+        """Perform one random step, and check the invariants."""
         house = dice.choice((self.ann, self.bob))
         known = self.stops(house)
         match dice.randrange(6):
@@ -385,5 +385,5 @@ class SequenceTests(StopCase):
             self.assertLessEqual(held[dog.name] - set(self.stops(dog)), self.released(dog))
 
     def released(self, dog: House) -> set[bytes]:
-        """What an operator released, of what a robot knew."""
+        """Return the ids that an operator has released."""
         return {stop for house in (self.ann, self.bob) for stop in self.team.halt(house)._ordered}

@@ -1,4 +1,4 @@
-"""Attack S18: one member tries to break, end, move or block a lease that it does not hold, or to pass as another."""
+"""Attack S18: a member tries to break, end, move or block another's lease, or to use another's name."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class LeaseTeam(Village):
 
 
 class LeaseCase(SiegeCase):
-    """A team with a task, and a member with the role of a device that obeys no rule."""
+    """A team with a task, and a malicious member with the role device."""
 
     def setUp(self) -> None:
         super().setUp()
@@ -74,7 +74,7 @@ class LeaseCase(SiegeCase):
         self.bad, self.own = self.insider(team, "bad", "device")
 
     def lessee(self, place: int) -> Lessee:
-        """The claim of an honest node, given back when the test ends."""
+        """Return the lease client of an honest node, released when the test ends."""
         lessee = self.team.nodes[place].lessee(self.task, lambda: None, 0)
         self.lessees.append(lessee)
         self.addCleanup(self.team.run, 2.0)
@@ -82,7 +82,7 @@ class LeaseCase(SiegeCase):
         return lessee
 
     def held_by(self, place: int, within: float = 1.0) -> Lessee:
-        """The claim of an honest node that wins."""
+        """Return the lease client of an honest node that gets the lease."""
         lessee = self.lessee(place)
         lessee.want()
         self.team.run(within)
@@ -90,12 +90,12 @@ class LeaseCase(SiegeCase):
         return lessee
 
     def assert_won(self, lessee: Lessee) -> None:
-        """It holds the lease, under a token that leaves room for many more."""
+        """Check that the client holds the lease, with a token far below the limit."""
         self.assertIsNotNone(lessee.lease, "an honest node does not win the lease")
         self.assertLess(lessee.token, 2**40)
 
     def attack(self, method: str, *arguments: object) -> list[Any]:
-        """Ask every node the same question, with bare hands; their answers, or errors."""
+        """Send the same request to every node; return the answers or errors."""
         found = []
         for house in self.team.houses:
             asked = self.bad.ask(self.team.contact(house), method, *arguments, changes=True)
@@ -106,7 +106,7 @@ class LeaseCase(SiegeCase):
         return self.attack("store", [record.packed() for record in records])
 
     def members(self) -> list[int]:
-        """The places of the council's members."""
+        """Return the council members' positions in the team."""
         known = [house.public for house in self.team.houses]
         return [known.index(member.public) for member in self.task.council]
 
@@ -116,7 +116,7 @@ class LeaseCase(SiegeCase):
 
 class ReconfigurationTests(LeaseCase):
     def test_forged_council(self) -> None:
-        """A council that one device invents is installed nowhere, and no second node wins the lease through it."""
+        """A council that one device invents is not installed, and no second node gets the lease through it."""
         holder = self.held_by(self.members()[0])
         others = [self.team.contact(self.team.houses[place]) for place in self.outsiders()]
         own = Contact(self.own.public, SOURCE)
@@ -131,7 +131,7 @@ class ReconfigurationTests(LeaseCase):
         self.assertEqual((second.council.configuration, second.council.members), (1, self.task.council))
 
     def test_member_that_lies_about_the_council(self) -> None:
-        """A member that says that the council is another one leads no claimant to it."""
+        """A member that lies about the council redirects no client."""
         holder = self.held_by(self.members()[0])
         liar, accomplices = self.members()[1], self.outsiders()
         forged = tuple(self.team.contact(self.team.houses[place]) for place in accomplices)
@@ -145,7 +145,7 @@ class ReconfigurationTests(LeaseCase):
         self.assertEqual(second.council.members, self.task.council)
 
     def test_council_of_the_device_alone(self) -> None:
-        """Members of a council accept no next one in which a device, with keys that it made up, is a majority."""
+        """A council rejects a change to a council with a majority of the device's own or invented keys."""
         own = Contact(self.own.public, SOURCE).packed()
         invented = [Contact(Identity(bytes([n]) * 32).public, SOURCE).packed() for n in range(2)]
         viewer = Contact(self.insider(self.team, "eye", "viewer", at=SOURCE._replace(port=7))[1].public, SOURCE)
@@ -157,7 +157,7 @@ class ReconfigurationTests(LeaseCase):
         self.held_by(self.outsiders()[0])
 
     def test_certified_council(self) -> None:
-        """With the signatures of the old council a new one is installed, and it goes on above the old tokens."""
+        """A council that the old council signed is installed, and its tokens are higher than the old ones."""
         holder = self.held_by(self.members()[0])
         token = holder.token
         contacts = [self.team.contact(house) for house in self.team.houses]
@@ -172,7 +172,7 @@ class ReconfigurationTests(LeaseCase):
 
 class ClosingTests(LeaseCase):
     def test_device_closes(self) -> None:
-        """A device that holds nothing ends no task: not as an operator, not under the token, not under a higher one."""
+        """A device without the lease cannot close the task, with any token or as an operator."""
         holder = self.held_by(self.members()[0])
         for token in (0, holder.token, holder.token + 1, HUGE):
             self.attack("lease.close", TASK.task_id, 1, token)
@@ -182,21 +182,21 @@ class ClosingTests(LeaseCase):
         self.assertFalse(holder.is_over)
 
     def test_device_closes_before_anybody_acts(self) -> None:
-        """A task that nobody holds yet is not ended by a device either."""
+        """A device cannot close a task without a holder either."""
         for token in (0, 1, HUGE):
             self.attack("lease.close", TASK.task_id, 1, token)
         self.attack("lease.cancel", TASK.task_id, 1)
         self.held_by(2)
 
     def test_operator_closes(self) -> None:
-        """The gateway, which may order, ends the task that another holds."""
+        """The gateway, which may order, closes a task that another node holds."""
         holder = self.held_by(self.members()[0])
         council = self.team.nodes[0].councils.of(self.task)
         self.assertIsNone(self.outcome(self.team, council.close(), 4.0))
         self.assertTrue(holder.is_over)
 
     def test_member_that_says_it_is_over(self) -> None:
-        """One member that lies about the end keeps no healthy claimant from the lease."""
+        """One member that falsely reports the end does not keep a client from the lease."""
         liar = self.members()[1]
         acceptor: Any = self.team.nodes[liar].councils.desk._acceptor
         for name in ("prepare", "lease"):
@@ -206,13 +206,13 @@ class ClosingTests(LeaseCase):
 
 class NumberTests(LeaseCase):
     def test_highest_ballot(self) -> None:
-        """After a device has asked under the highest ballots there are, others still win."""
+        """After a device has used the highest ballots, other nodes still get the lease."""
         for counter in (HUGE, HUGE - 1, 2**61, 2**52, 2**40):
             self.attack("lease.prepare", TASK.task_id, 1, counter, 1.5)
         self.held_by(self.outsiders()[0], 3.0)
 
     def test_highest_token(self) -> None:
-        """After a device has proposed the highest tokens there are, others still win when its lease has run out."""
+        """After a device has proposed the highest tokens, other nodes still get the lease when it expires."""
         for number in range(1, 4):
             self.attack("lease.prepare", TASK.task_id, 1, number * 2**20, 0.1)
             for token in (HUGE + 1, HUGE, 2**61, 2**53, 2**40):
@@ -221,7 +221,7 @@ class NumberTests(LeaseCase):
         self.held_by(self.outsiders()[0], 3.0)
 
     def test_false_news(self) -> None:
-        """A device that tells claimants of the highest token blocks none of them."""
+        """A device that notifies clients of the highest token blocks none of them."""
         place = self.outsiders()[0]
         lessee = self.lessee(place)
         lessee.stand_by(1)
@@ -233,7 +233,7 @@ class NumberTests(LeaseCase):
         self.assert_won(lessee)
 
     def test_member_that_lies_about_numbers(self) -> None:
-        """One member that answers with the highest numbers there are blocks no claimant."""
+        """One member that answers with the highest numbers blocks no client."""
         acceptor: Any = self.team.nodes[self.members()[1]].councils.desk._acceptor
         genuine = acceptor.prepare
 
@@ -251,13 +251,13 @@ class TaskTests(LeaseCase):
         return Record(key, name, own.public, 2**40, "team", 600.0, value).signed(own)
 
     def seen(self) -> dict[str, Task]:
-        """The tasks as every node of the team reads them."""
+        """Return the tasks, which every node must read equally."""
         all_seen = [tasks_of(self.outcome(self.team, node.entangled.get(TASKS), 1.0)) for node in self.team.nodes]
         self.assertTrue(all(seen == all_seen[0] for seen in all_seen))
         return all_seen[0]
 
     def test_task_made_or_altered(self) -> None:
-        """A device makes no task and changes none, its council included."""
+        """A device cannot create or change a task or its council."""
         before = self.seen()
         other = replace(self.task, generation=9, priority=9, council=self.task.council[:1], charter=b"")
         self.store(
@@ -266,7 +266,7 @@ class TaskTests(LeaseCase):
         self.assertEqual(self.seen(), before)
 
     def test_task_concluded(self) -> None:
-        """What a device writes about the end of a task that it does not hold is no end for any node."""
+        """A device's record about the end of another's task is ignored by every node."""
         heard: dict[int, Result | None] = {}
 
         def follow(place: int) -> Group:
@@ -287,7 +287,7 @@ class TaskTests(LeaseCase):
 
 class NameTests(LeaseCase):
     def test_name_of_another(self) -> None:
-        """A device that announces itself under another's name, in the slot or in the value, is not shown under it."""
+        """A device that announces itself under another's name is not listed under it."""
         device = Device(self.own.node_id.hex(), DEVICE_NAME, capabilities={"camera": {"width": 208}}, joined=9)
         for slot in (DEVICE_NAME, "bad"):
             self.store(Record(DEVICES, slot, self.own.public, 1, "leased", 60.0, device.packed()).signed(self.own))
@@ -299,7 +299,7 @@ class NameTests(LeaseCase):
         self.assertEqual(self.names(listing.records), ["bad", "dog1", "dog2", "dog3", "dog4", "vaio"])
 
     def test_two_members_of_one_name(self) -> None:
-        """Of two members to whom the operator gave one name each is shown with the beginning of its id."""
+        """Two members with the same name are listed with a part of their ids."""
         self.team.enlist("dog2", "device")
         self.team.run(2.0)
         listing = self.outcome(self.team, self.team.nodes[0].list_devices(), 2.0)
@@ -310,5 +310,5 @@ class NameTests(LeaseCase):
         return [node for node in self.team.nodes if node.presence.device.name == "dog2"]
 
     def names(self, records: list[Record]) -> list[str]:
-        """The names under which devices are shown."""
+        """Return the names under which devices are listed."""
         return sorted(device.name for device, _ in devices_of(records))

@@ -1,4 +1,4 @@
-"""Attack S19: to have a node answer, act or remember because of a recorded handshake and the question in it."""
+"""Attack S19: make a node answer, act or store state with a recorded handshake and the request in it."""
 
 from __future__ import annotations
 
@@ -60,10 +60,10 @@ ARGUMENTS: dict[str, tuple[object, ...]] = {
 
 
 class RecordedQuestionTests(SiegeCase):
-    """A node of a closed team that has a camera and every method, and forgot its sessions by a restart."""
+    """A node of a closed team with a camera and every method, which has no sessions after a restart."""
 
     def setUp(self) -> None:
-        """Count what the node sends to whom, and note each method that runs without a session."""
+        """Count the bytes that the node sends to each address, and record methods that run without a session."""
         super().setUp()
         self.team: Village = self.village()
         for name in ("cat", "pig", "cow", "hen", "fox", "owl"):
@@ -76,7 +76,7 @@ class RecordedQuestionTests(SiegeCase):
         self.restart()
 
     def restart(self) -> None:
-        """Begin another life of the node, which remembers no handshake."""
+        """Restart the node, which clears its state of handshakes."""
         self.team.close(self.house, is_sudden=True)
         self.team.open(self.house)
         network, endpoint = network_of(self.house), self.house.node.endpoint
@@ -94,17 +94,17 @@ class RecordedQuestionTests(SiegeCase):
 
         def count(datagram: bytes, to: Address) -> None:
             self.sent[to] += len(datagram)
-            if to != VICTIM:  # nothing is there; what is under way would count as state
+            if to != VICTIM:  # no node is there, and a datagram in flight would count as state
                 send(datagram, to)
 
         port: Any = network
         port.send = count
         for method in endpoint._answerer.methods.values():
-            _ = method._form  # else it is found out at the first call
+            _ = method._form  # otherwise it is determined at the first call
         self.team.run(20.0)
 
     def recording(self, method: str) -> bytes:
-        """An INIT of a member in which a question rides, as it was recorded."""
+        """Return a member's recorded INIT with a request in it."""
         self.numbers += 1
         question = encoded(Question(self.numbers, method, ARGUMENTS.get(method, ())))
         own = Credentials.of(self.member.identity, self.house.team.secret)
@@ -114,7 +114,7 @@ class RecordedQuestionTests(SiegeCase):
         return Invitation(own, remote, secret, self.numbers, question, hello, self.numbers).datagram()
 
     def state(self) -> str:
-        """The hash of what the node remembers, but for the half-open sessions, which are bounded and end soon."""
+        """Return the hash of the node's state without half-open sessions, which are limited and expire soon."""
         endpoint = self.house.node.endpoint
         half = endpoint._half_open
         for session in list(half._unconfirmed.values()):
@@ -127,19 +127,19 @@ class RecordedQuestionTests(SiegeCase):
         return found
 
     def play(self, datagram: bytes) -> None:
-        """Send a recording to the node from the address of a victim."""
+        """Send a recording to the node with the address of a victim as its source."""
         receiver = network_of(self.house).receiver
         assert receiver is not None
         receiver(datagram, VICTIM)
 
     def show(self, seconds: float) -> None:
-        """Let time pass, in which the camera takes ten pictures a second."""
+        """Let time pass while the camera takes ten pictures a second."""
         for number in range(int(10 * seconds)):
             self.streams.offer("camera", number, bytes(20 * PART_BYTES))
             self.team.run(0.1)
 
     def test_every_method(self) -> None:
-        """A recorded INIT with a question for any method brings back no more bytes than it has, and changes nothing."""
+        """A recorded INIT with a request for any method gets no more bytes than it has, and changes nothing."""
         methods = self.house.node.endpoint._answerer.methods
         self.assertLessEqual(set(METHODS), set(methods))
         answered = []
@@ -153,11 +153,11 @@ class RecordedQuestionTests(SiegeCase):
             self.show(3.0)
             self.assertLessEqual(self.sent[VICTIM], len(recording), name)
             self.assertEqual(changed, [])
-        self.assertEqual(answered, list(methods))  # each was let in, and got its RESP
+        self.assertEqual(answered, list(methods))  # each was accepted and got its RESP
         self.assertEqual(self.ran, [])
 
     def test_pictures_for_a_victim(self) -> None:
-        """A recorded INIT that asks for pictures, sent again after the restart, has none sent to a forged address."""
+        """A recorded INIT that requests pictures, replayed after a restart, sends none to a spoofed address."""
         recording = self.recording("stream.open")
         for _ in range(5):
             self.sent.clear()
@@ -167,7 +167,7 @@ class RecordedQuestionTests(SiegeCase):
             self.restart()
 
     def test_a_member_gets_its_pictures(self) -> None:
-        """A member that confirms its session does get them."""
+        """A member that confirms its session gets pictures."""
         viewer, _ = self.insider(self.team, "eye", "viewer")
         shown: list[int] = []
         watching = Streams(viewer, self.team.clock)
@@ -187,13 +187,13 @@ class TimestampTests(SiegeCase):
         self.tape.tap(network_of(self.house))
 
     def open_again(self, house: House) -> bytes:
-        """Have a node open another session with the first one; its INIT."""
+        """Let a node open another session with the first node; return its INIT."""
         house.node.endpoint.reopen(self.team.contact(self.house))
         self.team.run(1.0)
         return [datagram for _, datagram, _ in self.tape.heard if datagram[0] == INIT][-1]
 
     def played(self, recording: bytes) -> tuple[int, int]:
-        """How many bytes a recording brings back, and how many sessions it opens."""
+        """Return the number of bytes that a recording gets in return, and of sessions that it opens."""
         network: Any = network_of(self.house)
         endpoint = self.house.node.endpoint
         sent, sessions = [0], len(endpoint._sessions)
@@ -203,7 +203,7 @@ class TimestampTests(SiegeCase):
         return sum(sent), len(endpoint._sessions) - sessions
 
     def test_an_older_one_is_dropped(self) -> None:
-        """The newest INIT of a member and all before it are dropped without an answer; a newer one is answered."""
+        """All INITs of a member up to the newest are dropped without an answer; a newer one is answered."""
         dog = self.team.houses[1]
         recordings = [self.open_again(dog) for _ in range(3)]
         self.assertEqual(len(set(recordings)), 3)
@@ -215,7 +215,7 @@ class TimestampTests(SiegeCase):
         self.assertTrue(self.house.node.endpoint.is_met(self.team.contact(dog)))
 
     def test_one_of_an_earlier_life(self) -> None:
-        """After its sender was restarted a recording opens no session, and its sender is let in."""
+        """A recording from before its sender's restart opens no session, and its sender can still connect."""
         dog = self.team.houses[1]
         recording = self.open_again(dog)
         self.team.close(dog, is_sudden=True)
@@ -228,7 +228,7 @@ class TimestampTests(SiegeCase):
         self.assertEqual(self.house.node.endpoint.counters["replayed"], 0)
 
     def test_bounded(self) -> None:
-        """The newest INITs of so many members are remembered, and of an unproved later life no older one counts."""
+        """The table of newest INITs is limited, and an unverified later life does not block an earlier one."""
         stamps, first, later = Stamps(), Life(1, b"1" * 8), Life(2, b"2" * 8)
         answers = [stamps.take(b"a", life, stamp) for life, stamp in ((first, 5), (first, 5), (first, 4), (first, 6))]
         self.assertEqual(answers, [True, False, False, True])
@@ -242,7 +242,7 @@ class TimestampTests(SiegeCase):
 
 class RoundTripTests(EndpointCase):
     def asked(self, method: str, *arguments: object, changes: bool) -> float:
-        """The round trips that the first question to a peer takes."""
+        """Return the round trips that the first request to a peer takes."""
         identity = Identity(self.rng.randbytes(32))
         asker = Endpoint(identity, b"k" * 32, self.board.network("127.0.0.1", 0), self.clock, self.rng)
         asker.start()
@@ -256,7 +256,7 @@ class RoundTripTests(EndpointCase):
         return trips
 
     def test_one_more_for_changes_and_large_answers(self) -> None:
-        """A first question for a small read takes one round trip, any other one takes two."""
+        """A first request for a small read takes one round trip, any other two."""
         self.b.expose("zeros", lambda peer, count: bytes(count), early=True)
         self.b.expose("late", lambda peer: 1)
         self.assertEqual(self.asked("echo", 1, changes=False), 1.0)
@@ -266,11 +266,11 @@ class RoundTripTests(EndpointCase):
         self.assertEqual(self.asked("zeros", 1000, changes=False), 2.0)
 
     def test_early_and_changing(self) -> None:
-        """A method that changes something cannot be exposed as early."""
+        """A method that changes state cannot be exposed as early."""
         self.assertRaises(ValueError, self.b.expose, "bad", lambda peer: 1, changes=True, early=True)
 
     def test_early_and_slow(self) -> None:
-        """An early method that takes its time is cancelled, and runs again in the session."""
+        """An early method that does not return at once is cancelled, and runs again in the session."""
         cancelled: list[object] = []
         waiting: list[Deferred[int]] = []
 
@@ -288,7 +288,7 @@ class RoundTripTests(EndpointCase):
 
 class KeyLifeTests(SiegeCase):
     def test_keys_are_replaced(self) -> None:
-        """Sessions in use have new keys every two minutes, and no node holds keys that are older than three."""
+        """Active sessions get new keys every two minutes, and no node keeps keys older than three minutes."""
         team = self.village()
         for name in ("dog", "cat"):
             team.enlist(name)

@@ -1,4 +1,4 @@
-"""Attack S20: to have a node spend seconds and gigabytes on a picture of a few hundred bytes."""
+"""Attack S20: make a node spend seconds and gigabytes on a picture of a few hundred bytes."""
 
 from __future__ import annotations
 
@@ -46,14 +46,14 @@ START_OF_SCAN, END = b"\xff\xda", b"\xff\xd9"
 
 
 def encoded(width: int, height: int, *options: int) -> bytes:
-    """A picture with a red target in it, made by a real encoder."""
+    """Return a picture with a red target, compressed by a real encoder."""
     pixels = np.full((height, width, 3), 128, np.uint8)
     pixels[height // 4 : 3 * height // 4, 2 * width // 5 : 3 * width // 5] = (0, 0, 255)
     return bytes(cv2.imencode(".jpg", pixels, list(options))[1].tobytes())
 
 
 def claiming(width: int, height: int, kind: bytes = b"\xff\xc0") -> bytes:
-    """A small picture, the header of which claims another size, and maybe another kind of coding."""
+    """Return a small picture with another size, and optionally another coding, in its header."""
     data = bytearray(encoded(8, 8))
     start = data.index(b"\xff\xc0")
     data[start : start + 2] = kind
@@ -62,7 +62,7 @@ def claiming(width: int, height: int, kind: bytes = b"\xff\xc0") -> bytes:
 
 
 def of_scans(width: int, height: int, count: int) -> bytes:
-    """A progressive picture, the last scan of which comes again and again."""
+    """Return a progressive picture with its last scan repeated."""
     data = encoded(width, height, cv2.IMWRITE_JPEG_PROGRESSIVE, 1)
     last = data[data.rindex(START_OF_SCAN) : -len(END)]
     return data[: -len(END)] + (count - data.count(START_OF_SCAN)) * last + END
@@ -85,7 +85,7 @@ BOMBS = {
 
 
 class BombCase(SynchronousTestCase):
-    """Counts how often the decoder runs, and on how many bytes."""
+    """Counts the calls of the decoder and the sizes of its pictures."""
 
     def setUp(self) -> None:
         self.decoded: list[tuple[int, ...]] = []
@@ -114,7 +114,7 @@ class HeaderTests(BombCase):
         self.assertEqual(self.decoded, [])
 
     def streamed(self, jpeg: bytes) -> object:
-        """What a driver shows of a camera on the network that sends nothing else."""
+        """Return the frame of a network camera that sends only ``jpeg``."""
         clock = Clock()
         camera = MjpegCamera(clock, MemoryBody(jpeg=jpeg), 30.0)
         camera.start()
@@ -128,7 +128,7 @@ class HeaderTests(BombCase):
         return seen and seen.frame
 
     def from_folder(self, jpeg: bytes) -> object:
-        """What is shown of a folder that has nothing else."""
+        """Return the frame from a folder that contains only ``jpeg``."""
         folder = Path(self.mktemp())
         folder.mkdir()
         (folder / "1.jpg").write_bytes(jpeg)
@@ -140,7 +140,7 @@ class HeaderTests(BombCase):
             return None
 
     def on_page(self, jpeg: bytes) -> object:
-        """What a web node keeps for browsers."""
+        """Return the frame that a web node keeps for browsers."""
         clock, frames = Clock(), MemoryFrames()
         camera = WebCamera(clock, lambda on_frame: frames.watch("dog", on_frame), lambda: None)
         frames.show("dog", 1, jpeg)
@@ -149,7 +149,7 @@ class HeaderTests(BombCase):
         return kept
 
     def test_no_bomb_is_taken(self) -> None:
-        """A camera, a robot, a phone and a page take none of them, so that none is shown or sent on."""
+        """A camera, a robot, a phone and a page reject all bombs, which are neither shown nor forwarded."""
         for name, bomb in BOMBS.items():
             text = base64.b64encode(bomb).decode()
             self.assertRaises(BadFrame, codec.picture, {"format": "jpeg", "data": text})
@@ -165,7 +165,7 @@ class HeaderTests(BombCase):
             self.assertIsNotNone(taken)
 
     def test_real_pictures_are_decoded(self) -> None:
-        """Pictures of cameras are searched, baseline and progressive; of large ones every second or fourth pixel."""
+        """Baseline and progressive pictures are searched; large ones are reduced to every second or fourth pixel."""
         for width, height in ((208, 156), (1920, 1080), (MAX_SIDE, MAX_SIDE)):
             for is_progressive in (0, 1) if width < MAX_SIDE else (0,):
                 seen = find_target(encoded(width, height, cv2.IMWRITE_JPEG_PROGRESSIVE, is_progressive), SIZE)
@@ -182,7 +182,7 @@ class HeaderTests(BombCase):
 
 
 class PooledClock(Clock):
-    """A clock with a thread pool whose threads run when the test says so."""
+    """A clock with a thread pool that runs its jobs when the test calls ``work``."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -190,7 +190,7 @@ class PooledClock(Clock):
         self.jobs: list[Callable[[], None]] = []
 
     def getThreadPool(self) -> PooledClock:  # noqa: N802 (Twisted's)
-        """Itself."""
+        """Return this object."""
         return self
 
     def callInThreadWithCallback(self, done: Callable[[bool, object], None], function: Callable[[], object]) -> None:  # noqa: N802 (Twisted's)
@@ -205,11 +205,11 @@ class PooledClock(Clock):
         self.jobs.append(job)
 
     def callFromThread(self, function: Callable[..., object], *arguments: object) -> None:  # noqa: N802 (Twisted's)
-        """Call it at once: there is one thread."""
+        """Call ``function`` at once, because there is only one thread."""
         function(*arguments)
 
     def work(self) -> int:
-        """Run what was kept; how many that were."""
+        """Run the stored jobs; return their number."""
         jobs, self.jobs = self.jobs, []
         for job in jobs:
             job()
@@ -217,14 +217,14 @@ class PooledClock(Clock):
 
 
 class StillDriver:
-    """As much of a driver as a body asks for before it moves."""
+    """The attributes of a driver that a robot reads before it moves."""
 
     description = describe("camera", {"url": "http://10.0.0.7/"})
 
 
 class QueueTests(BombCase):
     def test_reactor_decodes_nothing(self) -> None:
-        """An agent that is shown 100 pictures has two decoded, the first and the newest, both in the thread pool."""
+        """Of 100 pictures an agent decodes two, the first and the newest, both in the thread pool."""
         for kind in ("find-target", "watch-target"):
             with self.subTest(kind=kind):
                 clock = PooledClock()
@@ -247,7 +247,7 @@ class QueueTests(BombCase):
                 self.assertIsNotNone(behaviour.cost)
 
     def test_queue_of_one(self) -> None:
-        """While one picture is searched the next ones replace each other; a failure does not stop the detector."""
+        """While one picture is searched, newer ones replace each other; a failure does not stop the detector."""
         clock, found = PooledClock(), list[object]()
         detector = Detector(run_in_thread(clock))
         for number in range(50):
@@ -259,7 +259,7 @@ class QueueTests(BombCase):
 
 class ThreadTests(TestCase):
     async def test_not_in_the_thread_of_the_reactor(self) -> None:
-        """Where the clock is a reactor, pictures are searched in another thread, and what is found comes back to it."""
+        """With a real reactor, pictures are searched in another thread, and the result returns to the reactor."""
         threads: list[int] = []
         done: Deferred[None] = Deferred()
 

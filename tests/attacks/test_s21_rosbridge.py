@@ -1,4 +1,4 @@
-"""Attack S21: a rosbridge, or who answers in its place, that has its driver spend memory and time."""
+"""Attack S21: a malicious rosbridge server makes its driver spend memory and time."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ ROOM = 24 * 2**20
 
 
 def published(inner: bytes) -> bytes:
-    """A message of odometry with something in it."""
+    """Return an odometry message that contains ``inner``."""
     return b'{"op":"publish","topic":"/odom","msg":{"pose":' + inner + b"}}"
 
 
 def filled(one: bytes, size: int = MAX_MESSAGE - 100) -> bytes:
-    """A message with as many values of a kind as fit."""
+    """Return a message filled with copies of one value."""
     return published(b"[" + one + (b"," + one) * ((size - len(one)) // (len(one) + 1)) + b"]")
 
 
@@ -62,7 +62,7 @@ DEEP = {
 
 class MessageTests(SynchronousTestCase):
     def peak(self, data: bytes) -> tuple[bool, int]:
-        """Whether a message is taken, and the most memory that this needed."""
+        """Return whether a message is accepted, and the peak memory of a rejected one."""
         tracemalloc.start()
         try:
             decoded(data)
@@ -73,7 +73,7 @@ class MessageTests(SynchronousTestCase):
         return True, 0
 
     def test_many_values(self) -> None:
-        """Messages of 4 MB with up to two million values are refused before they become objects."""
+        """Messages of 4 MB with up to two million values are rejected before they become objects."""
         for name, data in MANY.items():
             self.assertLessEqual(len(data), MAX_MESSAGE)
             is_taken, peak = self.peak(data)
@@ -81,19 +81,19 @@ class MessageTests(SynchronousTestCase):
             self.assertLess(peak, 10_000, name)
 
     def test_long_numbers(self) -> None:
-        """Numbers with up to a megabyte of digits are refused, and no such number is computed."""
+        """Numbers with up to a megabyte of digits are rejected without being computed."""
         for name, data in LONG.items():
             is_taken, peak = self.peak(data)
             self.assertFalse(is_taken, name)
             self.assertLess(peak, 3 * len(data) + 10_000, name)
 
     def test_deep_nesting(self) -> None:
-        """Nesting deeper than the interpreter follows is refused as no message."""
+        """Nesting deeper than the interpreter's limit is rejected."""
         for name, data in DEEP.items():
             self.assertFalse(self.peak(data)[0], name)
 
     def test_nesting_is_not_printed(self) -> None:
-        """A deep or large value in the place of a text or a number is named by its type only."""
+        """A deep or large value in place of a text or number is reported only by its type."""
         for depth in range(50, 1000):
             deep = b"[" * depth + b"]" * depth
             for data in (b'{"op":' + deep + b"}", b'{"op":"service_response","id":"1","values":' + deep + b"}"):
@@ -108,7 +108,7 @@ class MessageTests(SynchronousTestCase):
         self.assertEqual(status, Status("error", "a list"))
 
     def test_most_that_is_taken(self) -> None:
-        """The most that is taken costs a bounded amount of memory; the largest scans and numbers are taken."""
+        """The most expensive accepted message uses limited memory; the largest scans and numbers are accepted."""
         worst = published(b"[" + b",".join([b'{"":0}'] * (MOST_VALUES // 2 - 5)) + b"]")
         tracemalloc.start()
         try:
@@ -126,7 +126,7 @@ class MessageTests(SynchronousTestCase):
 
 class FloodTests(SynchronousTestCase):
     def setUp(self) -> None:
-        """Connect a driver to an emulated robot, and count the frames that are made."""
+        """Connect a driver to an emulated robot, and count the processed frames."""
         self.clock = Clock()
         self.robot = RosbridgeRobot(self.clock, MemoryBody(values={"power.level": 0.8}), Random(1))
         self.robot.start()
@@ -168,13 +168,13 @@ class FloodTests(SynchronousTestCase):
         return self.connector.links[-1]
 
     def hear(self, data: bytes) -> None:
-        """Let the driver read this, as a reactor would."""
+        """Deliver ``data`` to the driver in the chunks of a reactor."""
         for start in range(0, len(data), READ):
             if self.link.receiver is not None:
                 self.link.receiver.received(data[start : start + READ])
 
     def test_flood_of_empty_frames(self) -> None:
-        """Of a megabyte of empty frames of any kind some thousand are taken; the link is closed, and called later."""
+        """Of a megabyte of empty frames about a thousand are processed; the driver disconnects and reconnects later."""
         for opcode in (PING, PONG, CONTINUATION, TEXT):
             with self.subTest(opcode=opcode):
                 self.taken = 0
@@ -187,7 +187,7 @@ class FloodTests(SynchronousTestCase):
                 self.assertEqual(self.driver.state, "ready")
 
     def test_flood_comes_again(self) -> None:
-        """A rosbridge that floods each connection is called at most once in some seconds, so it costs little in all."""
+        """A server that floods each connection is reconnected at most every few seconds, which limits the cost."""
         flood = framed(PING, b"", None) * (READ // 2)
         self.taken = 0
         for _ in range(6000):
@@ -197,7 +197,7 @@ class FloodTests(SynchronousTestCase):
         self.assertLess(self.taken, 60 * MAX_FRAMES)
 
     def test_pongs_do_not_pile_up(self) -> None:
-        """Where the other end takes nothing, its pings are not answered."""
+        """If the peer reads nothing, its pings are not answered."""
         sent: list[bytes] = []
         self.patch(self.link, "send", sent.append)
         self.link.is_busy = True
@@ -208,7 +208,7 @@ class FloodTests(SynchronousTestCase):
         self.assertEqual(len(sent), 1)
 
     def test_driver_survives(self) -> None:
-        """None of the messages takes the connection down or raises; the driver goes on with the next good one."""
+        """No hostile message closes the connection or raises; the driver continues with the next valid one."""
         before = self.driver.diagnostics()["bad_frames"]
         hostile = [*MANY.values(), *LONG.values(), *DEEP.values()]
         for data in hostile:
@@ -218,7 +218,7 @@ class FloodTests(SynchronousTestCase):
         self.assertEqual(self.driver.state, "ready")
 
     def test_answers_to_calls(self) -> None:
-        """A failed call whose reason is deeply nested fails with a short text."""
+        """A failed call with a deeply nested reason fails with a short text."""
         errors: list[object] = []
         asked = self.driver._call("/dance")
         asked.addErrback(lambda failure: errors.append(failure.check(RobotError) and failure.getErrorMessage()))

@@ -1,4 +1,4 @@
-"""Attack S22: an author that is not, or is no longer, an operator of the team has code run on a node."""
+"""Attack S22: an author that is not, or no longer, an operator of the team runs code on a node."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class PushedCodeTests(SynchronousTestCase):
         self.shelf = MemoryShelf()
 
     def join(self, name: str, *roles: str) -> SwarmNode:
-        """A member that the operator gave these roles."""
+        """Add a member to which the operator granted these roles."""
         membership = self.team.operator.founded(
             name, roles, self.team.clock.seconds(), self.team._member_rng, self.team._secret
         )
@@ -63,7 +63,7 @@ class PushedCodeTests(SynchronousTestCase):
         return self.team.services[name].assembly.node
 
     def allow(self, *authors: SwarmNode) -> SwarmNode:
-        """Start the dog, which lists the keys of these authors."""
+        """Start the dog with the keys of these authors in its settings."""
         keys = [author.entangled.identity.public.hex() for author in authors]
         allowed = {"allow": True, "operators": keys, "modules": ["best"]}
         self.team.add("dog1", {"deployment": allowed}, self.shelf)
@@ -71,7 +71,7 @@ class PushedCodeTests(SynchronousTestCase):
         return self.team.services["dog1"].assembly.node
 
     def push(self, author: SwarmNode, source: str = SOURCE, kind: str = "strategy") -> int:
-        """Push a module at the author's node; returns the exit code."""
+        """Push a module at the author's node; return the exit code."""
         path = self.folder / "best.py"
         path.write_text(source)
         shell = Shell(self.team, author)
@@ -80,7 +80,7 @@ class PushedCodeTests(SynchronousTestCase):
         return int(code)
 
     def revoke(self, node: SwarmNode, name: str) -> None:
-        """The operator revokes a member at the laptop."""
+        """Revoke a member at the laptop."""
         packed = self.team.operator.revoke(node.entangled.identity.public, name, self.team.clock.seconds())
         team = self.team.services["vaio"].assembly.node.team
         assert team is not None
@@ -89,7 +89,7 @@ class PushedCodeTests(SynchronousTestCase):
         self.team.clock.advance(IN_FORCE)
 
     def submit(self, steps: int) -> None:
-        """A task for the pushed behaviour, which ends after so many steps."""
+        """Submit a task for the pushed behaviour, which ends after ``steps`` steps."""
         task = Task("t1", "deployed:best", "Walk", parameters={"steps": steps}, requirements={"base2d": {}})
         task = replace(task, created=self.team.clock.seconds())
         self.team_told(self.team.services["vaio"].assembly.node.submit(task))
@@ -104,16 +104,16 @@ class PushedCodeTests(SynchronousTestCase):
         return self.successResultOf(done)
 
     def shown(self) -> str:
-        """The state of the module on the dog, as the page shows it."""
+        """Return the state of the dog's module on the page."""
         (device,) = [each for each in self.team.state()["devices"] if each["name"] == "dog1"]
         return str(device["deployed"].get("best", ""))
 
     def assert_nothing_runs(self, dog: SwarmNode) -> None:
-        """Neither has the module run, nor may a task have it."""
+        """Check that the module has not run and is not available to tasks."""
         self.assertEqual((dict(dog.deployed), CANARY in sys.modules), ({}, False))
 
     def test_gateway_does_not_push(self) -> None:
-        """A gateway writes the records of operators for the people behind it, and has no code run, even if listed."""
+        """A gateway may write operators' records, but cannot run code, even if its key is listed."""
         author = self.join("author", "gateway")
         dog = self.allow(author)
         self.assertNotEqual(self.push(author), 0)
@@ -121,7 +121,7 @@ class PushedCodeTests(SynchronousTestCase):
         self.assertEqual(self.shown(), "")
 
     def test_device_and_viewer_do_not_push(self) -> None:
-        """Neither does a device or a viewer whose key a node lists by mistake."""
+        """A device or a viewer cannot run code, even if its key is listed by mistake."""
         authors = [self.join("author", "device"), self.join("second", "viewer")]
         dog = self.allow(*authors)
         for author in authors:
@@ -129,7 +129,7 @@ class PushedCodeTests(SynchronousTestCase):
             self.assert_nothing_runs(dog)
 
     def test_revoked_operator_stops_running(self) -> None:
-        """The module of an operator that is revoked runs no longer, and no task gets it."""
+        """A module stops when its operator is revoked, and tasks can no longer use it."""
         author = self.join("author", "operator")
         dog = self.allow(author)
         self.assertEqual(self.push(author), 0)
@@ -140,7 +140,7 @@ class PushedCodeTests(SynchronousTestCase):
         self.assertIn("refused", self.shown())
 
     def test_revoked_operator_is_not_loaded_again(self) -> None:
-        """Nor does the next life of a node load it from its own file."""
+        """A restarted node does not load a revoked operator's module from its file."""
         author = self.join("author", "operator")
         dog = self.allow(author)
         self.push(author)
@@ -153,7 +153,7 @@ class PushedCodeTests(SynchronousTestCase):
         self.assert_nothing_runs(dog)
 
     def test_another_operator_follows_a_revoked_one(self) -> None:
-        """A module of a revoked operator, with any version, does not block the next operator."""
+        """A revoked operator's module, of any version, does not block the next operator."""
         author, second = self.join("author", "operator"), self.join("second", "operator")
         dog = self.allow(author, second)
         self.push(author)
@@ -164,7 +164,7 @@ class PushedCodeTests(SynchronousTestCase):
         self.assertEqual(list(dog.deployed), [("strategy", "best")])
 
     def test_behaviour_does_its_task(self) -> None:
-        """A behaviour of an operator moves the robot, and ends the task."""
+        """An operator's behaviour moves the robot and completes the task."""
         author = self.join("author", "operator")
         self.allow(author)
         self.push(author, WALK, "behaviour")
@@ -175,7 +175,7 @@ class PushedCodeTests(SynchronousTestCase):
         self.assertEqual([task["status"] for task in self.team.state()["tasks"]], ["COMPLETED"])
 
     def test_robot_stands_when_its_author_is_revoked(self) -> None:
-        """A robot that a behaviour moves stands when the author of the behaviour is revoked."""
+        """A robot stops when the author of its behaviour is revoked."""
         author = self.join("author", "operator")
         dog = self.allow(author)
         self.push(author, WALK, "behaviour")
@@ -190,7 +190,7 @@ class PushedCodeTests(SynchronousTestCase):
         self.assertEqual((self.pose(), dict(dog.deployed)), (before, {}))
 
     def test_author_and_digest_are_shown(self) -> None:
-        """The page shows name and key of the author and the digest, of a running and of a refused module."""
+        """The page shows the author's name and key and the digest of a running and of a refused module."""
         author = self.join("author", "operator")
         dog = self.allow(author)
         self.push(author)

@@ -1,4 +1,4 @@
-"""Attack S23: by another user of the same computer: control sockets in a shared folder, secrets on command lines."""
+"""Attack S23: another user of the same computer: control sockets in a shared folder, secrets on command lines."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ SECRET = "the secret of a classroom"
 
 
 class ControlSocketTests(SynchronousTestCase):
-    """Another user made the folder, or the socket, before the node did."""
+    """Another user created the folder or the socket before the node."""
 
     def setUp(self) -> None:
-        # Trial's own folders are deeper than the path of a socket may be.
+        # The path of a socket has a maximum length, which trial's folders exceed.
         self.runtime = Path(tempfile.mkdtemp())
         self.addCleanup(shutil.rmtree, self.runtime)
         self.patch(os, "environ", {**os.environ, "XDG_RUNTIME_DIR": str(self.runtime)})
         self.me = os.getuid()
 
     def be_another(self) -> None:
-        """From now on this is another user's process: all that is there belongs to the first user."""
+        """Continue as another user, which owns none of the existing files."""
         self.patch(os, "getuid", lambda: self.me + 1)
 
     def listening(self, name: str) -> Path:
@@ -45,7 +45,7 @@ class ControlSocketTests(SynchronousTestCase):
         return path
 
     def test_folder_of_another(self) -> None:
-        """A folder that another user made is asked nothing, and no socket is made there."""
+        """A folder of another user is neither read nor used for a socket."""
         made("vaio").touch()
         self.assertEqual(found("vaio").name, "vaio.control")
         self.be_another()
@@ -53,7 +53,7 @@ class ControlSocketTests(SynchronousTestCase):
             self.assertIn("accessible to other users", str(self.assertRaises(NoControl, use, "vaio")))
 
     def test_page_of_another(self) -> None:
-        """Nobody is led to a page that another user's note names."""
+        """A page in another user's note is not opened."""
         note = {"name": "vaio", "url": "http://127.0.0.1:1/", "code": "loud-otter", "pid": os.getpid()}
         made("vaio").with_suffix(".page").write_text(json.dumps(note))
         self.assertEqual([each.name for each in invitations()], ["vaio"])
@@ -61,14 +61,14 @@ class ControlSocketTests(SynchronousTestCase):
         self.assertRaises(NoControl, invitations)
 
     def test_folder_that_others_write(self) -> None:
-        """A folder in which others can make a socket is refused."""
+        """A folder that other users can write is refused."""
         made("vaio").touch()
         folder().chmod(0o777)
         for use in (found, made):
             self.assertRaises(NoControl, use, "vaio")
 
     def test_folder_that_is_a_link(self) -> None:
-        """A link to another folder is no folder, even to one that is as it should be."""
+        """A symbolic link is refused as the folder, even if its target is valid."""
         other = self.runtime / "elsewhere"
         other.mkdir(mode=0o700)
         (other / "vaio.control").touch()
@@ -77,7 +77,7 @@ class ControlSocketTests(SynchronousTestCase):
             self.assertRaises(NoControl, use, "vaio")
 
     def test_socket_of_another(self) -> None:
-        """A socket that another user made is not spoken to, nor is anything that is no socket."""
+        """A socket of another user, and a file that is not a socket, get no request."""
         made("vaio")
         path = self.listening("vaio")
         file = folder() / "file.control"
@@ -90,7 +90,7 @@ class ControlSocketTests(SynchronousTestCase):
         self.assertIn("accessible to other users", str(self.assertRaises(NoControl, list, asked(path, {}))))
 
     def test_service_of_another_user(self) -> None:
-        """Root asks a service of another user if it names the folder, and never in the shared folder."""
+        """Root may contact another user's service in a named folder, but not in the shared folder."""
         made("vaio")
         path = self.listening("vaio")
         for each in (folder(), path):
@@ -104,7 +104,7 @@ class ControlSocketTests(SynchronousTestCase):
         self.assertRaises(NoControl, check_socket, path)
 
     def test_process_of_another(self) -> None:
-        """Nor is a socket behind which another user's process listens."""
+        """A socket with another user's process behind it is refused."""
         here, there = socket.socketpair(socket.AF_UNIX)
         self.addCleanup(here.close)
         self.addCleanup(there.close)
@@ -137,20 +137,20 @@ class TeamKeyTests(SynchronousTestCase):
         return options
 
     def refusal(self, *words: str) -> str:
-        """The error of a command line that is refused."""
+        """Return the error of a refused command line."""
         said = io.StringIO()
         self.patch(sys, "stderr", said)
         self.assertEqual(self.assertRaises(SystemExit, self.options, *words).code, 2)
         return said.getvalue()
 
     def test_not_on_the_command_line(self) -> None:
-        """A secret on the command line is refused with the remedy, and is not said again."""
+        """A secret on the command line is refused with the remedy, and the error does not repeat it."""
         said = self.refusal("--team-key", SECRET)
         self.assertIn("--team-key-file", said)
         self.assertNotIn(SECRET, said)
 
     def test_from_a_file_of_the_owner(self) -> None:
-        """It is read from a file, or from standard input; a file that others can read is refused."""
+        """The secret is read from a file or standard input; a file that other users can read is refused."""
         self.assertEqual(self.options("--team-key-file", str(self.path)).settings.node.team_key, SECRET)
         self.patch(sys, "stdin", io.TextIOWrapper(io.BytesIO(SECRET.encode())))
         self.assertEqual(self.options("--team-key-file", "-").settings.node.team_key, SECRET)

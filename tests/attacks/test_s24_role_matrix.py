@@ -12,13 +12,13 @@ from tests.attacks.role_matrix import REVOKED_OPERATOR, list_slots, try_everythi
 
 
 class RoleMatrixTests(SynchronousTestCase):
-    """Each subject at a team of its own; what the role table forbids is refused and changes nothing."""
+    """Each subject acts in a new team; attempts that the role table forbids are refused and change nothing."""
 
     def test_every_subject(self) -> None:
-        """All that the roles of a subject forbid was tried and refused, what they allow was not refused for the role.
+        """All attempts that a subject's roles forbid are refused; allowed ones are not refused for the role.
 
-        A viewer writes its presence alone, a device does not order, and a revoked operator can do nothing, neither
-        itself nor by a member that carries its records.
+        A viewer only writes its presence, a device does not order, and a revoked operator can do nothing, neither
+        directly nor through a member that sends its records.
         """
         subjects: dict[str, tuple[tuple[str, ...], int]] = {
             VIEWER: ((VIEWER,), 100),
@@ -39,5 +39,5 @@ class RoleMatrixTests(SynchronousTestCase):
                 self.assertEqual(counts.allowed, nodes * sum(may_call(roles, name) for name in METHODS))
 
     def test_slots_cover_the_table(self) -> None:
-        """The slots that are tried have every namespace of the table."""
+        """The tried slots cover every namespace of the table."""
         self.assertEqual({kind_of(slot) for slot in list_slots(b"o" * 32)}, set(KINDS))

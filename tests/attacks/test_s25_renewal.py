@@ -1,4 +1,4 @@
-"""Attack S25: to outlive the operator's word by renewals: one's own, backdated ones, and those of hostile nodes."""
+"""Attack S25: evade the operator's decision by renewals: self-made, backdated, and by hostile nodes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ DOG = identity("dog")
 
 
 class RenewalCase(SiegeCase):
-    """A team with two bootstrap nodes, of which the second one is hostile, and a plain member that judges."""
+    """A team with two bootstrap nodes, the second one hostile, and a plain member that checks certificates."""
 
     def setUp(self) -> None:
         super().setUp()
@@ -39,31 +39,31 @@ class RenewalCase(SiegeCase):
         return found[1]
 
     def word(self, roles: Sequence[str] = ("device",), life: float = YEAR, own: Identity = DOG) -> bytes:
-        """The pass of a key by a grant of the operator from now on."""
+        """Return the certificate of a key with the operator's grant from now on."""
         return pass_of(self.team.signer.grant(own.public, "dog", roles, self.team.wall(), life))
 
     def read(self, shown: bytes, own: Identity = DOG) -> Member:
         return member_of(self.team.signer.public, own.public, shown)
 
     def renew(self, shown: bytes, ago: float = 0.0, own: Identity = DOG, by: int = 1) -> bytes:
-        """The pass ``shown`` as a bootstrap node, the thief unless another is named, renews it: some time ago."""
+        """Return ``shown``, renewed by a bootstrap node (the hostile one by default) ``ago`` seconds ago."""
         member, begin = self.read(shown, own), int(self.team.wall() - ago)
         return renewed(self.keys[by], (self.honest, self.thief)[by], member, shown, begin)
 
     def said(self, shown: bytes, own: Identity = DOG) -> str:
-        """How the honest nodes judge a pass: their refusal; empty where the key is let in."""
+        """Return the code with which the honest nodes refuse a certificate, or "" if they accept it."""
         answers = {self.team.houses[place].team.door.admit(own.public, shown) for place in (0, 2)}
         self.assertEqual(len(answers), 1, answers)
         return answers.pop()
 
     def end(self, own: Identity = DOG) -> int:
-        """When the certificate of a key ends, by the list of a plain member."""
+        """Return the expiry of a key's certificate in the list of a plain member."""
         member = self.judge.team.door.member(own.public)
         assert member is not None
         return member.not_after
 
     def let_in(self, code: Code, name: str, own: Identity = DOG) -> bytes:
-        """The pass of a key that the thief lets in by a code."""
+        """Return the certificate of a key that the hostile node admits with a code."""
         found = self.judge.team.roll.invited(invitation_id(code.key.public))
         assert found is not None
         came = (own.public, "", proof(code.key, own.public, ""))
@@ -74,7 +74,7 @@ class RenewalCase(SiegeCase):
         self.team.run(2.0)
 
     def enter(self, shown: bytes, own: Identity = DOG) -> str:
-        """The code with which a node refuses the key that shows this pass."""
+        """Return the code with which a node refuses the key with this certificate."""
         secret = self.judge.kept.membership.secrets[0][1]
         self.port += 1
         endpoint = self.attacker(self.team, own, secret, shown, SOURCE._replace(port=self.port))
@@ -83,7 +83,7 @@ class RenewalCase(SiegeCase):
 
 class RevokedBootstrapTests(RenewalCase):
     def test_backdated(self) -> None:
-        """Of a revoked bootstrap node's renewals those count that the operator kept, whatever dates others bear."""
+        """After a bootstrap node's revocation only the renewals kept by the operator are valid, for any dates."""
         old = self.word()
         self.team.days = 300
         kept = self.renew(old)
@@ -97,13 +97,13 @@ class RevokedBootstrapTests(RenewalCase):
         for ago in (0, 95 * DAY, 100 * DAY, 399 * DAY):
             late = self.renew(old, ago)
             if late != kept:
-                self.assertEqual(self.said(late), "")  # the kept one is on the list
+                self.assertEqual(self.said(late), "")  # the kept renewal is on the list
         self.assertEqual(self.end(), end)
         self.team.days = 300 + 366
         self.assertEqual({self.said(self.renew(old, ago * DAY)) for ago in (0, 10, 300, 360)}, {EXPIRED})
 
     def test_not_kept(self) -> None:
-        """Its renewals are void where they were not kept; the member has what it had, and another node renews it."""
+        """Renewals that the operator did not keep are void; another node can renew the previous certificate."""
         old = self.word()
         self.team.days = 300
         self.assertEqual(self.said(self.renew(old)), "")
@@ -115,7 +115,7 @@ class RevokedBootstrapTests(RenewalCase):
         self.assertEqual(self.said(self.renew(old, by=0)), "")
 
     def test_behind_a_void_renewal(self) -> None:
-        """A member that shows a void renewal of a grant that still holds is let in by the grant, and is on the list."""
+        """A member with a void renewal of a valid grant is admitted by the grant, and is on the list."""
         ghost = identity("ghost")
         old = pass_of(self.team.signer.grant(ghost.public, "ghost", ("viewer",), self.team.wall()))
         self.tell(self.team.signer.revoke(self.keys[1].public, "boot1", self.team.wall()))
@@ -123,7 +123,7 @@ class RevokedBootstrapTests(RenewalCase):
         self.assertEqual([("ghost" in self.team.members(place)) for place in (0, 2)], [True, True])
 
     def test_without_the_role(self) -> None:
-        """A bootstrap node from which the operator took that role renews nobody, by its earlier grant either."""
+        """A bootstrap node that lost this role cannot renew, even with its earlier grant."""
         old = self.word()
         self.team.days = 300
         grant = self.team.signer.grant(self.keys[1].public, "boot1", ("device",), self.team.wall())
@@ -132,7 +132,7 @@ class RevokedBootstrapTests(RenewalCase):
         self.assertEqual({self.said(self.renew(old, ago * DAY)) for ago in (0, 80, 360)}, {EXPIRED})
 
     def test_laundered_admission(self) -> None:
-        """Whom a bootstrap node let in, and the operator did not keep, goes with it, though another node renewed it."""
+        """A member admitted by a revoked bootstrap node is revoked with it, even if another node renewed it."""
         shown = self.let_in(read(self.team.invite("pup")), "pup")
         self.team.days = 300
         shown = self.renew(shown, by=0)
@@ -144,7 +144,7 @@ class RevokedBootstrapTests(RenewalCase):
 
 class SelfRenewalTests(RenewalCase):
     def test_a_plain_member(self) -> None:
-        """A renewal that a member without the role bootstrap signs, for itself or for another, is none."""
+        """A renewal signed by a member without the role bootstrap, for any key, is invalid."""
         old = self.word(("device", "operator", "gateway"))
         grant = msgpack.unpackb(old)[1]
         self.team.days = 360
@@ -154,7 +154,7 @@ class SelfRenewalTests(RenewalCase):
         self.assertEqual(self.said(forged), FOREIGN)
 
     def test_a_bootstrap_node_beside_others(self) -> None:
-        """A bootstrap node that was left to expire does not renew itself while there is another one."""
+        """A bootstrap node with a lapsed renewal cannot renew itself while there is another bootstrap node."""
         old, own = pass_of(self.thief), self.keys[1]
         self.team.days = 300
         mine = [self.renew(old, ago, own) for ago in (0, 200 * DAY)]
@@ -163,7 +163,7 @@ class SelfRenewalTests(RenewalCase):
         self.assertEqual({self.said(each, own) for each in mine}, {EXPIRED})
 
     def tell_renewal(self, place: int) -> None:
-        """Have the honest bootstrap node renewed by the other one, as is usual."""
+        """Let the other bootstrap node renew the bootstrap node at ``place``."""
         shown = pass_of((self.honest, self.thief)[place])
         public = self.keys[place].public
         again = self.renew(shown, own=self.keys[place], by=1 - place)
@@ -171,7 +171,7 @@ class SelfRenewalTests(RenewalCase):
         self.team.run(2.0)
 
     def test_a_short_one_renews_nobody(self) -> None:
-        """A bootstrap node that the operator named for a month renews nobody, also not within that month."""
+        """A bootstrap node with a grant for a month cannot renew, even within that month."""
         own = identity("helper")
         grant = self.team.signer.grant(own.public, "helper", ("bootstrap",), self.team.wall(), 30 * DAY)
         old = self.word()
@@ -181,7 +181,7 @@ class SelfRenewalTests(RenewalCase):
 
 class WideningTests(RenewalCase):
     def test_roles_that_were_taken_away(self) -> None:
-        """A renewal of an earlier grant does not bring back roles that the operator took away since."""
+        """A renewal of an earlier grant does not restore roles that the operator removed."""
         old = self.word(("device", "operator"))
         self.team.days = 1
         self.tell(msgpack.unpackb(self.word(("viewer",)))[1])
@@ -191,7 +191,7 @@ class WideningTests(RenewalCase):
         self.assertEqual(self.judge.team.door.roles_of(DOG.public), {"viewer"})
 
     def test_when_the_narrower_grant_has_ended(self) -> None:
-        """A grant that has ended still stands before what the operator said earlier of that key."""
+        """An expired grant still overrides the operator's earlier grants to the same key."""
         old = self.word(("device", "operator"))
         self.assertEqual(self.said(old), "")
         self.team.days = 1
@@ -202,7 +202,7 @@ class WideningTests(RenewalCase):
         self.assertEqual(self.said(self.renew(old)), EXPIRED)
 
     def test_another_word(self) -> None:
-        """Roles, name, life and dates of a renewal are signed: what is changed in it is refused."""
+        """Roles, name, lifetime and dates of a renewal are signed, and any change is refused."""
         old = self.word()
         self.team.days = 300
         fields = msgpack.unpackb(self.renew(old))
@@ -212,7 +212,7 @@ class WideningTests(RenewalCase):
             self.assertEqual(self.said(msgpack.packb(changed)), FOREIGN)
 
     def test_longer_than_its_life(self) -> None:
-        """A renewal that a bootstrap node signs for longer than the operator made the certificate is refused."""
+        """A renewal for longer than the lifetime that the operator granted is refused."""
         old = self.word()
         member = self.read(old)
         long = Member(member.public, "dog", member.roles, 0, 0, since=member.since, life=3 * YEAR)
@@ -220,7 +220,7 @@ class WideningTests(RenewalCase):
         self.assertEqual(self.said(again), FOREIGN)
 
     def test_a_name_by_a_bootstrap_node(self) -> None:
-        """A bootstrap node that renews who came by a code gives it no other name."""
+        """A bootstrap node cannot change the name of a member that joined by code."""
         dog = self.team.welcome("dog")
         shown, own = dog.kept.membership.shown, dog.kept.membership.identity
         fields = msgpack.unpackb(shown)
@@ -229,7 +229,7 @@ class WideningTests(RenewalCase):
         self.assertEqual(self.said(again, own), FOREIGN)
 
     def test_shortened(self) -> None:
-        """A bootstrap node shortens nothing that another one, or the operator, gave."""
+        """A bootstrap node cannot shorten a certificate."""
         old = self.word()
         self.team.days = 300
         good = self.renew(old, by=0)
@@ -238,7 +238,7 @@ class WideningTests(RenewalCase):
         self.assertEqual(self.end(), self.read(good).not_after)
 
     def test_in_the_place_of_a_good_one(self) -> None:
-        """A renewal of an earlier word, which lasts longer, does not keep out one of the present word."""
+        """A longer renewal of an earlier grant does not displace a renewal of the current grant."""
         old = self.word(life=3 * YEAR)
         self.team.days = 1
         new = self.word()
@@ -249,7 +249,7 @@ class WideningTests(RenewalCase):
         self.assertEqual((self.said(good), self.end()), ("", self.read(good).not_after))
 
     def test_another_origin(self) -> None:
-        """A renewal that gives a member by a code another name or admitting node keeps out no good one, and is none."""
+        """A renewal with another name or admitting node than the admission is invalid and displaces none."""
         dog = self.team.move_in(self.successResultOf(self.knocked("pup", 2)))
         shown, own = dog.kept.membership.shown, dog.kept.membership.identity
         self.team.days = 300
@@ -268,13 +268,13 @@ class WideningTests(RenewalCase):
         self.assertIn("pup-1", self.team.members(2))
 
     def knocked(self, name: str, uses: int) -> Deferred[Membership]:
-        """A newcomer that was let in by a code for several."""
+        """Return a newcomer that joins by a code with several uses."""
         knocked = self.team.knock(self.team.invite(name, uses))
         self.team.run(2.0)
         return knocked
 
     def test_ahead_of_time(self) -> None:
-        """A renewal that begins in the future does not count before that, and lasts no longer than others."""
+        """A renewal that starts in the future is not valid earlier, and not for longer."""
         old = self.word()
         self.team.days = 300
         ahead = self.renew(old, -100 * DAY)
@@ -285,7 +285,7 @@ class WideningTests(RenewalCase):
 
 class RevivalTests(RenewalCase):
     def test_revoked_member(self) -> None:
-        """A revoked member stays out, whoever renews it, before or after its revocation, and no node offers to."""
+        """A revoked member stays rejected, for renewals by any node at any time, and no node offers a renewal."""
         dog = self.team.enlist("dog")
         shown, own = dog.kept.membership.shown, dog.kept.membership.identity
         before = self.renew(shown, own=own, by=0)
@@ -298,7 +298,7 @@ class RevivalTests(RenewalCase):
         self.assertNotIn(own.public, [each.public for each in due])
 
     def test_temporary_guest(self) -> None:
-        """A bootstrap node revives nobody whom the operator let in for less than a year, by a grant or by a code."""
+        """A bootstrap node cannot renew a member with a lifetime of less than a year, by grant or by code."""
         short = self.word(life=YEAR - 1)
         code, packed, terms = self.team.signer.invite(
             "pup", ("device",), 1, self.team.wall(), 3600.0, self.team.dice, life=float(DAY)
@@ -315,7 +315,7 @@ class RevivalTests(RenewalCase):
             self.assertEqual(self.enter(self.renew(shown)), FOREIGN)
 
     def test_more_keys_than_the_code_has(self) -> None:
-        """Renewals bring in no more keys by a code than it is good for, also where no admission is known."""
+        """Renewals cannot add more keys for a code than it has uses, even without a known admission."""
         code = read(self.team.invite("dog", uses=2))
         answers = []
         for number in range(1, 5):

@@ -1,1 +1,1 @@
-"""Tests of what others have standardised."""
+"""Tests of standard formats."""

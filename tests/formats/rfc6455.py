@@ -1,4 +1,4 @@
-"""Frames and a greeting of RFC 6455, made by hand, to say what ``wsproto`` would not."""
+"""Encode frames and the handshake of RFC 6455, including content that ``wsproto`` would not send."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def answer_to(request: bytes) -> bytes:
 
 
 def framed(opcode: int, payload: bytes, mask: bytes | None) -> bytes:
-    """One whole frame; a client gives 4 bytes of ``mask``, a server none."""
+    """Return one complete frame; a client sends a ``mask`` of 4 bytes, a server none."""
     size, bit = len(payload), 0 if mask is None else 0x80
     if size < 126:
         start = bytes([0x80 | opcode, bit | size])
@@ -33,5 +33,5 @@ def framed(opcode: int, payload: bytes, mask: bytes | None) -> bytes:
 
 
 def masked(payload: bytes, mask: bytes) -> bytes:
-    """The payload under, or from under, a mask of 4 bytes."""
+    """Mask or unmask a payload with 4 bytes."""
     return bytes(byte ^ mask[place % 4] for place, byte in enumerate(payload))

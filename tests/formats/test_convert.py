@@ -38,24 +38,24 @@ class _Table:
 
 
 class ConvertTests(SynchronousTestCase):
-    """Values arrive as the field declares, or the error names key, problem and remedy."""
+    """Values are converted to the declared types, or the error names key, problem and remedy."""
 
     def refused(self, key: str, value: object) -> Invalid:
-        """The error of one wrong value."""
+        """Return the error for a wrong value."""
         error: Invalid = self.assertRaises(Invalid, convert_table, {"name": "a", key: value}, _Table)
         self.assertEqual(error.key, key)
         self.assertTrue(error.problem and error.remedy)
         return error
 
     def test_converts(self) -> None:
-        """Whole numbers become numbers where these are declared, lists tuples, and a later step has the last word."""
+        """Integers become floats where declared, lists become tuples, and the ``Then`` step is applied last."""
         given = {"name": "a", "rate": 2, "sizes": [1, 1, 2], "parts": [{"kind": "camera"}], "word": "ay"}
         table = convert_table(given, _Table)
         self.assertEqual(table, _Table("a", 80, 2.0, "safe", (1, 2), (_Part("camera"),), "AY"))  # type: ignore[arg-type]
         self.assertIsInstance(table.rate, float)
 
     def test_refuses_wrong_types_and_bounds(self) -> None:
-        """No value is bent to fit: not truth to a number, not text to a number, not NaN into a range."""
+        """Values are not coerced: no boolean to a number, no text to a number, no NaN into a range."""
         nan, inf = float("nan"), float("inf")
         wrong: dict[str, list[object]] = {
             "name": ["", "x" * 9, 1, None, "a\nb"],
@@ -73,17 +73,17 @@ class ConvertTests(SynchronousTestCase):
                 self.refused(key, value)
 
     def test_names_the_innermost_value(self) -> None:
-        """In a list or a table the error says which entry is wrong, and shows that one."""
+        """The error for a list or table names the wrong entry and shows its value."""
         self.assertIn("[1] is -5", self.refused("sizes", [1, -5]).problem)
         self.assertIn('[0].size is "b"', self.refused("parts", [{"kind": "a", "size": "b"}]).problem)
 
     def test_hides_secrets(self) -> None:
-        """A secret is neither shown in an error nor in the table's own words."""
+        """A secret is not shown in an error."""
         error = self.refused("key", "hunter2")
         self.assertNotIn("hunter2", error.problem + error.remedy)
 
     def test_says_what_is_known(self) -> None:
-        """An unknown key names the nearest one; a missing one has an example; what is no table says so."""
+        """The error names the nearest key for an unknown one, and an example for a missing one."""
         error = self.assertRaises(Invalid, convert_table, {"nam": "a"}, _Table)
         self.assertIn("nearest is name", error.remedy)
         error = self.assertRaises(Invalid, convert_table, {}, _Table)
@@ -92,7 +92,7 @@ class ConvertTests(SynchronousTestCase):
         self.assertEqual(self.assertRaises(Invalid, convert_table, [], _Table).key, "")
 
     def test_reads_a_command_line(self) -> None:
-        """Words stand for numbers, truth and lists separated by commas."""
+        """Numbers, booleans and comma-separated lists are parsed from command-line text."""
         self.assertEqual(convert_field("8080", _Table, "port", is_text=True), 8080)
         self.assertEqual(convert_field("1, 2,", _Table, "sizes", is_text=True), (1, 2))
         self.assertIs(convert_field("true", _Table, "on", is_text=True), True)

@@ -9,7 +9,7 @@ from formats.head import MAX_HEAD, head, taken
 
 class HeadTests(SynchronousTestCase):
     def test_one_is_made_and_read(self) -> None:
-        """The first line and the fields come back, whatever the case of their names and the blanks around them."""
+        """The first line and the fields are parsed, whatever their case and surrounding blanks."""
         buffer = bytearray(head("GET / HTTP/1.1", "Host: h:1", "uPgrade:  x , y  ") + b"rest")
         found = taken(buffer)
         assert found is not None
@@ -18,7 +18,7 @@ class HeadTests(SynchronousTestCase):
         self.assertEqual(bytes(buffer), b"rest")
 
     def test_the_end_is_waited_for(self) -> None:
-        """Nothing is taken before the end is there, nor where it comes later than it may."""
+        """An incomplete or too long head gives None."""
         whole = head("HTTP/1.1 200 OK", "Server: x")
         for length in range(len(whole)):
             self.assertIsNone(taken(bytearray(whole[:length])))
@@ -27,7 +27,7 @@ class HeadTests(SynchronousTestCase):
         self.assertIsNone(taken(bytearray(b"x" + longest)))
 
     def test_said_for_people(self) -> None:
-        """The beginning of the first line is text, though it were none, and an empty line is one as well."""
+        """The description is the start of the first line as text, for any bytes and for an empty line."""
         for bare, said in ((b"SSH-2.0-box", "SSH-2.0-box"), (b"", ""), (b"\xff" + b"x" * 99, "\ufffd" + "x" * 59)):
             found = taken(bytearray(bare + b"\r\n\r\n"))
             assert found is not None

@@ -15,7 +15,7 @@ LONGEST = 1 << 17
 
 
 class Plain(End):
-    """An end that accepts every other one."""
+    """An endpoint that accepts every handshake."""
 
     def __init__(self, is_client: bool = True) -> None:
         super().__init__(LONGEST, Request("server.example.com", "/chat") if is_client else None)
@@ -28,7 +28,7 @@ class Plain(End):
 
 
 def client() -> Plain:
-    """One that has been greeted."""
+    """Return a client after its handshake."""
     one = Plain()
     one.received(answer_to(one.opening()))
     assert one.is_open
@@ -37,7 +37,7 @@ def client() -> Plain:
 
 class GreetingTests(SynchronousTestCase):
     def test_refused_greetings(self) -> None:
-        """A refused greeting opens no connection and no frame is read after it; a server answers in HTTP."""
+        """A rejected handshake opens no connection and stops reading; a server answers with HTTP 400."""
         for old, new in ((b"101 Switching", b"200 OK"), (b"Accept: ", b"Accept: x"), (b"e: websocket", b"e: h2c")):
             one = Plain()
             answer = answer_to(one.opening())
@@ -49,7 +49,7 @@ class GreetingTests(SynchronousTestCase):
             self.assertTrue(server.fault and not server.is_open)
 
     def test_endless_greetings(self) -> None:
-        """An end that never finishes its greeting is not listened to for ever."""
+        """A handshake without an end is rejected at the maximum size."""
         one = Plain(is_client=False)
         one.received(b"GET /" + b"x" * (MAX_HEAD - 6))
         self.assertEqual(one.fault, "")
@@ -59,7 +59,7 @@ class GreetingTests(SynchronousTestCase):
 
 class FrameTests(SynchronousTestCase):
     def test_joins_fragments(self) -> None:
-        """The two fragments of the RFC are one Hello, and a ping between them is answered."""
+        """The two fragments in the RFC give one Hello, and a ping between them is answered."""
         one = client()
         said = bytes.fromhex("010348656c") + bytes.fromhex("890548656c6c6f") + bytes.fromhex("80026c6f")
         messages, reply = one.received(said)
@@ -69,7 +69,7 @@ class FrameTests(SynchronousTestCase):
         self.assertEqual((one.fault, one.frames), ("", 6))
 
     def test_answers_a_close(self) -> None:
-        """A close is answered once, and nothing is heard or sent after it."""
+        """A close is answered once, and nothing is received or sent after it."""
         one = client()
         messages, reply = one.received(framed(CLOSE, b"\x03\xe8bye", None) + framed(TEXT, b"x", None))
         self.assertEqual((messages, reply[0] & 0x0F), ([], CLOSE))
@@ -77,7 +77,7 @@ class FrameTests(SynchronousTestCase):
         self.assertEqual((one.closing(), one.ping(), one.text(b"x")), (b"", b"", b""))
 
     def test_refuses_what_the_rfc_forbids(self) -> None:
-        """Masks from a server, extensions, unknown opcodes, strange fragments and too much are faults."""
+        """Masks from a server, extensions, unknown opcodes, invalid fragments and excessive sizes are faults."""
         part = b"\x7f" + (LONGEST // 2 + 1).to_bytes(8, "big") + bytes(LONGEST // 2 + 1)
         for said in (
             framed(TEXT, b"x", MASK),
@@ -98,7 +98,7 @@ class FrameTests(SynchronousTestCase):
             self.assertEqual(one.received(framed(TEXT, b"x", None)), ([], b""))
 
     def test_counts_frames(self) -> None:
-        """So many frames in one read, and no more; the next read may have as many."""
+        """The number of frames in one read is limited; the next read has the same limit."""
         one = client()
         for _ in range(2):
             self.assertEqual(len(one.received(framed(TEXT, b"", None) * MAX_FRAMES)[0]), MAX_FRAMES)
@@ -107,7 +107,7 @@ class FrameTests(SynchronousTestCase):
 
     @given(st.lists(st.binary(max_size=200), max_size=4))
     def test_both_ends_understand_each_other_cut_anyhow(self, said: list[bytes]) -> None:
-        """What one end says the other hears, though each byte arrives alone."""
+        """Both ends decode each other's messages if each byte arrives separately."""
         near, far = Plain(), Plain(is_client=False)
         heard: list[bytes] = []
         for place in near.opening():
@@ -123,7 +123,7 @@ class FrameTests(SynchronousTestCase):
 
     @given(st.lists(st.binary(max_size=40), max_size=6))
     def test_any_bytes(self, pieces: list[bytes]) -> None:
-        """Whatever arrives is messages or a fault, and nothing is raised."""
+        """Any bytes give messages or a fault, and never raise."""
         for one in (client(), Plain(), Plain(is_client=False)):
             one.opening()
             for piece in pieces:

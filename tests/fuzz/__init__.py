@@ -1,1 +1,1 @@
-"""Fuzzing of the wire: four targets, each a module with ``check(data)`` that runs by itself."""
+"""Fuzzing of the wire protocol: each target is a module with ``check(data)`` and can be run directly."""

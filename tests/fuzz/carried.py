@@ -1,8 +1,8 @@
-"""Carried: what a member in a session has carried for it, says to have carried, or asks of the mirror.
+"""Fuzz the relayed and path messages of a member in a session.
 
-Each input is several plaintexts, as in ``envelope``; the first byte of each picks the kind: CARRY to somebody who is
-there or not, CARRIED as if from somebody, MIRROR, IMAGE.  Nothing raises or is logged, what does not go to a peer with
-a session changes nothing, and no more is sent to the other side than came.
+Each input consists of several plaintexts, as in ``envelope``; the first byte of each selects the kind: CARRY to a
+known or unknown node, CARRIED as if from a node, MIRROR, IMAGE. No input raises or is logged, a message for a node
+without a session changes nothing, and the target sends no more than it received.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ KINDS = (CARRY, CARRIED, MIRROR, IMAGE)
 
 
 def plain_of(ground: Ground, data: bytes) -> bytes:
-    """The plaintext that some bytes stand for."""
+    """Return the plaintext that some bytes encode."""
     first = data[0] if data else 0
     kind = KINDS[first % 4]
     known = (node_id(ground.identity.public), ground.contact.node_id, bytes(20), data[1:21])
@@ -30,7 +30,7 @@ def plain_of(ground: Ground, data: bytes) -> bytes:
 
 
 def shot(ground: Ground, data: bytes) -> None:
-    """Fire one input; raises ``Violation``."""
+    """Send one input; raises ``Violation``."""
     session = next(iter(ground.other._sessions.values()))
     for each in plaintexts(data):
         plain = plain_of(ground, each)[:1423]

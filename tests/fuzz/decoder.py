@@ -1,6 +1,6 @@
-"""Decoder: every decoder of the wire gives what it promises or raises ``Malformed``, whatever the bytes.
+"""Fuzz every decoder of the wire protocol: each returns a valid object or raises ``Malformed``.
 
-What a decoder took is packed and read again, and must be the same.
+A decoded object is encoded and decoded again, and must be the same.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from tests.fuzz.runner import main
 
 
 def check(data: bytes) -> None:
-    """Read one input with every decoder; raises ``Violation``."""
+    """Decode one input with every decoder; raises ``Violation``."""
     with contextlib.suppress(Malformed):
         message = decoded(data)
         again = encoded(message)
@@ -31,7 +31,7 @@ def check(data: bytes) -> None:
         packed = packed_receipt(receipt.key, receipt.is_done, receipt.room, receipt.cause, receipt.here)
         if receipt_of(packed) != receipt._replace(next=receipt_of(packed).next):
             raise Violation("a receipt that is another one when it is packed and read again")
-    with contextlib.suppress(Exception):  # not ours to judge: it only makes fields for those below
+    with contextlib.suppress(Exception):  # not tested here: it only provides fields for the decoders below
         fields = msgpack.unpackb(data, strict_map_key=False)
         _records(fields)
 

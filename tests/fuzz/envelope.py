@@ -1,6 +1,6 @@
-"""Envelope: a member in an established session seals what it likes; what is no message must change nothing.
+"""Fuzz the sealed messages of a member in a session: a malformed message must change nothing.
 
-Several plaintexts in one input are several datagrams: each begins with two bytes that give its length.
+Several plaintexts in one input are several datagrams: each begins with its length in two bytes.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ MAX_SHOTS = 8
 
 
 def plaintexts(data: bytes) -> list[bytes]:
-    """The plaintexts in an input."""
+    """Return the plaintexts in an input."""
     found: list[bytes] = []
     while data and len(found) < MAX_SHOTS:
         length = int.from_bytes(data[:2], "little") % 1372
@@ -23,13 +23,13 @@ def plaintexts(data: bytes) -> list[bytes]:
 
 
 def shot(ground: Ground, data: bytes) -> None:
-    """Fire one input; raises ``Violation``."""
+    """Send one input; raises ``Violation``."""
     session = next(iter(ground.other._sessions.values()))
     for plain in plaintexts(data):
         counted = ground.target.counters["malformed"]
         before = _lasting(ground)
         ground.shoot(session.seal(plain), ground.other.address)
-        # The last part of a parcel ends it, whatever was in it.
+        # The last fragment completes a message, whatever its content.
         is_whole = plain[:1] != bytes([PART])
         if is_whole and ground.target.counters["malformed"] > counted and _lasting(ground) != before:
             raise Violation("a malformed message changed the node")
@@ -37,7 +37,7 @@ def shot(ground: Ground, data: bytes) -> None:
 
 
 def _lasting(ground: Ground) -> str:
-    """The state without that of the session which carried the datagram: its counters went on, as they must."""
+    """Return the hash of the state without the session of the datagram, because its counters always change."""
     target, node = ground.target, ground.node
     session = next(iter(target._sessions.values()), None)
     half_open = [target._half_open._responses, list(target._half_open._unconfirmed)]

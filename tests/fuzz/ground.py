@@ -1,8 +1,7 @@
-"""Ground: the node that the targets are fired at, and what must hold after every shot.
+"""Provide the node that the fuzz targets attack, and the checks after every input.
 
-``state_of`` hashes everything that a node remembers, found by walking its objects, so that new state is never forgotten
-here; left out are the counters (those that measure the rate of handshakes among them), the dice, the clock and the
-network.
+``state_of`` hashes the complete state of a node by walking its objects, which includes new attributes automatically.
+It excludes the counters (including the handshake rate), the random generator, the clock and the network.
 """
 
 from __future__ import annotations
@@ -37,20 +36,20 @@ APART = (FunctionType, MethodType, type, random.Random, HeapClock, Switchboard)
 
 
 class Violation(AssertionError):
-    """A shot did what no datagram may do."""
+    """An input had a forbidden effect."""
 
 
 @implementer(ILogObserver)
 class Ground:
-    """A node ``target`` and a member ``other`` with a session between them, both behind ``door``.
+    """A node ``target`` and a member ``other`` with a session between them, both with the admission check ``door``.
 
-    All that came to the target is recorded.
+    All datagrams to the target are recorded.
     """
 
     def __init__(self, door: Door = OPEN) -> None:
         self.room = door.room
         self.errors: list[str] = []
-        self.known = ""  # the hash after the last shot, for targets that let no time pass
+        self.known = ""  # the hash after the last input, for targets that let no time pass
         self._is_shooting = False
         self.clock = HeapClock()
         self.board = Switchboard(self.clock, random.Random(1))
@@ -87,12 +86,12 @@ class Ground:
         self.clock.advance(0.5)
 
     def stop(self) -> None:
-        """Leave no timer behind."""
+        """Stop both nodes, which removes their timers."""
         self.node.vanish()
         self.other.stop()
 
     def shoot(self, datagram: bytes, source: Address = STRANGER) -> int:
-        """Hand one datagram to the target; the number of bytes that it sent to ``source`` because of it."""
+        """Deliver one datagram to the target; return the number of bytes that it sends to ``source``."""
         self.sent.clear()
         self._is_shooting = True
         receiver = self.network.receiver
@@ -111,7 +110,7 @@ class Ground:
         return sum(len(datagram) for datagram, to in self.sent if to == source)
 
     def state(self) -> str:
-        """The hash of what the target remembers: table, store, sessions, calls under way, timers."""
+        """Return the hash of the target's state: table, store, sessions, pending calls, timers."""
         timers = sorted(call.getTime() for call in self.clock.getDelayedCalls())
         return state_of([self.node, self.store, timers])
 
@@ -128,7 +127,7 @@ class Ground:
 
         def noted(datagram: bytes, to: Address) -> None:
             self.sent.append((datagram, to))
-            if not self._is_shooting:  # what is under way would count as state
+            if not self._is_shooting:  # a datagram in flight would count as state
                 send(datagram, to)
 
         network.listen, network.send = tapped, noted
@@ -136,13 +135,13 @@ class Ground:
         return tapped_network
 
     def __call__(self, event: Any) -> None:
-        """Take note of what is logged while a shot is fired, but for who is not let in, which has a ``code``."""
+        """Record warnings during an input, except refusals of peers, which have a ``code``."""
         if event["log_level"] >= LogLevel.warn and "code" not in event:
             self.errors.append(str(event.get("log_format")))
 
 
 def state_of(thing: object, without: object = None) -> str:
-    """The hash of everything that can be reached from ``thing``, but not through ``without``."""
+    """Return the hash of every object reachable from ``thing``, but not through ``without``."""
     said: list[str] = []
     _walk(thing, said.append, {id(without): -1})
     return hashlib.blake2b(";".join(said).encode(), digest_size=16).hexdigest()

@@ -1,8 +1,8 @@
-"""Handshake: a member that holds the team's key makes INIT, RESP and COOKIE with contents of its own choice.
+"""Fuzz INIT, RESP and COOKIE of a member with the team's key and arbitrary contents.
 
-Contents are a life, a pass, a message and padding, or rubbish; a RESP may be a refusal, too.  A refused handshake
-changes nothing (R1), and nothing that is sent is longer than what came (R3).  The first byte of an input says which of
-the three, and whether the team is a closed one (from 3 on); an INIT has the seed of its ephemeral key next.
+The content is a life, a certificate, a message and padding, or random bytes; a RESP may also be a refusal. A refused
+handshake changes nothing (R1), and no reply is longer than its request (R3). The first byte of an input selects one of
+the three, and a closed team (from 3 on); in an INIT the seed of its ephemeral key follows.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ AT = Address("10.0.0.3", 3)
 
 
 class ShortPass(Gate):
-    """A door whose passes take little room."""
+    """An admission check with short certificates."""
 
     def __init__(self) -> None:
         super().__init__(shown=b"pass")
@@ -34,7 +34,7 @@ class ShortPass(Gate):
 
 
 def init(ground: Ground, data: bytes) -> bytes:
-    """An INIT around a payload; what stands behind the first 600 bytes is changed in the finished datagram."""
+    """Return an INIT with a payload; the bytes after the first 600 change the finished datagram."""
     remote = exchange_key(ground.contact.public)
     noise = Initiator(OWN.static, remote, random.Random(data[:1]).randbytes(32), PROLOGUE, OWN.psk)
     payload = data[1:] if data[:1] < b"\x80" else data[1:5] + OWN.public + data[5:]
@@ -44,7 +44,7 @@ def init(ground: Ground, data: bytes) -> bytes:
 
 
 def resp(ground: Ground, asked: bytes, data: bytes) -> bytes:
-    """A RESP to the INIT that the target sent, around a payload."""
+    """Return a RESP to the target's INIT, with a payload."""
     noise = Responder(OWN.static, bytes(range(32)), PROLOGUE, OWN.psk)
     payload, _ = noise.read(asked[1 : -2 * MAC])
     message, _ = noise.write(data[:1300])
@@ -52,14 +52,14 @@ def resp(ground: Ground, asked: bytes, data: bytes) -> bytes:
 
 
 def cookie(asked: bytes, data: bytes) -> bytes:
-    """A COOKIE for the INIT that the target sent, around sixteen bytes or any other number."""
+    """Return a COOKIE for the target's INIT, with content of any length."""
     head, nonce = bytes([COOKIE]) + mac_of(asked), bytes(24)
     key = derived_key(TEAM, b"cookie")
     return head + nonce + bindings.crypto_aead_xchacha20poly1305_ietf_encrypt(data[:1300], head, nonce, key)
 
 
 def shot(ground: Ground, data: bytes) -> None:
-    """Fire one input; raises ``Violation``."""
+    """Send one input; raises ``Violation``."""
     kind, data = data[0] % 3 if data else 0, data[1:]
     source = STRANGER
     if kind:
@@ -78,7 +78,7 @@ def shot(ground: Ground, data: bytes) -> None:
     sent_bytes = ground.shoot(datagram, source)
     if not kind and sent_bytes > len(datagram):
         raise Violation(f"{sent_bytes} bytes sent for {len(datagram)} received")
-    # A RESP opens its session whatever message rides in it; only that message is dropped.
+    # A RESP opens its session even if its message is invalid; only the message is dropped.
     if kind != 1 and counters["forged"] + counters["malformed"] > refused and ground.state() != before:
         raise Violation("a refused handshake changed the node")
     ground.clock.advance(2.0 if kind else 0.02)
@@ -88,7 +88,7 @@ _open, _closed = Again(shot), Again(shot, made=lambda: Ground(ShortPass()))
 
 
 def check(data: bytes) -> None:
-    """Fire one input at an open team's node or at a closed one's."""
+    """Send one input to a node of an open or of a closed team."""
     (_closed if data and data[0] // 3 % 2 else _open)(data)
 
 

@@ -1,9 +1,9 @@
-"""Paper: whatever may be shown as a pass, told as a statement, knocked or welcomed with; changed, cut or made up.
+"""Fuzz certificates, statements, join requests and join replies: changed, truncated or invented.
 
-The first byte of an input names the kind (see ``KINDS``), and from 128 on a lawful one is taken, of which each three
-bytes after it say where to change it and how.  Every reader gives what it promises or raises ``Malformed`` or
-``Forged``; the roll believes nothing that its operator, or who stands for it, did not sign; and a bootstrap node
-answers a knock with no more than came, without an exception or a line in the log.
+The first byte of an input selects the kind (see ``KINDS``). From 128 on a valid one is taken, and each following three
+bytes give the position and value of a change. Every decoder returns a valid object or raises ``Malformed`` or
+``Forged``; the membership list accepts nothing without the signature of its operator or of a bootstrap node; and a
+bootstrap node's reply to a join request is no longer than the request, without an exception or a log line.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ EPHEMERAL = bytes(range(32))
 
 
 def lawful() -> dict[str, list[bytes]]:
-    """What a team says, of each kind."""
+    """Return valid messages of each kind."""
     grant = granted(SIGNER, "vaio", "bootstrap")
     chain = admitted(SIGNER, "dog")
     secret = SIGNER.rotate(2, [NEWCOMER.public], NOW, 60, random.Random(2))
@@ -64,7 +64,7 @@ GENUINE = {each for kind in LAWFUL.values() for each in kind}
 
 
 def changed(base: bytes, data: bytes) -> bytes:
-    """``base``, changed as the bytes say."""
+    """Return ``base`` with the changes that ``data`` encodes."""
     found = bytearray(base)
     for place in range(0, len(data) - 2, 3):
         where = int.from_bytes(data[place : place + 2], "little")
@@ -76,7 +76,7 @@ def changed(base: bytes, data: bytes) -> bytes:
 
 
 def check(data: bytes) -> None:
-    """Read one input with everything that reads its kind; raises ``Violation``."""
+    """Decode one input with all decoders of its kind; raises ``Violation``."""
     first = data[0] if data else 0
     kind = KINDS[first % len(KINDS)]
     base = LAWFUL[kind][first // len(KINDS) % len(LAWFUL[kind])]

@@ -1,4 +1,4 @@
-"""Raw: whatever a stranger may send to an open port; recordings of lawful datagrams, changed or not, among it.
+"""Fuzz an open port with arbitrary datagrams of a stranger, including changed recordings.
 
 A stranger changes nothing (R1) and gets no more bytes than it sent (R3).
 """
@@ -12,9 +12,10 @@ RECORDED = 128
 
 
 def datagram_of(data: bytes, recorded: list[bytes]) -> bytes:
-    """The datagram that an input stands for.
+    """Return the datagram that an input encodes.
 
-    From ``RECORDED`` on the first byte names a recorded one; each three bytes after it say where to change it and how.
+    From ``RECORDED`` on the first byte selects a recording; each following three bytes give the position and value of
+    a change.
     """
     if not data or data[0] < RECORDED or not recorded:
         return data[1:]
@@ -29,7 +30,7 @@ def datagram_of(data: bytes, recorded: list[bytes]) -> bytes:
 
 
 def shot(ground: Ground, data: bytes) -> None:
-    """Fire one input; raises ``Violation``."""
+    """Send one input; raises ``Violation``."""
     datagram = datagram_of(data, ground.recorded)
     before = ground.known or ground.state()
     sent = ground.shoot(datagram)

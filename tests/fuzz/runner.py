@@ -1,7 +1,7 @@
-"""Runner: fires inputs at a target for a while: with atheris where it is installed, else with plain mutations.
+"""Run a fuzz target for some time, with atheris if it is installed, otherwise with simple mutations.
 
-``python -m tests.fuzz.raw --seconds 600`` prints how many inputs were fired and how long the slowest took; an input
-that breaks a rule is written to a file, whose name is printed.
+``python -m tests.fuzz.raw --seconds 600`` prints the number of inputs and the duration of the slowest one; an input
+that violates a rule is written to a file, and its name is printed.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Check = Callable[[bytes], None]
 
 
 class Again:
-    """A check on a ground that is made anew after every ``period`` inputs, since lawful ones leave their traces."""
+    """A check on a ground that is recreated after ``period`` inputs, because valid inputs change its state."""
 
     def __init__(
         self, shot: Callable[[Ground, bytes], None], period: int = 200, made: Callable[[], Ground] = Ground
@@ -35,7 +35,7 @@ class Again:
         self._ground: Ground | None = None
 
     def __call__(self, data: bytes) -> None:
-        """Fire one input."""
+        """Send one input."""
         if self._ground is None or not self._left:
             if self._ground is not None:
                 self._ground.stop()
@@ -49,12 +49,12 @@ class Again:
 
 
 def seeds(name: str) -> list[bytes]:
-    """The corpus of a target."""
+    """Return the corpus of a target."""
     return [path.read_bytes() for path in sorted((CORPUS / name).iterdir())]
 
 
 def mutated(rng: random.Random, inputs: list[bytes]) -> bytes:
-    """Another input, made of those that are known."""
+    """Return a mutation of the known inputs."""
     data = bytearray(rng.choice(inputs))
     for _ in range(rng.randrange(1, 6)):
         place = rng.randrange(len(data) + 1)
@@ -97,7 +97,7 @@ def main(name: str, check: Check) -> None:
 
 
 def _functions() -> list[FunctionType]:
-    """What the coverage is measured of: the functions and methods of the library."""
+    """Return the functions and methods of the library, for which coverage is measured."""
     found = []
     for name, module in list(sys.modules.items()):
         if name.startswith("middleware.entangled"):
@@ -124,7 +124,7 @@ def _mutate(check: Check, inputs: list[bytes], seconds: float, seed: int) -> Non
 
 
 class _Timed:
-    """Counts the inputs, and keeps how long the slowest took."""
+    """Counts the inputs, and measures the slowest one."""
 
     def __init__(self, check: Check) -> None:
         self._check = check

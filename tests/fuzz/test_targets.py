@@ -1,4 +1,4 @@
-"""Tests of the four targets: the kept corpus, and a bounded number of inputs that hypothesis makes."""
+"""Tests of the fuzz targets with a limited number of inputs from hypothesis."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ BOUNDED = settings(max_examples=150)
 
 
 class TargetTests(SynchronousTestCase):
-    """No input breaks a rule: R1 (what is refused changes nothing) and R3 (no reply is larger than its request)."""
+    """No input violates a rule: R1 (refused input changes nothing) and R3 (no reply is larger than its request)."""
 
     @BOUNDED
     @given(st.binary(max_size=1500))
     def test_any_datagram(self, data: bytes) -> None:
-        """Any bytes at all, from a stranger."""
+        """Arbitrary datagrams of a stranger violate no rule."""
         raw.check(b"\0" + data)
 
     @BOUNDED
     @given(st.integers(0, 30), st.lists(st.tuples(st.integers(0, 1400), st.integers(1, 255)), max_size=4))
     def test_any_change(self, which: int, changes: list[tuple[int, int]]) -> None:
-        """Any change of a few bytes in a recorded datagram, and the recording as it was."""
+        """Recorded datagrams, unchanged and with a few changed bytes, violate no rule."""
         raw.check(bytes([raw.RECORDED + which]) + b"".join(w.to_bytes(2, "little") + bytes([b]) for w, b in changes))
 
     @BOUNDED
     @given(st.binary(max_size=1371))
     def test_any_plaintext(self, data: bytes) -> None:
-        """Any bytes at all, sealed by a member."""
+        """Arbitrary plaintexts, sealed by a member, violate no rule."""
         envelope.check(len(data).to_bytes(2, "little") + data)
 
     def test_the_ground_notices(self) -> None:
-        """The hash sees new sessions, timers and calls under way; a longer reply is a violation."""
+        """The hash covers new sessions, timers and pending calls; a longer reply is a violation."""
         ground = Ground()
         self.addCleanup(ground.stop)
         before = ground.state()

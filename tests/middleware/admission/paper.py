@@ -1,4 +1,4 @@
-"""Paper: operators, members and what they sign, for the tests of admission."""
+"""Build operators, members and signed statements for the tests of admission."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ LATER = 3600.0
 
 
 def operator(seed: int = 1, team: str = "yard") -> Operator:
-    """An operator who is the same for the same seed."""
+    """Return an operator; the same seed gives the same operator."""
     return drawn(team, random.Random(f"operator {seed}"))
 
 
 def identity(name: str) -> Identity:
-    """The key pair of whoever is called so."""
+    """Return the key pair that belongs to ``name``."""
     return Identity(random.Random(f"identity {name}").randbytes(32))
 
 
@@ -30,7 +30,7 @@ def granted(signer: Operator, name: str, *roles: str) -> bytes:
 
 
 def invited(signer: Operator, name: str = "dog", uses: int = 1, seed: int = 1) -> tuple[Code, bytes, Invite]:
-    """A code, the statement that makes it good, and that as it is read."""
+    """Return a join code, the signed invitation for it, and the decoded invitation."""
     code, packed, _ = signer.invite(name, ("device",), uses, NOW, LATER, random.Random(seed))
     invite = opened(signer.public, packed)
     assert isinstance(invite, Invite)
@@ -40,7 +40,7 @@ def invited(signer: Operator, name: str = "dog", uses: int = 1, seed: int = 1) -
 def admitted(
     signer: Operator, name: str, bootstrap: str = "vaio", wish: str = "", now: int = NOW, seed: int = 1
 ) -> bytes:
-    """The pass of a newcomer that the bootstrap node of that name let in."""
+    """Return the certificate chain of a newcomer that the bootstrap node ``bootstrap`` admitted."""
     code, packed, invite = invited(signer, name, seed=seed)
     public = identity(name).public
     grant = granted(signer, bootstrap, "bootstrap")

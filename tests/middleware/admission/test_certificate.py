@@ -1,4 +1,4 @@
-"""Tests of passes."""
+"""Tests of certificate chains."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ DOG = identity("dog")
 
 class CertificateTests(SynchronousTestCase):
     def test_granted_by_the_operator(self) -> None:
-        """A grant of the operator makes a member, of the key that it names and no other."""
+        """A grant of the operator makes a member of the key that it names, and of no other key."""
         shown = pass_of(granted(OPERATOR, "dog", "device", "gateway"))
         member = member_of(OPERATOR.public, DOG.public, shown)
         self.assertEqual((member.name, member.roles), ("dog", ("device", "gateway")))
@@ -37,14 +37,14 @@ class CertificateTests(SynchronousTestCase):
         self.assertRaises(Forged, member_of, operator(2).public, DOG.public, shown)
 
     def test_let_in_by_a_bootstrap_node(self) -> None:
-        """Invitation, proof and admission together make a member with the invitation's roles and its life."""
+        """Invitation, proof and admission together make a member with the roles and lifetime of the invitation."""
         member = member_of(OPERATOR.public, DOG.public, admitted(OPERATOR, "dog"))
         _, _, invite = invited(OPERATOR)
         expected = (DOG.public, "dog", ("device",), NOW, NOW + invite.life, invite.public, identity("vaio").public)
         self.assertEqual(member, Member(*expected, uses=1, since=NOW, life=invite.life))
 
     def test_renewed_by_a_bootstrap_node(self) -> None:
-        """A renewal moves the end of a certificate, by a grant or by a code, and can itself be renewed."""
+        """A renewal moves the expiry of a certificate, granted or by code, and can itself be renewed."""
         vaio, grant = identity("vaio"), granted(OPERATOR, "vaio", "bootstrap")
         for shown in (pass_of(granted(OPERATOR, "dog")), admitted(OPERATOR, "dog")):
             before = member_of(OPERATOR.public, DOG.public, shown)
@@ -57,7 +57,7 @@ class CertificateTests(SynchronousTestCase):
             self.assertLessEqual(len(shown), ROOM)
 
     def test_it_takes_two(self) -> None:
-        """A bootstrap node without the code, and the code with a node that is no bootstrap, admit nobody."""
+        """An admission without the code, or by a node without the role bootstrap, is forged."""
         code, packed, invite = invited(OPERATOR)
         grant, plain = granted(OPERATOR, "vaio", "bootstrap"), granted(OPERATOR, "vaio", "device")
         vaio = identity("vaio")
@@ -78,7 +78,7 @@ class CertificateTests(SynchronousTestCase):
             self.assertRaises(Forged, member_of, OPERATOR.public, DOG.public, shown)
 
     def test_admission_needs_a_living_invitation(self) -> None:
-        """Nobody is let in by an invitation that had run out, and none for longer than it says."""
+        """An expired invitation admits no member, and no admission outlives the lifetime in its invitation."""
         late = admitted(OPERATOR, "dog", now=NOW + int(LATER) + 1)
         self.assertRaises(Malformed, member_of, OPERATOR.public, DOG.public, late)
         fields = msgpack.unpackb(admitted(OPERATOR, "dog"))
@@ -86,14 +86,14 @@ class CertificateTests(SynchronousTestCase):
         self.assertRaises(Malformed, member_of, OPERATOR.public, DOG.public, msgpack.packb(fields))
 
     def test_it_has_its_time(self) -> None:
-        """A pass is early before its time, allowing for clocks that differ, and expired after it."""
+        """A certificate is early before its start, with a tolerance for clock skew, and expired after its end."""
         member = member_of(OPERATOR.public, DOG.public, pass_of(granted(OPERATOR, "dog")))
         self.assertEqual(member.trouble(NOW - SKEW - 1), "early")
         self.assertEqual(member.trouble(NOW - SKEW), "")
         self.assertEqual(member.trouble(member.not_after), "expired")
 
     def test_guest(self) -> None:
-        """A gateway vouches for a guest for a day; a member without that role, and a guest, vouch for nobody."""
+        """A gateway vouches for a guest for one day; a member without that role cannot, nor can a guest."""
         page, phone, friend = identity("page"), identity("phone"), identity("friend")
         own = pass_of(granted(OPERATOR, "page", "gateway"))
         shown = guest_pass(page, own, phone.public, "phone", NOW)
@@ -110,7 +110,7 @@ class CertificateTests(SynchronousTestCase):
         self.assertEqual(mine.refusal(member, NOW), "revoked")
 
     def test_guest_of_one_who_came_by_code(self) -> None:
-        """A gateway that came by an invitation has room to vouch, unless all the names in its pass are long."""
+        """A gateway that joined by code can vouch for a guest, unless all the names in its chain are long."""
         page, phone = identity("page"), identity("phone")
         shown = guest_pass(page, admitted(OPERATOR, "page"), phone.public, "phone-of-a-visitor", NOW)
         voucher = member_of(OPERATOR.public, phone.public, shown).voucher
@@ -123,7 +123,7 @@ class CertificateTests(SynchronousTestCase):
         self.assertRaises(Malformed, guest_pass, page, long, phone.public, "phone", NOW)
 
     def test_longest_fits(self) -> None:
-        """A chain whose names are as long as names may be, and its renewal, stay within the room of a pass."""
+        """A chain with names of the maximum length, and its renewal, fit into the space for a chain."""
         long, boot = "n" * 40, "b" * 40
         shown = admitted(OPERATOR, long, bootstrap=boot, wish="w" * 40)
         member = member_of(OPERATOR.public, identity(long).public, shown)
@@ -135,7 +135,7 @@ class CertificateTests(SynchronousTestCase):
     @given(st.data())
     @settings(max_examples=200, deadline=None)
     def test_reads_anything(self, data: st.DataObject) -> None:
-        """Whatever is shown, cut and changed in any way, is refused by name and never raises anything else."""
+        """The decoder raises only ``Forged`` or ``Malformed`` for truncated, changed and random input."""
         old = data.draw(st.sampled_from((admitted(OPERATOR, "dog"), pass_of(granted(OPERATOR, "dog")))))
         member, grant = member_of(OPERATOR.public, DOG.public, old), granted(OPERATOR, "vaio", "bootstrap")
         again = renewed(identity("vaio"), grant, member, old, NOW + YEAR)

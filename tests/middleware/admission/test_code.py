@@ -1,4 +1,4 @@
-"""Tests of the code of an invitation."""
+"""Tests of the join code of an invitation."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ class CodeTests(SynchronousTestCase):
         self.code = code.drawn(operator().public, random.Random(1))
 
     def test_what_is_read_out_is_what_is_typed(self) -> None:
-        """The text of a code has four groups of five characters, and reading it gives the code and its key again."""
+        """The text of a code has four groups of five characters, and decodes to the same code and key."""
         self.assertEqual([len(group) for group in self.code.text.split("-")], [5, 5, 5, 5])
         again = code.read(self.code.text)
         self.assertEqual((again, again.key.public), (self.code, self.code.key.public))
 
     def test_hands_are_forgiven(self) -> None:
-        """Small letters, other groups, and letters that look like digits are read as they were meant."""
+        """Lower case, other groups and letters that look like digits are accepted."""
         meant = code.Code(0x1_0001, 0x10)
         self.assertEqual(code.read(meant.text.replace("0", "o").replace("1", "l").replace("-", " ").lower()), meant)
 
     def test_every_slip_is_noticed(self) -> None:
-        """Any single wrong character, and any two that changed places, is called mistyped before anything is sent."""
+        """Any single wrong character and any two swapped characters are reported as mistyped."""
         letters = self.code.text.replace("-", "")
         slips = [letters[:at] + other + letters[at + 1 :] for at in range(20) for other in code.LETTERS]
         for first in range(20):
@@ -42,23 +42,23 @@ class CodeTests(SynchronousTestCase):
                 self.assertIn("mistyped", str(self.assertRaises(BadCode, code.read, slip)))
 
     def test_length_and_letters_are_named(self) -> None:
-        """A code that is too short, or has a letter that no code has, says so."""
+        """The error for a code of the wrong length or with an invalid letter names the length or the letter."""
         self.assertIn("has 19", str(self.assertRaises(BadCode, code.read, self.code.text[:-1])))
         self.assertIn("'U'", str(self.assertRaises(BadCode, code.read, "u" + self.code.text[1:])))
 
     def test_code_names_its_operator(self) -> None:
-        """A code fits the operator that made it and not another one."""
+        """A code fits the operator that created it, and no other operator."""
         self.assertTrue(self.code.fits(operator().public))
         self.assertFalse(self.code.fits(operator(2).public))
 
     def test_secret_is_not_shown(self) -> None:
-        """What a log prints of a code does not let anybody in."""
+        """The ``repr`` of a code does not contain its secret."""
         self.assertNotIn(str(self.code.secret), repr(self.code))
 
     @given(st.text(max_size=30) | st.text("0123456789ABCDEFGHJKMNPQRSTVWXYZ-oil", min_size=18, max_size=24))
     @settings(max_examples=300, deadline=None)
     def test_reads_anything(self, text: str) -> None:
-        """Whatever is typed is a code or refused by name."""
+        """Any text is either a code or raises ``BadCode``."""
         try:
             found = code.read(text)
         except BadCode:

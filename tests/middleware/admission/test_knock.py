@@ -1,4 +1,4 @@
-"""Tests of what a newcomer and a bootstrap node say."""
+"""Tests of the messages between a newcomer and a bootstrap node."""
 
 from __future__ import annotations
 
@@ -33,17 +33,17 @@ HEARD = knock.Knock(DOG, EPHEMERAL, "dog", b"")
 
 
 def signer(name: str = "vaio", role: str = "bootstrap", code: Code = CODE) -> Signer:
-    """The node of that name, which answers by the terms of ``code``."""
+    """Return the node ``name``, which answers with the terms of ``code``."""
     return Signer(identity(name), granted(OPERATOR, name, role), seal_terms(code, CONTENT, random.Random(3)))
 
 
 def welcomed(by: Signer | None = None) -> bytes:
-    """A WELCOME, lawful unless another node signs."""
+    """Return a join reply (WELCOME), valid unless ``by`` is another node."""
     return knock.welcome(INVITE.public, HEARD, WELCOME, by or signer(), random.Random(2))
 
 
 def read(datagram: bytes, code: Code = CODE, secret: bytes = SECRET) -> Reply | Hint:
-    """The answer as the newcomer reads it."""
+    """Return the reply as the newcomer decodes it."""
     return knock.opened_welcome(datagram, code, DOG, secret)
 
 
@@ -53,7 +53,7 @@ def knocked(wish: str = "dog") -> bytes:
 
 class KnockTests(SynchronousTestCase):
     def test_knock_is_read_as_it_was_said(self) -> None:
-        """A bootstrap node that knows the invitation reads the newcomer's key, wish and proof."""
+        """A bootstrap node that knows the invitation decodes the newcomer's key, wish and proof."""
         said = knocked()
         found = knock.opened_knock(said, INVITE.public)
         self.assertEqual((found.public, found.ephemeral, found.wish), (DOG, EPHEMERAL, "dog"))
@@ -61,13 +61,13 @@ class KnockTests(SynchronousTestCase):
         self.assertFalse(is_proof(INVITE.public, DOG, "cat", found.proof))
 
     def test_knock_hides_who_comes(self) -> None:
-        """Who reads the wire sees neither key nor name; all knocks are as long as a datagram may be."""
+        """A join request (KNOCK) reveals neither key nor name, and always has the maximum size of a datagram."""
         said = knocked()
         self.assertNotIn(DOG, said)
         self.assertEqual({len(knocked(name)) for name in ("", "dog", "n" * 40)}, {1400})
 
     def test_welcome_is_read_as_it_was_given(self) -> None:
-        """The newcomer reads what it is given; the fullest welcome loses contacts rather than outgrow its knock."""
+        """The newcomer decodes the join reply; a full reply drops contacts to stay smaller than the request."""
         said = welcomed()
         self.assertLessEqual(len(said), knock.KNOCK_BYTES)
         found = read(said)
@@ -78,20 +78,20 @@ class KnockTests(SynchronousTestCase):
         self.assertGreater(len(found.said.contacts), 1)
 
     def test_welcome_is_for_one(self) -> None:
-        """Another ephemeral key, another code or another newcomer reads nothing."""
+        """A join reply cannot be decrypted with another ephemeral key, code or newcomer."""
         other = invited(OPERATOR, seed=2)[0]
         self.assertRaises(Forged, read, welcomed(), CODE, b"x" * 32)
         self.assertRaises(Forged, read, welcomed(), other)
         self.assertRaises(Forged, knock.opened_welcome, welcomed(), CODE, identity("cat").public, SECRET)
 
     def test_only_a_bootstrap_node_answers(self) -> None:
-        """The answer of a member without the role, and one by the terms of another code, are forged."""
+        """A reply from a member without the role bootstrap, or with the terms of another code, is forged."""
         self.assertRaises(Forged, read, welcomed(signer(role="device")))
         self.assertRaises(Forged, read, welcomed(signer(code=invited(OPERATOR, seed=2)[0])))
         self.assertRaises(Forged, read, welcomed(replace(signer(), identity=identity("eye"))))
 
     def test_refusals_have_names(self) -> None:
-        """A refusal comes through by its code, an unknown one as unknown; a hint is no more than a hint."""
+        """A refusal arrives with its code, an unrecognized code as "unknown"; a hint is decoded as a hint."""
         for code, meant in (("used", "used"), ("silly", "unknown")):
             said = knock.refusal(INVITE.public, HEARD, code, signer(), random.Random(2))
             self.assertEqual(read(said), Reply(CONTENT, meant))
@@ -102,7 +102,7 @@ class KnockTests(SynchronousTestCase):
     @given(st.integers(0, 1399), st.integers(1, 255), st.binary(max_size=1400))
     @settings(max_examples=200, deadline=None)
     def test_reads_anything(self, place: int, change: int, junk: bytes) -> None:
-        """Whatever comes is refused as forged or malformed: junk, and each datagram with one byte changed."""
+        """Random bytes and datagrams with one changed byte raise ``Forged`` or ``Malformed``."""
         said = bytearray(knocked())
         said[place] ^= change
         self.assertRaises((Forged, Malformed), knock.opened_knock, bytes(said), INVITE.public)
@@ -114,7 +114,7 @@ class KnockTests(SynchronousTestCase):
     @given(st.recursive(st.integers(0, 99) | st.binary(max_size=70) | st.text(max_size=5), st.lists, max_leaves=20))
     @settings(max_examples=200, deadline=None)
     def test_a_bootstrap_node_may_sign_anything(self, body: object) -> None:
-        """An answer that is signed and holds something else raises nothing but Malformed, or is a refusal."""
+        """A signed reply with any other content is a refusal or raises ``Malformed``."""
         whole = knock._sign_body(INVITE.public, HEARD, msgpack.packb(body), signer())
         said = knock._encrypt_reply(INVITE.public, EPHEMERAL, whole, random.Random(2))
         with contextlib.suppress(Malformed):

@@ -1,4 +1,4 @@
-"""Tests of the files that members and operators keep."""
+"""Tests of the key files of members and operators."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ class MembershipTests(SynchronousTestCase):
         self.membership = operator().founded("vaio", ("device", "bootstrap"), NOW, random.Random(1))
 
     def refusal(self, path: Path) -> str:
-        """What is said of the membership at ``path``."""
+        """Return the error for the membership file at ``path``."""
         return str(self.assertRaises(BadKeyFile, MembershipFile, path))
 
     def test_read_as_it_was_kept(self) -> None:
-        """A membership is the same after it was written, and nobody else can read its file."""
+        """A membership is unchanged after a write and a read, and its file is readable by its owner alone."""
         membership.made(self.path, self.membership)
         self.assertEqual(MembershipFile(self.path).membership, self.membership)
         self.assertEqual(self.path.stat().st_mode & 0o777, 0o600)
 
     def test_what_is_no_membership(self) -> None:
-        """A missing file, other content, another kind and another team's pass are each refused by name and path."""
+        """A missing file, other content, another kind and another team's certificate are refused with the path."""
         self.assertIn("cannot be read", self.refusal(self.path))
         foreign = operator(2).founded("vaio", ("device",), NOW, random.Random(1))
         wrong = self.membership.packed() | {"pass": foreign.shown.hex()}
@@ -42,13 +42,13 @@ class MembershipTests(SynchronousTestCase):
         self.assertIn(str(self.path), self.refusal(self.path))
 
     def test_nothing_is_overwritten(self) -> None:
-        """To make a file where there is one is refused: a team's key is not lost by a slip."""
+        """Creating a key file over an existing one is refused, which protects a team's key from a mistake."""
         operators.made(self.path, operator())
         self.assertRaises(BadKeyFile, operators.made, self.path, operator(2))
         self.assertEqual(operators.load(self.path), operator())
 
     def test_replaced_whole(self) -> None:
-        """A new secret replaces the file, leaves nothing beside it, and a folder that cannot be written says so."""
+        """A new secret replaces the file and leaves no temporary file; an unwritable folder is reported."""
         membership.made(self.path, self.membership)
         kept = MembershipFile(self.path)
         kept.keep(self.membership.with_secret(2, b"2" * 32, NOW + 60))
@@ -61,7 +61,7 @@ class MembershipTests(SynchronousTestCase):
         )
 
     def test_old_secrets_run_out(self) -> None:
-        """After a rotation the secret before is accepted for its grace and no longer, in whatever order they came."""
+        """After a rotation the previous secret is accepted for its grace period, in any order of arrival."""
         first = self.membership.secrets[0][1]
         second, third = (2, b"2" * 32, NOW + 60), (3, b"3" * 32, NOW + 90)
         for order in ((second, third), (third, second)):

@@ -1,4 +1,4 @@
-"""Tests of the bootstrap node's side of admission, with nothing around it."""
+"""Tests of the bootstrap node's side of admission, in isolation."""
 
 from __future__ import annotations
 
@@ -50,18 +50,18 @@ class ReceptionTests(SynchronousTestCase):
         )
 
     def knocked(self, dice: int = 1, name: str = "dog", secret: bytes = SECRET) -> bytes:
-        """A lawful KNOCK, other bytes for other dice."""
+        """Return a valid join request (KNOCK); another seed gives other bytes."""
         shared = bindings.crypto_scalarmult_base(secret)
         return knock.knock(CODE.key, identity(name).public, shared, "", random.Random(dice))
 
     def answer(self) -> Welcome | str:
-        """The content of the last signed answer."""
+        """Return the content of the last signed reply."""
         reply = knock.opened_welcome(self.sent[-1][0], CODE, DOG, SECRET)
         assert isinstance(reply, Reply)
         return reply.said
 
     def test_let_in(self) -> None:
-        """A lawful knock is answered once, to where it came from, and never with more bytes than it has."""
+        """A valid join request gets one reply, sent to its source and not larger than the request."""
         said = self.knocked()
         self.reception.on_knock(said, DOOR)
         self.assertIsInstance(self.answer(), Welcome)
@@ -70,15 +70,15 @@ class ReceptionTests(SynchronousTestCase):
         assert self.roll.admitted(DOG) is not None
 
     def test_repeated_knock_costs_nothing(self) -> None:
-        """The same datagram again gets the same bytes again, wherever it comes from, and uses no code."""
+        """A repeated datagram gets the same reply, from any source address, and consumes no use of the code."""
         said = self.knocked()
         self.reception.on_knock(said, DOOR)
-        self.taken = Deferred()  # who asked for another use would wait for it
+        self.taken = Deferred()  # a request for another use would block on this
         self.reception.on_knock(said, Address("10.0.0.3", 1))
         self.assertEqual(self.sent[0][0], self.sent[1][0])
 
     def test_answer_under_way(self) -> None:
-        """While a use is being taken the same newcomer's knocks wait; then it is answered once."""
+        """Requests of one newcomer wait while a use is taken; then the newcomer gets one reply."""
         self.taken = Deferred()
         for dice in range(3):
             self.reception.on_knock(self.knocked(dice), DOOR)
@@ -87,7 +87,7 @@ class ReceptionTests(SynchronousTestCase):
         self.assertEqual(len(self.sent), 1)
 
     def test_nobody_can_tell(self) -> None:
-        """Where too few are in sight, or the roll is full, the newcomer is told to come again, and nobody is let in."""
+        """A newcomer is refused with "later" if too few peers are reachable or the membership list is full."""
         self.taken = fail(NoAnswer("too few"))
         self.reception.on_knock(self.knocked(1), DOOR)
         self.assertEqual(self.answer(), "later")
@@ -104,7 +104,7 @@ class ReceptionTests(SynchronousTestCase):
         self.assertIsNone(self.roll.admitted(DOG))
 
     def test_strangers_get_nothing(self) -> None:
-        """What names a known invitation and does not open gets no answer, and keeps nobody with the code from one."""
+        """Forged requests for a known invitation get no reply, and do not delay a newcomer with the code."""
         said = self.knocked()
         for number in range(int(RATE) * 3):
             forged = bytearray(said)
@@ -115,13 +115,13 @@ class ReceptionTests(SynchronousTestCase):
         self.assertIsInstance(self.answer(), Welcome)
 
     def test_key_that_is_none(self) -> None:
-        """A newcomer whose ephemeral key is none gets no answer, and no log is filled for it."""
+        """A request with an invalid ephemeral key gets no reply and logs no error."""
         bad = knock.knock(CODE.key, DOG, bytes(32), "", random.Random(1))
         self.reception.on_knock(bad, DOOR)
         self.assertEqual((self.sent, self.flushLoggedErrors()), ([], []))
 
     def test_hints_are_few_and_short(self) -> None:
-        """Unknown codes are answered by nine bytes, at most so many a second, and logged once."""
+        """Requests with unknown codes get hints of nine bytes, limited in rate and logged once."""
         strange = bytearray(self.knocked())
         strange[1] ^= 1
         with capturedLogs() as said:
@@ -131,7 +131,7 @@ class ReceptionTests(SynchronousTestCase):
         self.assertEqual(len(said), 1)
 
     def test_checks_are_few(self) -> None:
-        """Of many that have the code only so many a second are looked at; a second later others are."""
+        """The rate of checked requests is limited, even for newcomers with the code."""
         for number in range(int(RATE) + 10):
             self.reception.on_knock(self.knocked(name=f"dog{number}"), DOOR)
         self.assertEqual(len(self.sent), int(RATE))
@@ -142,7 +142,7 @@ class ReceptionTests(SynchronousTestCase):
     @given(st.data())
     @settings(max_examples=150, deadline=None)
     def test_takes_anything(self, data: st.DataObject) -> None:
-        """Whatever comes raises nothing, and is answered with fewer bytes than it has, or not at all."""
+        """Any datagram is handled without an exception, and its reply is not larger than the datagram."""
         said = bytearray(self.knocked())
         for place in data.draw(st.lists(st.integers(0, len(said) - 1), max_size=3)):
             said[place] ^= data.draw(st.integers(0, 255))

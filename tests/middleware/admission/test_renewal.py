@@ -1,4 +1,4 @@
-"""Tests of renewal: a team over a year and a half of virtual time, with nobody attending."""
+"""Tests of automatic renewal over a year and a half of virtual time."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ STEP_DAYS, STEP_S = 5, 12.0
 
 
 class Years(Village):
-    """A village whose wall clock advances faster than the clock by which nodes measure time."""
+    """A simulated team with a wall clock that advances faster than the nodes' monotonic clock."""
 
     def live(self, days: int) -> None:
-        """Let so many days pass while the nodes run."""
+        """Let ``days`` pass while the nodes run."""
         for _ in range(days // STEP_DAYS):
             self.days += STEP_DAYS
             self.run(STEP_S)
 
     def end_of(self, house: House, at: int = 0) -> int:
-        """When the certificate of a house ends, as another one knows."""
+        """Return the expiry of the certificate of ``house`` in the list of node number ``at``."""
         member = self.houses[at].team.door.member(house.public)
         assert member is not None
         return member.not_after
 
 
 class YearsCase(VillageCase):
-    """A test of years."""
+    """A test with a ``Years`` team."""
 
     def years(self, bootstraps: int = 2) -> Years:
-        """A village of five, of which the first are bootstrap nodes, stopped when the test ends."""
+        """Return a team of five, the first ``bootstraps`` of them bootstrap nodes, stopped when the test ends."""
         years = self.kept(Years(bootstraps=bootstraps))
         for name in ("dog", "cat", "pig", "cow")[: 5 - bootstraps]:
             years.welcome(name)
@@ -43,7 +43,7 @@ class YearsCase(VillageCase):
 
 class YearAndAHalfTests(YearsCase):
     def test_nobody_attends(self) -> None:
-        """All five renew, one that sleeps for 60 days is back in place, and one that was revoked stays out."""
+        """All five members renew; one that was off for 60 days returns, and a revoked one stays rejected."""
         years = self.years()
         vaio, boot, dog, cat, pig = years.houses
         publics = [house.public for house in years.houses]
@@ -63,7 +63,7 @@ class YearAndAHalfTests(YearsCase):
         self.assertEqual(self.refusal(years, pig.node.call, vaio, 3.0), "revoked")
 
     def test_one_bootstrap_node(self) -> None:
-        """The only bootstrap node renews itself and all others, over restarts too."""
+        """A single bootstrap node renews itself and all other members, also across restarts."""
         years = self.years(bootstraps=1)
         years.live(300)
         for house in years.houses:
@@ -76,7 +76,7 @@ class YearAndAHalfTests(YearsCase):
         self.assertEqual(years.houses[0].team.door.me.renewer, years.houses[0].public)
 
     def test_a_bootstrap_node_is_gone_for_good(self) -> None:
-        """When one of two bootstrap nodes is gone, the other one goes on, and renews itself in the end."""
+        """If one of two bootstrap nodes is lost, the other one renews all members and itself."""
         years = self.years()
         years.live(200)
         years.close(years.houses[1], is_sudden=True)
@@ -87,7 +87,7 @@ class YearAndAHalfTests(YearsCase):
 
 class LargeTeamTests(YearsCase):
     def test_not_in_sight(self) -> None:
-        """A member that is no contact of the bootstrap node is looked up in a large team, and has to answer."""
+        """In a large team the bootstrap node looks up a member that is not a contact, and requires its answer."""
         years = self.years(bootstraps=1)
         vaio, dog, cat = years.houses[:3]
         years.close(cat, is_sudden=True)
@@ -105,7 +105,7 @@ class LargeTeamTests(YearsCase):
 
 class BatchTests(YearsCase):
     def test_a_few_at_once(self) -> None:
-        """A bootstrap node signs a few renewals at a time, and goes on until all are renewed."""
+        """A bootstrap node signs at most ``BATCH`` renewals at a time, and continues until all are renewed."""
         years = self.years(bootstraps=1)
         for number in range(BATCH + 3):
             years.tell(years.signer.grant(bytes([number]) * 32, f"p{number}", ("device",), years.wall()))
@@ -123,13 +123,13 @@ class BatchTests(YearsCase):
 
 class SleeperTests(YearsCase):
     def slept(self, years: Years, house: House) -> None:
-        """Have a house asleep from before its renewal until after its end."""
+        """Keep ``house`` off from before its renewal until after its expiry."""
         years.live(230)
         years.close(house)
         years.live(160)
 
     def test_renewed_by_the_operator(self) -> None:
-        """One that slept through its end is let in nowhere, until the operator grants its key a certificate anew."""
+        """A member that was off until its certificate expired is rejected until the operator grants a new one."""
         years = self.years()
         vaio, _, dog, cat, _ = years.houses
         before = dog.kept.membership
@@ -151,7 +151,7 @@ class SleeperTests(YearsCase):
         self.assertEqual(years.members(dog.place), years.members())
 
     def test_renewed_while_it_sleeps(self) -> None:
-        """One that the operator renewed while it slept comes back at once, though it knows no newer certificate."""
+        """A member that the operator renewed while it was off rejoins at once with its old certificate."""
         years = self.years()
         vaio, _, dog, cat, _ = years.houses
         self.slept(years, dog)

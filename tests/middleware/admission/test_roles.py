@@ -1,4 +1,4 @@
-"""Tests of ``admission.roles``: the table has everything that a node exposes and writes, and a team can live by it."""
+"""Tests of ``admission.roles``: the table covers all methods and slots of a node, and a team works under it."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ ABSENT = ("roll.", "reach.")
 
 
 class RoleDoor(OpenDoor):
-    """Lets everybody in; ``roles`` by public key say what each may, and ``refusals`` has what was not allowed."""
+    """Admits every node, with ``roles`` by public key; ``refusals`` collects the denied calls and writes."""
 
     def __init__(self, known: dict[bytes, tuple[str, ...]], refusals: list[tuple[tuple[str, ...], str]]) -> None:
         self._known = known
@@ -74,7 +74,7 @@ def slot(key: bytes, name: str = "x") -> Slot:
 
 class TableTests(SynchronousTestCase):
     def exposed(self) -> set[str]:
-        """The methods of a real node that has a robot, an agent, and allows all that can be allowed."""
+        """Return the methods of a real node with a robot, an agent and all options enabled."""
         tables: dict[str, Any] = {
             "node": {"name": "a", "team_key": KEY},
             "driver": {"kind": "sim"},
@@ -88,20 +88,20 @@ class TableTests(SynchronousTestCase):
         return set(node.entangled.endpoint._answerer.methods)
 
     def test_every_method_has_an_entry(self) -> None:
-        """A method that a node exposes and nobody put into the table fails here, and so does one that is gone."""
+        """Each exposed method has an entry in the table, and each entry has an exposed method."""
         exposed = self.exposed()
         self.assertGreater(len(exposed), 40)
         self.assertEqual(sorted(exposed - set(METHODS)), [])
         self.assertEqual(sorted(name for name in set(METHODS) - exposed if not name.startswith(ABSENT)), [])
 
     def test_roles_are_known(self) -> None:
-        """Every entry names roles that there are, and at least one."""
+        """Every entry names at least one role, and only existing roles."""
         for allowed in (*METHODS.values(), *KINDS.values(), roles.OTHER_METHODS):
             self.assertTrue(allowed)
             self.assertLessEqual(allowed, set(ROLES))
 
     def test_kinds_by_key(self) -> None:
-        """The keys that the middleware and the page write under are those of the table, whatever the slot is called."""
+        """The kind of a slot follows from the keys of the middleware and the page, whatever the name of the slot."""
         keys = {
             presence.DEVICES: roles.PRESENCE,
             tasks.TASKS: roles.TASKS,
@@ -114,7 +114,7 @@ class TableTests(SynchronousTestCase):
                 self.assertEqual(kind_of(slot(key, name)), kind)
 
     def test_presence_in_a_large_team(self) -> None:
-        """A viewer announces itself at its own places of the directory, and writes nowhere else there."""
+        """In a large team a viewer writes its presence under its own directory prefixes only."""
         own, other = Identity(bytes(32)), Identity(b"1" * 32)
         for depth in range(presence.MAX_DEPTH + 1):
             for key in places_of(own.node_id, depth):
@@ -123,7 +123,7 @@ class TableTests(SynchronousTestCase):
         self.assertEqual([may_store([VIEWER], Slot(key, own.public, "phone")) for key in strange], [False] * 2)
 
     def test_kinds_by_name(self) -> None:
-        """The slots of tasks and modules are known by their names, all others are of no kind."""
+        """The slots of tasks and modules are identified by their names; all others have the kind ``OTHER``."""
         key = tasks.group_key("t")
         names = {
             tasks.MEMBER: roles.MEMBER,
@@ -140,7 +140,7 @@ class TableTests(SynchronousTestCase):
         self.assertEqual({name: kind_of(slot(key, name)) for name in names}, names)
 
     def test_a_viewer_changes_nothing(self) -> None:
-        """A viewer is present, reads and asks, and can neither act, order, bid nor write anything else."""
+        """A viewer publishes its presence and reads; it cannot act, order, bid or write anything else."""
         writes = {kind for kind, allowed in KINDS.items() if VIEWER in allowed}
         self.assertEqual(writes, {roles.PRESENCE})
         for method in ("find_value", "watch", "device.settings", "device.inventory", "stream.open"):
@@ -149,7 +149,7 @@ class TableTests(SynchronousTestCase):
             self.assertFalse(may_call((VIEWER,), method), method)
 
     def test_who_orders_and_who_acts(self) -> None:
-        """Operators and gateways order, devices and gateways act, and no bootstrap does either by that alone."""
+        """Operators and gateways order, devices and gateways act; the role bootstrap alone permits neither."""
         for method in (
             "device.halt",
             "device.tune",
@@ -166,7 +166,7 @@ class TableTests(SynchronousTestCase):
         self.assertTrue(may_store((BOOTSTRAP,), slot(hashed_key("tuples/admission/2"))))
 
     def test_several_roles_add_up(self) -> None:
-        """A member with two roles may do what either may; one without any may nothing."""
+        """A member with two roles has the rights of both; a member without roles has none."""
         self.assertTrue(may_call((VIEWER, OPERATOR), "device.halt"))
         self.assertFalse(may_call((), "ping"))
         self.assertFalse(may_store((), slot(presence.DEVICES)))
@@ -174,7 +174,7 @@ class TableTests(SynchronousTestCase):
 
 class TeamTests(SynchronousTestCase):
     def test_experiment_by_roles(self) -> None:
-        """With a gateway, dogs as devices and a viewer, experiment 2 passes, and no request is rejected."""
+        """Experiment 2 passes with a gateway, dogs as devices and a viewer, and no request is rejected."""
         plain: Any = SwarmNode
         known: dict[bytes, tuple[str, ...]] = {}
         refusals: list[tuple[tuple[str, ...], str]] = []
@@ -186,6 +186,6 @@ class TeamTests(SynchronousTestCase):
 
         self.patch(assembly, "SwarmNode", make)
         outcome = trial(partial(VirtualTeam, others=("looker",)), 2, 3)
-        # A viewer is asked to be a member of a council, which its role forbids.
+        # The council may include the viewer, and its role forbids this method.
         self.assertEqual(set(refusals) - {((VIEWER,), "lease.freed")}, set())
         self.assertEqual((outcome.broken, bool(outcome.found)), ([], True))

@@ -1,4 +1,4 @@
-"""Tests of the roll."""
+"""Tests of the membership list."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ DOG, CAT, VAIO = (identity(name).public for name in ("dog", "cat", "vaio"))
 
 
 def entries() -> list[bytes]:
-    """Statements of every kind, some of them about the same thing."""
+    """Return statements of every kind, some of them about the same key."""
     dice = random.Random(1)
     found = [granted(OPERATOR, "vaio", "bootstrap"), OPERATOR.grant(DOG, "dog", ("viewer",), NOW + 1)]
     found += [granted(OPERATOR, "dog"), invited(OPERATOR)[1], packed_admission(DOG, admitted(OPERATOR, "dog"))]
@@ -32,7 +32,7 @@ ENTRIES = entries()
 
 class RollTests(SynchronousTestCase):
     def test_foreign_statements_are_refused(self) -> None:
-        """What another team's operator signed, or nobody, never enters."""
+        """Statements of another operator and random bytes are not added."""
         mine = Roll(OPERATOR.public)
         self.assertRaises(Forged, mine.add, granted(operator(2), "dog"), NOW)
         self.assertRaises(Forged, mine.add, packed_admission(DOG, admitted(operator(2), "dog")), NOW)
@@ -40,13 +40,13 @@ class RollTests(SynchronousTestCase):
         self.assertEqual((len(mine), mine.digest), (0, bytes(8)))
 
     def test_known_is_not_new(self) -> None:
-        """What is known already is not told on: adding it again gives nothing."""
+        """Adding a known statement again returns None, which stops its propagation."""
         mine = Roll(OPERATOR.public)
         self.assertIsNotNone(mine.add(ENTRIES[0], NOW))
         self.assertIsNone(mine.add(ENTRIES[0], NOW))
 
     def test_later_word_holds(self) -> None:
-        """Of two grants for one key the later holds, whichever comes first; a revocation keeps its first moment."""
+        """The later of two grants for a key wins in either order; of two revocations the earlier time wins."""
         for order in (ENTRIES, ENTRIES[::-1]):
             mine = roll(OPERATOR, *order)
             found, revocation = mine.granted(DOG), mine.revoked(DOG)
@@ -56,13 +56,13 @@ class RollTests(SynchronousTestCase):
     @given(st.permutations(ENTRIES))
     @settings(max_examples=60, deadline=None)
     def test_order_does_not_matter(self, order: list[bytes]) -> None:
-        """Two rolls that heard the same in any order know the same, and have one digest."""
+        """Two lists with the same statements have the same digest, in any order of arrival."""
         self.assertEqual(roll(OPERATOR, *order).digest, roll(OPERATOR, *ENTRIES).digest)
 
     @given(st.permutations(range(7)))
     @settings(max_examples=60, deadline=None)
     def test_order_of_renewals(self, order: list[int]) -> None:
-        """Rolls that heard of renewals, a later grant and a revocation in any order agree when they have compared."""
+        """Lists converge for any order of renewals, a later grant and a revocation, once they have been compared."""
         vaio, grant, later = identity("vaio"), granted(OPERATOR, "vaio", "bootstrap"), NOW + 300 * 86_400
         found = [grant, packed_admission(CAT, admitted(OPERATOR, "cat")), granted(OPERATOR, "dog")]
         for name, shown, moment in (
@@ -80,7 +80,7 @@ class RollTests(SynchronousTestCase):
         self.assertEqual(mine.digest, roll(OPERATOR, *found, *found, now=later).digest)
 
     def test_revoked_key(self) -> None:
-        """Who is revoked is refused for good, whatever is granted to the same key afterwards."""
+        """A revoked key stays refused, whatever is granted to it later."""
         shown = admitted(OPERATOR, "dog")
         member = member_of(OPERATOR.public, DOG, shown)
         mine = roll(OPERATOR, OPERATOR.revoke(DOG, "dog", NOW), OPERATOR.grant(DOG, "dog", ("device",), NOW + 9))
@@ -88,7 +88,7 @@ class RollTests(SynchronousTestCase):
         self.assertEqual(mine.members(NOW + 9), [])
 
     def test_what_has_run_out_goes(self) -> None:
-        """An invitation that ran out is remembered for a week, so that it is refused by name, and then forgotten."""
+        """An expired invitation is kept for a week, to name the reason of a refusal, and then deleted."""
         _, packed, invite = invited(OPERATOR)
         mine = roll(OPERATOR, packed)
         name = invitation_id(invite.public)
@@ -99,12 +99,12 @@ class RollTests(SynchronousTestCase):
         self.assertIsNone(mine.add(packed, NOW + LATER + REMEMBERED))
 
     def test_newest_secrets_stay(self) -> None:
-        """Of the team's secrets the newest few are remembered."""
+        """The list keeps only the newest secrets of the team."""
         numbers = [secret.number for secret in roll(OPERATOR, *ENTRIES).secrets()]
         self.assertEqual(numbers, [6, 5, 4, 3])
 
     def test_name_of_a_member(self) -> None:
-        """Members are listed by the operator's latest word: a promotion shows, and the admission is remembered."""
+        """A member's roles come from the operator's latest grant, and its admission is kept."""
         mine = roll(OPERATOR, packed_admission(DOG, admitted(OPERATOR, "dog")))
         mine.add(OPERATOR.grant(DOG, "dog", ("device", "bootstrap"), NOW + 1), NOW)
         [member] = mine.members(NOW + 2)

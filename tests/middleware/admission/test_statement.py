@@ -1,4 +1,4 @@
-"""Tests of what an operator signs."""
+"""Tests of the statements that an operator signs."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ class StatementTests(SynchronousTestCase):
         self.secret = sealed_secret(b"s" * 32, 2, [DOG.public], NOW, 60, random.Random(1))
 
     def test_each_is_read_as_it_was_signed(self) -> None:
-        """Every kind of statement comes out of its packed form as it went in."""
+        """Every kind of statement survives packing and unpacking."""
         for each in (GRANT, INVITE, REVOKE, self.secret):
             self.assertEqual(opened(self.operator.public, signed(self.operator, each)), each)
 
     def test_only_this_operator_counts(self) -> None:
-        """What another operator signed is forged here, and so is what was changed by one bit anywhere."""
+        """Statements of another operator, and statements with any changed bit, are refused."""
         packed = signed(self.operator, GRANT)
         self.assertRaises(Forged, opened, operator(2).public, packed)
         for place in range(len(packed)):
@@ -49,20 +49,20 @@ class StatementTests(SynchronousTestCase):
             self.assertRaises((Forged, Malformed), opened, self.operator.public, changed)
 
     def test_secret_opens_for_those_that_stay(self) -> None:
-        """The team's new secret can be read by whom it was sealed for and by nobody else."""
+        """The team's new secret can be decrypted only by the members for which it was sealed."""
         self.assertEqual(self.secret.opened(DOG), b"s" * 32)
         self.assertIsNone(self.secret.opened(CAT))
         stolen = Secret(2, NOW, 60, NOW + 100, self.secret.mark, ((CAT.public, self.secret.sealed[0][1]),))
         self.assertIsNone(stolen.opened(CAT))
 
     def test_secret_for_many(self) -> None:
-        """The fullest secret can be signed and read."""
+        """A secret sealed for the maximum number of members can be signed and read."""
         keys = [identity(str(number)).public for number in range(MAX_SEALED)]
         secret = sealed_secret(b"s" * 32, 2**40, keys, NOW, MAX_LIFE, random.Random(1))
         self.assertEqual(opened(self.operator.public, signed(self.operator, secret)), secret)
 
     def test_unlawful_is_not_signed(self) -> None:
-        """An operator's slip is refused before it is signed: an empty name, no role, no time, too many uses."""
+        """Invalid statements are refused before signing: empty name, no role, no lifetime, too many uses."""
         wrong: list[Any] = [
             Grant(DOG.public, "", ("device",), NOW, NOW + 1),
             Grant(DOG.public, "dog", (), NOW, NOW + 1),
@@ -76,7 +76,7 @@ class StatementTests(SynchronousTestCase):
             self.assertRaises(ValueError, signed, self.operator, each)
 
     def test_one_form_only(self) -> None:
-        """The same statement packed in a longer way is malformed, or two digests would name one thing."""
+        """A non-canonical encoding of a statement is malformed, otherwise one statement had two digests."""
         packed = signed(self.operator, REVOKE)
         fields = msgpack.unpackb(packed)
         longer = b"\xdc" + len(fields).to_bytes(2) + packed[1:]
@@ -91,5 +91,5 @@ class StatementTests(SynchronousTestCase):
     )
     @settings(max_examples=400, deadline=None)
     def test_reads_anything(self, packed: bytes) -> None:
-        """Whatever bytes come are malformed or forged, and never anything else."""
+        """Any bytes raise ``Malformed`` or ``Forged``, and no other error."""
         self.assertRaises((Forged, Malformed), opened, operator().public, packed)

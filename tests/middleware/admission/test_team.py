@@ -1,4 +1,4 @@
-"""Tests of whole teams: joining by code, revoking, rotating, promoting."""
+"""Tests of whole closed teams: join by code, revocation, rotation, promotion."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.middleware.admission.village import VillageCase
 
 class JoiningTests(VillageCase):
     def test_join_by_code(self) -> None:
-        """A newcomer with a code gets certificate, secret and contacts, and is then a member that others talk to."""
+        """A newcomer with a code gets certificate, secret and contacts, and can then exchange messages with members."""
         village = self.village()
         dog = village.welcome("dog")
         self.assertEqual((dog.name, dog.team.door.me.roles), ("dog", ("device",)))
@@ -22,7 +22,7 @@ class JoiningTests(VillageCase):
         self.assertEqual(self.refusal(village, village.houses[0].node.call, dog), "")
 
     def test_same_newcomer_again(self) -> None:
-        """Who lost the answer and knocks again, at another bootstrap node, gets the same pass for one use."""
+        """A newcomer that repeats its request at another bootstrap node gets the same certificate for the same use."""
         village = self.village(bootstraps=2)
         code, seed = village.invite(), b"d" * 32
         passes = []
@@ -33,7 +33,7 @@ class JoiningTests(VillageCase):
         self.assertEqual(passes[0], passes[1])
 
     def test_expired_and_unknown_code(self) -> None:
-        """A code that ran out, and one of another team, are each refused by name."""
+        """An expired code is refused as "expired", a code of another team as "unknown"."""
         village = self.village()
         code = village.invite(expires=10.0)
         village.run(10.0)
@@ -43,14 +43,14 @@ class JoiningTests(VillageCase):
         self.assertEqual(self.failureResultOf(foreign, NotWelcome).value.code, "unknown")
 
     def test_nobody_there(self) -> None:
-        """Where nobody answers the newcomer says so, and which address it tried."""
+        """If no node answers, the newcomer's error names the address that it tried."""
         village = self.village()
         knocked = village.knock(village.invite(), (77,), timeout=2.0)
         village.run(2.5)
         self.assertIn(str(village.address(77)), str(self.failureResultOf(knocked, NoAnswer).value))
 
     def test_second_bootstrap(self) -> None:
-        """Where the first bootstrap node is gone, the newcomer comes in by the second."""
+        """If the first bootstrap node is down, the newcomer joins through the second."""
         village = self.village(bootstraps=3)
         code = village.invite()
         village.close(village.houses[1], is_sudden=True)
@@ -59,7 +59,7 @@ class JoiningTests(VillageCase):
         self.assertEqual(self.successResultOf(knocked).member.name, "dog")
 
     def test_member_that_is_no_bootstrap(self) -> None:
-        """A plain member lets nobody in and says so; promoted by the operator it does, without a restart."""
+        """A plain member refuses a newcomer with "role"; after a promotion it admits it without a restart."""
         village = self.village()
         dog = village.welcome("dog")
         code = village.invite("cat")
@@ -76,7 +76,7 @@ class JoiningTests(VillageCase):
         self.assertEqual((cat.team.door.me.admitter, village.members()), (dog.public, ["cat", "dog", "vaio"]))
 
     def test_many_by_one_code(self) -> None:
-        """A code for three lets in three, by the names they wish for or numbered, and no name twice."""
+        """A code for three uses admits three newcomers, named by wish or numbered, without duplicate names."""
         village = self.village()
         code = village.invite("pupil", uses=3)
         names: list[str] = []
@@ -87,7 +87,7 @@ class JoiningTests(VillageCase):
         self.assertEqual(names, ["pupil-1", "kim", "pupil-2", "used"])
 
     def test_code_made_while_the_others_are_gone(self) -> None:
-        """Who is left alone suddenly can make no code yet, and is told in one line what to wait for."""
+        """A node that suddenly lost all peers cannot publish a code; the one-line error names the time to wait."""
         village = self.village(bootstraps=3)
         village.run(5.0)
         for house in village.houses[1:]:
@@ -100,7 +100,7 @@ class JoiningTests(VillageCase):
         self.assertEqual(len(text.splitlines()), 1)
 
     def test_uses_across_a_cut(self) -> None:
-        """While bootstrap nodes are cut off from each other no code is used more often than it says, on both sides."""
+        """A partition between bootstrap nodes does not allow more uses of a code than it grants."""
         village = self.village(bootstraps=5)
         village.run(5.0)
         code = village.invite(uses=2)
@@ -130,7 +130,7 @@ class JoiningTests(VillageCase):
 
 class RevocationTests(VillageCase):
     def test_revoked_invitation(self) -> None:
-        """With an invitation all that came by it go, and the code opens no more."""
+        """Revoking an invitation revokes all members that joined by it, and the code itself."""
         village = self.village()
         code = village.invite("pupil", uses=3)
         knocked = village.knock(code)
@@ -147,7 +147,7 @@ class RevocationTests(VillageCase):
 
 class RotationTests(VillageCase):
     def test_rotation(self) -> None:
-        """After a rotation all members go by the new secret, sessions and new ones work, and newcomers get it."""
+        """After a rotation all members and newcomers have the new secret, and open sessions still work."""
         village = self.village()
         houses = [village.houses[0], village.welcome("dog"), village.welcome("cat")]
         village.run(3.0)
@@ -160,7 +160,7 @@ class RotationTests(VillageCase):
         self.assertEqual(self.refusal(village, pig.node.call, houses[2]), "")
 
     def slept(self, grace: float, seconds: float) -> int:
-        """The number of the secret of a member that was off during a rotation and for so long after it."""
+        """Return the number of the secret of a member that was off during a rotation and ``seconds`` after it."""
         village = self.village()
         dog = village.welcome("dog")
         village.run(2.0)
@@ -173,11 +173,11 @@ class RotationTests(VillageCase):
         return int(dog.kept.membership.secrets[0][0])
 
     def test_who_slept_through_it(self) -> None:
-        """A member that was off during a rotation comes back by the old secret and is given the new one."""
+        """A member that was off during a rotation reconnects with the old secret and receives the new one."""
         self.assertEqual(self.slept(grace=600.0, seconds=5.0), 2)
 
     def test_who_came_meanwhile(self) -> None:
-        """A member for whom the new secret was not sealed asks another one for it."""
+        """A member for which the new secret was not sealed requests it from another member."""
         village = self.village()
         dog = village.welcome("dog")
         village.run(2.0)
@@ -186,13 +186,13 @@ class RotationTests(VillageCase):
         self.assertEqual(dog.kept.membership.secrets, village.houses[0].kept.membership.secrets)
 
     def test_old_secret_ends(self) -> None:
-        """When the grace is over the old secret opens nothing any more."""
+        """After the grace period the old secret is rejected."""
         self.assertEqual(self.slept(grace=30.0, seconds=40.0), 1)
 
 
 class StrangersTests(VillageCase):
     def test_certificate_of_another_team(self) -> None:
-        """Who knows the secret and shows a pass of another operator is refused as foreign, and both say so once."""
+        """A node with the team's secret but another operator's certificate is refused, and both nodes log it once."""
         village = self.village()
         first = village.houses[0].kept.membership
         stranger = operator(9).founded("spy", ("device",), village.wall(), village.dice, first.secrets[0][1])
@@ -206,7 +206,7 @@ class StrangersTests(VillageCase):
         self.assertEqual(village.members(), ["vaio"])
 
     def test_stranger_is_told_where_to_look(self) -> None:
-        """Who does not know the team's secret hears no answer at all, and its log says once who can tell why."""
+        """A node without the team's secret gets no answer, and logs once that ``swarm doctor`` finds the reason."""
         village = self.village()
         with capturedLogs() as said:
             village.move_in(operator(9).founded("spy", ("device",), village.wall(), village.dice))
@@ -214,7 +214,7 @@ class StrangersTests(VillageCase):
         self.assertEqual(sum("swarm doctor SETTINGS" in formatEvent(event) for event in said), 1)
 
     def test_expired_member(self) -> None:
-        """When the time of a certificate is over its member is parted with, though a session is open."""
+        """A member is removed when its certificate expires, even in an open session."""
         village = self.village()
         code, packed, terms = village.signer.invite(
             "dog", ("device",), 1, village.wall(), 3600.0, village.dice, life=30.0
@@ -232,7 +232,7 @@ class StrangersTests(VillageCase):
         self.assertEqual(self.refusal(village, village.houses[0].node.call, dog, 3.0), "expired")
 
     def test_expired_by_its_own_clock(self) -> None:
-        """A node whose certificate does not hold by its own clock says so when it starts, with both remedies."""
+        """A node with an expired certificate logs it at its start, with both remedies."""
         village = self.village()
         old = village.signer.founded("dog", ("device",), village.wall() - 366 * 86_400.0, village.dice)
         with capturedLogs() as events:

@@ -1,4 +1,4 @@
-"""Test section 8 of ``docs/reference/wire-protocol.md`` byte for byte, with fixed keys."""
+"""Tests of section 8 of ``docs/reference/wire-protocol.md``, byte for byte, with fixed keys."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ NOW = 1_800_000_000
 
 
 class Counted(random.Random):
-    """Dice whose bytes count up, for the ephemeral keys and nonces of the vectors."""
+    """A random generator that returns increasing bytes, for the ephemeral keys and nonces of the vectors."""
 
     def randbytes(self, n: int) -> bytes:
         return bytes(range(n))
 
 
 def made() -> dict[str, str]:
-    """All of it, in hexadecimal but for the code."""
+    """Return all vectors in hexadecimal, and the code as text."""
     operator, vaio, dog, phone = (Identity(bytes([number]) * 32) for number in (1, 2, 3, 4))
     code, dice = Code(0x123456789ABCDEF0123, 0x7D3A1), Counted()
     grant = signed(operator, Grant(vaio.public, "vaio", ("gateway", "bootstrap"), NOW, NOW + 1000))
@@ -74,7 +74,7 @@ def made() -> dict[str, str]:
 
 class VectorTests(SynchronousTestCase):
     def test_made_again(self) -> None:
-        """Code, statements, passes and both datagrams are made again byte for byte."""
+        """Code, statements, certificate chains and both datagrams match the vectors byte for byte."""
         self.assertEqual(made(), json.loads(VECTORS.read_text(encoding="utf-8")))
 
 

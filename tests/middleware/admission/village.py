@@ -1,4 +1,4 @@
-"""Whole nodes of a closed team on one virtual clock and one switchboard."""
+"""Complete nodes of a closed team on one virtual clock and one switchboard."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ DAY = 86_400.0
 
 
 class Tape:
-    """Records what networks receive, in order, with its source."""
+    """Records the datagrams that networks receive, in order, with their source."""
 
     def __init__(self) -> None:
         self.heard: list[tuple[SwitchboardNetwork, bytes, Address]] = []
 
     def tap(self, network: SwitchboardNetwork) -> None:
-        """Record what an open network receives."""
+        """Record the datagrams that ``network`` receives; it must be open."""
         receiver = network.receiver
         assert receiver is not None
 
@@ -45,7 +45,7 @@ class Tape:
 
 
 class House:
-    """One node, its team, and what it keeps between its lives."""
+    """One node, its team, and the membership that it keeps across restarts."""
 
     def __init__(self, place: int, kept: MemoryMembership) -> None:
         self.place = place
@@ -63,9 +63,10 @@ class House:
 
 
 class Village(World):
-    """A closed team; ``signer`` is its operator, whose words are told to the first house unless another is named.
+    """A closed team; ``signer`` is its operator, and the first node publishes the operator's statements by default.
 
-    The wall clock is ahead of the virtual one by ``days``; ``tape`` records what nodes receive that are opened later.
+    The wall clock is ``days`` ahead of the virtual clock; ``tape`` records the datagrams that nodes receive that are
+    opened after it was set.
     """
 
     days = 0.0
@@ -83,11 +84,11 @@ class Village(World):
             self.move_in(other if number else first)
 
     def wall(self) -> float:
-        """The wall clock of every node."""
+        """Return the time of the wall clock that all nodes share."""
         return NOW + self.clock.seconds() + self.days * DAY
 
     def move_in(self, membership: Membership) -> House:
-        """A node of that membership, which joins."""
+        """Start a node with this membership and let it join."""
         house = House(len(self.houses), MemoryMembership(membership))
         self.houses.append(house)
         self.open(house)
@@ -95,12 +96,12 @@ class Village(World):
         return house
 
     def paper(self, name: str, *which: str) -> Membership:
-        """The membership of a node to which the operator gave these roles."""
+        """Return the membership of a node to which the operator granted these roles."""
         secret = self.houses[0].kept.membership.secrets[0][1]
         return self.signer.founded(name, which or ("device",), self.wall(), self.dice, secret)
 
     def enlist(self, name: str, *which: str) -> House:
-        """One more member, to which the operator gave these roles."""
+        """Add a member to which the operator granted these roles."""
         return self.move_in(self.paper(name, *which))
 
     def open(self, house: House) -> None:
@@ -123,7 +124,7 @@ class Village(World):
         if self.tape is not None:
             self.tape.tap(network_of(house))
         known = [self.address(0)] if place else []
-        # Who is not let in may be closed before it is in.
+        # A rejected node may be closed before its join completes.
         house.node.join(known).addErrback(lambda failure: failure.trap(NotRunning))
 
     def close(self, house: House, is_sudden: bool = False) -> None:
@@ -134,11 +135,11 @@ class Village(World):
             house.node.stop()
 
     def tell(self, packed: bytes, house: int = 0) -> Deferred[str]:
-        """Let the operator tell the team something at a house."""
+        """Publish a statement of the operator at a node."""
         return Deferred.fromCoroutine(self.houses[house].team.tell(packed))
 
     def invite(self, name: str = "dog", uses: int = 1, expires: float = 3600.0, house: int = 0) -> str:
-        """A code that is good from now on."""
+        """Return a code that is valid from now on."""
         code, packed, terms = self.signer.invite(name, ("device",), uses, self.wall(), expires, self.dice)
         told: list[str] = []
         for each in (terms, packed):
@@ -150,7 +151,7 @@ class Village(World):
     def knock(
         self, code: str, doors: Sequence[int] = (0,), wish: str = "", seed: bytes = b"", timeout: float = 20.0
     ) -> Deferred[Membership]:
-        """A newcomer who knocks at these houses."""
+        """Start a newcomer that sends join requests to these nodes."""
         self.lives += 1
         network = self.board.network("10.0.0.2", 9000 + self.lives)
         read_code: Code = read(code)
@@ -158,7 +159,7 @@ class Village(World):
         return newcomer.join([self.address(door) for door in doors], timeout)
 
     def welcome(self, name: str = "dog", doors: Sequence[int] = (0,)) -> House:
-        """One more member, who came by a code of its own."""
+        """Add a member that joins by a new code."""
         found: list[Membership] = []
         self.knock(self.invite(name), doors).addCallback(found.append)
         self.run(1.5)
@@ -182,33 +183,33 @@ AnyVillage = TypeVar("AnyVillage", bound=Village)
 
 
 def network_of(house: House) -> SwitchboardNetwork:
-    """The port of a house on the switchboard."""
+    """Return the switchboard port of a node."""
     network: Any = house.node._network
     return network  # type: ignore[no-any-return]
 
 
 class VillageCase(SynchronousTestCase):
-    """A test with a village; afterwards nothing may be left on its clock."""
+    """A test with a simulated team; no timer may remain on its clock afterwards."""
 
     def village(self, seed: int = 1, bootstraps: int = 1) -> Village:
-        """A village that is stopped when the test ends."""
+        """Return a simulated team that is stopped when the test ends."""
         return self.kept(Village(seed, bootstraps=bootstraps))
 
     def kept(self, village: AnyVillage) -> AnyVillage:
-        """Have ``village`` stopped when the test ends."""
+        """Stop ``village`` when the test ends."""
         self.addCleanup(self.left, village)
         self.addCleanup(village.stop)
         return village
 
     def outcome(self, village: Village, asked: Deferred[Any], within: float = 2.0) -> Any:
-        """What came of a question: its answer, or the error."""
+        """Return the result of a request: its value, or its error."""
         found: list[Any] = []
         asked.addCallbacks(found.append, lambda failure: found.append(failure.value))
         village.run(within)
         return found[0] if found else None
 
     def refusal(self, village: Village, ask: Callable[..., Deferred[Any]], house: House, within: float = 2.0) -> str:
-        """The code with which a house refuses the node whose ``ask`` that is; empty where it answers."""
+        """Return the code with which ``house`` refuses the node that owns ``ask``, or "" if it answers."""
         answer = self.outcome(village, ask(village.contact(house), "ping", bytes(8), changes=True), within)
         if isinstance(answer, NotAdmitted):
             return str(answer.code)
@@ -216,7 +217,7 @@ class VillageCase(SynchronousTestCase):
         return ""
 
     def left(self, village: Village) -> None:
-        """Nothing but datagrams may be under way."""
-        village.run(1.0)  # what is under way arrives
+        """Check that only datagrams are pending."""
+        village.run(1.0)  # deliver the datagrams in flight
         calls = village.clock.getDelayedCalls()
         self.assertEqual(calls, [], "a node left a timer behind")

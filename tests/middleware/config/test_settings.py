@@ -1,4 +1,4 @@
-"""The settings of a node."""
+"""Tests of the settings of a node."""
 
 from __future__ import annotations
 
@@ -63,18 +63,18 @@ class SettingsTest(SynchronousTestCase):
         return path
 
     def refusal(self, table: str, key: str, value: object) -> str:
-        """The line by which one value is refused; it says where, and what to do."""
+        """Return the one-line error for a value; it names file, table and key, and the remedy."""
         mapping = {"node": {"name": "dog1"}}
         mapping.setdefault(table, {})[key] = value  # type: ignore[assignment]
         line: str = str(self.assertRaises(BadSetting, Settings.from_mapping, mapping, "dog1.toml"))
         self.assertEqual(line.splitlines(), [line])
-        self.assertLess(len(line), 400)  # a long value is cut
+        self.assertLess(len(line), 400)  # a long value is truncated
         self.assertTrue(line.startswith(f"dog1.toml: [{table}] {key}: "), line)
         self.assertIn("; ", line)
         return line
 
     def test_whole_file(self) -> None:
-        """Every key of a file arrives, in the types that the program uses."""
+        """Every key of a file is read, in the types that the program uses."""
         path = self.file(WHOLE)
         read = Settings.load(path)
         node = read.node
@@ -100,14 +100,14 @@ class SettingsTest(SynchronousTestCase):
         self.assertEqual(read.origin, path)
 
     def test_defaults(self) -> None:
-        """A name is enough: such a node hears its own machine, forgets all at its end, and has no body."""
+        """With only a name, a node listens on loopback, stores in memory, and has no driver and no agent."""
         read = settings()
         self.assertEqual((read.node.host, read.node.port, read.node.store), ("127.0.0.1", 8484, ":memory:"))
         self.assertEqual((read.node.known_nodes, read.node.roles), ((), ("edge",)))
         self.assertEqual((read.agent.module, read.driver.kind, read.web.yard), ("", "", None))
 
     def test_store_beside_the_file(self) -> None:
-        """A relative store lies in the folder of the settings, wherever the node was started; an absolute one stays."""
+        """A relative store path is resolved against the folder of the settings file; an absolute path is unchanged."""
         mapping = {"node": {"name": "a", "store": "a.db"}}
         self.assertEqual(Settings.from_mapping(mapping, "/etc/swarm/a.toml").node.store, "/etc/swarm/a.db")
         mapping["node"]["membership"] = "a.membership"
@@ -118,14 +118,14 @@ class SettingsTest(SynchronousTestCase):
         self.assertEqual(Settings.from_mapping(mapping, "/etc/swarm/a.toml").node.store, ":memory:")
 
     def test_team_key(self) -> None:
-        """The team's key is hashed to 32 bytes, is not shown, and is none where none was given."""
+        """The team key is hashed to 32 bytes, absent from ``repr``, and empty by default."""
         self.assertEqual((settings().node.team_key, settings().node.membership), ("", ""))
         self.assertEqual(settings(team_key="horse").node.team_secret, hashlib.blake2s(b"horse").digest())
         self.assertNotEqual(settings(team_key="correct horse").node.team_secret, settings().node.team_secret)
         self.assertNotIn("correct horse", repr(settings(team_key="correct horse")))
 
     def test_examples_of_errors(self) -> None:
-        """An error is one line: file, table and key, what is wrong without a secret, and what to do."""
+        """An error is one line: file, table, key, the problem without secrets, and the remedy."""
         problem, _, remedy = self.refusal("node", "port", "x").rpartition("; ")
         self.assertIn('is "x"', problem)
         self.assertIn("65535", remedy)
@@ -137,7 +137,7 @@ class SettingsTest(SynchronousTestCase):
         self.assertIn('"camera.fps"', self.refusal("node", "capabilities", {"camera": {"fps": True}}))
 
     def test_wrong_values(self) -> None:
-        """A value of a wrong type or out of its range is refused, whichever key it stands under."""
+        """Every key refuses values of a wrong type or out of range."""
         wrong: dict[tuple[str, str], list[object]] = {
             ("node", "name"): ["", "x" * 41, "dog 1", "dög", 1, "dog\n"],
             ("node", "kind"): [1, "x" * 41, "two\nlines"],
@@ -192,7 +192,7 @@ class SettingsTest(SynchronousTestCase):
                 self.refusal(table, key, value)
 
     def test_deployment_is_off_by_default(self) -> None:
-        """Nothing may be deployed on a node whose owner has not said so; what he says arrives, in files and flags."""
+        """Deployment is disabled by default, and can be enabled in the file and by flags."""
         off = settings().deployment
         self.assertEqual((off.allow, off.operators, off.modules), (False, (), ()))
         table = {"allow": True, "operators": ["ab" * 32], "modules": ["best", "spin"]}
@@ -203,7 +203,7 @@ class SettingsTest(SynchronousTestCase):
         self.assertRaises(BadSetting, settings().with_flags, deployment_allow="yes")
 
     def test_tunnels(self) -> None:
-        """Unless told otherwise port 443 of each known node elsewhere is a tunnel; what is named comes first."""
+        """By default port 443 of each remote known node is a tunnel; named tunnels come first."""
         known = ["10.0.0.7:7000", "127.0.0.1:7000", "10.0.0.7:7001", "[fe80::1]:7000"]
         found = [str(url) for url in settings(known_nodes=known).node.tunnel_urls]
         self.assertEqual(found, ["wss://10.0.0.7/swarm", "wss://[fe80::1]/swarm"])
@@ -216,7 +216,7 @@ class SettingsTest(SynchronousTestCase):
         self.assertEqual((flags.tunnel_port, flags.tunnels, flags.tunnel_tls), (443, ("wss://a",), False))
 
     def test_unknown_names(self) -> None:
-        """A misspelt table or key, a missing name and a value in the place of a table are refused with the remedy."""
+        """A misspelt table or key, a missing name and a value in place of a table are refused with the remedy."""
         for mapping, meant in (
             ({"nod": {}}, "nearest table is [node]"),
             ({"store": "x"}, "store: is outside of any table; write it below [node]"),
@@ -231,7 +231,7 @@ class SettingsTest(SynchronousTestCase):
             self.assertIn(meant, str(error))
 
     def test_files_that_cannot_be_read(self) -> None:
-        """A missing file, a folder, other bytes and broken TOML are each refused in one line with the reason."""
+        """A missing file, a folder, non-UTF-8 bytes and broken TOML are each refused in one line with the reason."""
         folder = self.mktemp()
         os.mkdir(folder)
         for path, reason in (
@@ -249,7 +249,7 @@ class SettingsTest(SynchronousTestCase):
 
 class FlagsTest(SynchronousTestCase):
     def test_flags_win(self) -> None:
-        """Flags take the place of what the file says; the rest stays, and so does the original."""
+        """Flags override the file; other values, and the original settings, are unchanged."""
         before = settings(port=7001, kind="ers7")
         after = before.with_flags(port=7002, web_port="8081", agent_module="search", name=None)
         self.assertEqual((after.node.port, after.web.port, after.agent.module), (7002, 8081, "search"))
@@ -257,17 +257,17 @@ class FlagsTest(SynchronousTestCase):
         self.assertEqual(before.node.port, 7001)
 
     def test_text_of_the_command_line(self) -> None:
-        """Numbers and lists are read from the text that a command line has."""
+        """Numbers and lists are parsed from command-line text."""
         node = settings().with_flags(presence_lease="0.5", roles="web, edge", known_nodes="10.0.0.7:7000,").node
         self.assertEqual((node.presence_lease, node.roles), (0.5, ("edge", "web")))
         self.assertEqual(node.known_nodes, (Address("10.0.0.7", 7000),))
 
     def test_store_where_one_stands(self) -> None:
-        """A store named on the command line is relative to where one stands, as every name there."""
+        """A store path on the command line is relative to the working directory, like every other path there."""
         self.assertEqual(settings(store="a.db").with_flags(store="b.db").node.store, "b.db")
 
     def test_bad_flags(self) -> None:
-        """An unknown flag names the nearest one, a bad value its flag; the file is not blamed."""
+        """The error for an unknown flag names the nearest one, the error for a bad value its flag."""
         for flags, line in (
             ({"prot": 1}, "command line: --prot: is not a setting; the nearest is --port"),
             ({"web_port": "many"}, 'command line: --web-port: is "many"; write a number from 0 to 65535'),

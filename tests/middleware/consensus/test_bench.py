@@ -1,4 +1,4 @@
-"""The bench of the strategies, at its smallest."""
+"""Tests of the benchmark of the strategies at its smallest size."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from benchmarks.consensus.talk import talked
 
 class BenchConsensusTests(SynchronousTestCase):
     def test_missions_are_seeded(self) -> None:
-        """Equal seeds give equal missions, and those who fail are there in both."""
+        """Equal seeds give equal missions, with and without failing agents."""
         one, again, other = Mission(20, 20, 1), Mission(20, 20, 1), Mission(20, 20, 2)
         self.assertEqual((one.costs, one.items), (again.costs, again.items))
         self.assertNotEqual(one.costs, other.costs)
@@ -25,7 +25,7 @@ class BenchConsensusTests(SynchronousTestCase):
         self.assertEqual(after.capacity, 2)
 
     def test_nobody_beats_the_oracle(self) -> None:
-        """No strategy costs less than the optimum, each serves every task, and the optimum's own costs just that."""
+        """No strategy costs less than the optimum, each assigns every task, and ``group_optimal`` costs the optimum."""
         mission = Mission(8, 8, 3)
         least = least_star(mission)[0]
         for name, decide in DECIDERS.items():
@@ -37,14 +37,14 @@ class BenchConsensusTests(SynchronousTestCase):
                 self.assertEqual(cost, least)
 
     def test_talk(self) -> None:
-        """Among themselves the bidders end with one owner each, also where messages are lost."""
+        """The bidders agree on one owner for each task, also with message loss."""
         for loss in (0.0, 0.3):
             found = talked(Mission(12, 12, 1), loss=loss)
             self.assertEqual(sorted(map(len, found.owners.values())), [1] * 12)
             self.assertGreater(found.messages, 1.0)
 
     def test_rows(self) -> None:
-        """Each strategy has one row of all missions of a size; none is better than the optimum, and that is reached."""
+        """Each strategy has one row per size; no ratio is below 1, and ``group_optimal`` has exactly 1."""
         rows = {row["strategy"]: row for row in judged(10, range(1, 4))}
         self.assertEqual(list(rows), list(DECIDERS))
         self.assertEqual({row["missions"] for row in rows.values()}, {3})
@@ -55,7 +55,7 @@ class BenchConsensusTests(SynchronousTestCase):
         self.assertGreater(rows["cbba"]["messages"], rows["cbba + exchange"]["messages"])
 
     def test_plot(self) -> None:
-        """The picture is drawn from rows as they are written: a bar as long as what is above the optimum."""
+        """The plot is drawn from JSON rows, with bars in proportion to the cost above the optimum."""
         row = {"agents": 3, "strategy": "a < b", "ratio": 1.1, "ratio_failed": 1.2}
         picture = drawn(json.loads(json.dumps([row])))
         self.assertIn("a &lt; b", picture)

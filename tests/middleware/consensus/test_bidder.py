@@ -1,4 +1,4 @@
-"""Tests of the bidders of the CBBA benchmark: whatever the network does, they end at the greedy assignment."""
+"""Tests of the bidders of the CBBA benchmark: on any network they reach the greedy assignment."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ Costs = dict[str, dict[str, float]]
 
 
 def flat(row: dict[str, float]) -> Score:
-    """What a task is worth does not depend on the bundle."""
+    """Return a score that does not depend on the bundle."""
     return lambda bundle, task: 1000.0 - row[task]
 
 
 class Talk:
-    """Bidders on a graph whose messages come late, twice and in any order, but come."""
+    """Bidders on a graph that delivers messages late, repeatedly and in any order, but reliably."""
 
     def __init__(self, seed: int, edges: list[tuple[str, str]], bidders: dict[str, Bidder]) -> None:
         self.dice = random.Random(seed)
@@ -32,7 +32,7 @@ class Talk:
         self.delivered = 0
 
     def run(self) -> None:
-        """Until nobody has anything to say."""
+        """Deliver messages until no bidder has one to send."""
         while True:
             for name, bidder in self.bidders.items():
                 if self.dice.random() < 0.5 or not self.way:
@@ -41,7 +41,7 @@ class Talk:
                 return
             number = self.dice.randrange(len(self.way))
             sender, taker, said = self.way[number]
-            if self.dice.random() < 0.8:  # else it comes once more
+            if self.dice.random() < 0.8:  # else it is delivered again
                 del self.way[number]
             corrections = self.bidders[taker].hear(sender, said)
             if corrections:
@@ -49,7 +49,7 @@ class Talk:
             self.delivered += 1
 
     def owners(self) -> dict[str, list[str]]:
-        """Who believes to have each task."""
+        """Return the agents that believe to own each task."""
         found: dict[str, list[str]] = {}
         for name, bidder in self.bidders.items():
             for task in bidder.bundle:
@@ -58,7 +58,7 @@ class Talk:
 
 
 def line(names: list[str], dice: random.Random) -> list[tuple[str, str]]:
-    """A line through all, and some more edges."""
+    """Return a line through all names and some additional edges."""
     edges = set(zip(names, names[1:], strict=False))
     edges |= {tuple(sorted(dice.sample(names, 2))) for _ in range(dice.randrange(4)) if len(names) > 1}  # type: ignore[misc]
     return sorted(edges)
@@ -68,7 +68,7 @@ class BidderTests(SynchronousTestCase):
     @settings(max_examples=150)
     @given(st.integers(1, 8), st.integers(1, 8), st.integers(1, 3), st.integers(0, 10**6))
     def test_equals_greedy(self, agents: int, tasks: int, capacity: int, seed: int) -> None:
-        """In any order of delivery, with repetitions, on any connected graph, all end at the greedy assignment."""
+        """On any connected graph, in any order and with repetitions, all bidders reach the greedy assignment."""
         dice = random.Random(seed)
         names = [f"a{n}" for n in range(agents)]
         goals = [f"t{n}" for n in range(tasks)]
@@ -83,7 +83,7 @@ class BidderTests(SynchronousTestCase):
             self.assertEqual(winners, expected)
 
     def test_warped(self) -> None:
-        """Where tasks are worth more together, no bid rises within a bundle, and all come to rest without conflict."""
+        """With scores that grow with the bundle, bids do not rise within a bundle, and all bidders converge."""
         for seed in range(40):
             dice = random.Random(seed)
             names, goals = [f"a{n}" for n in range(5)], [f"t{n}" for n in range(6)]

@@ -1,4 +1,4 @@
-"""Tests of the choice among devices of different kinds."""
+"""Tests of the choice among devices with different capabilities."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class CapabilityCostTests(SynchronousTestCase):
         self.strategy = CapabilityCost()
 
     def test_the_incapable_never_win(self) -> None:
-        """Who lacks something does not win at any price."""
+        """A device with an unmet requirement does not win at any cost."""
         for cost in (0.0, math.nan, math.inf, -1.0):
             unable = Report("dog1", cost, unmet=("has no camera",))
             found = self.strategy.find([unable, Report("dog2", 9e8)])
@@ -32,7 +32,7 @@ class CapabilityCostTests(SynchronousTestCase):
     @settings(max_examples=100)
     @given(seconds, shares, st.integers(0, 9), seconds, shares, st.integers(1, 9))
     def test_monotone(self, way: float, battery: float, load: int, more: float, less: float, tasks: int) -> None:
-        """A longer way, a lower battery or more tasks never make a report weigh less."""
+        """A greater distance, a lower battery or more tasks never lower the weight of a report."""
         report = Report("a", way, battery=battery, load=float(load))
         weight = self.strategy.weigh(report)
         self.assertGreaterEqual(self.strategy.weigh(replace(report, cost=way + more)), weight)
@@ -40,13 +40,13 @@ class CapabilityCostTests(SynchronousTestCase):
         self.assertGreater(self.strategy.weigh(replace(report, load=float(load + tasks))), weight)
 
     def test_terms(self) -> None:
-        """Between equal ways the fuller battery goes, and then who has less to do."""
+        """At equal distances the device with the fuller battery wins, then the one with fewer tasks."""
         tired, fresh, busy = Report("a", 5.0, battery=0.2), Report("b", 5.0), Report("c", 5.0, load=2.0)
         found = self.strategy.find([tired, fresh, busy])
         self.assertEqual((found.assigned_agent, found.standby), ("b", ("a", "c")))
 
     def test_own_reports(self) -> None:
-        """Of two reports of one device the one counts that weighs less, not the one of the shorter way."""
+        """Of two reports of one device the one with the lower weight counts, not the one with the shorter distance."""
         tired, fresh = Report("a", 5.0, battery=0.2), Report("a", 6.0)
         self.assertEqual(self.strategy.merge([tired], [fresh]), (fresh,))
         self.assertEqual(self.strategy.find([tired, fresh, Report("b", 10.0)]).assigned_agent, "a")

@@ -1,4 +1,4 @@
-"""Every built-in strategy conforms, and the kit sees what does not."""
+"""Every built-in strategy conforms, and the conformance kit finds violations."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ for _name in BUILT_IN:
 
 
 class GuardedTests(Conformance, SynchronousTestCase):
-    """A guard around a good strategy is a good strategy."""
+    """A guard around a conforming strategy conforms."""
 
     @staticmethod
     def make() -> Guard:
@@ -42,7 +42,7 @@ class GuardedTests(Conformance, SynchronousTestCase):
 
 
 def point(order: Sequence[Report]) -> Consensus:
-    """A consensus point out of reports in the order of their rank."""
+    """Return a consensus of reports in the order of their rank."""
     if not order:
         return Consensus(None)
     names = list(dict.fromkeys(r.agent for r in order))
@@ -54,7 +54,7 @@ class Unnamed(Nearest):
 
 
 class Remembers(Nearest):
-    """Whoever won before is not to win again."""
+    """Excludes the previous winner."""
 
     def __init__(self) -> None:
         self.last: str | None = None
@@ -66,7 +66,7 @@ class Remembers(Nearest):
 
 
 class Sorts(Nearest):
-    """Sorts what it was given in its place."""
+    """Sorts its argument in place."""
 
     def find(self, contacts: Sequence[Report]) -> Consensus:
         contacts.sort(key=lambda r: r.agent, reverse=True)  # type: ignore[attr-defined]
@@ -74,7 +74,7 @@ class Sorts(Nearest):
 
 
 class FirstCome(Nearest):
-    """No tie-break: the first of the nearest."""
+    """Breaks ties by the order of the reports."""
 
     def find(self, contacts: Sequence[Report]) -> Consensus:
         found = super().find(contacts)
@@ -83,7 +83,7 @@ class FirstCome(Nearest):
 
 
 class Trusting(Nearest):
-    """Believes every number, as ``min`` does with NaN."""
+    """Accepts every number, including NaN."""
 
     def find(self, contacts: Sequence[Report]) -> Consensus:
         return point(sorted(contacts, key=lambda r: (not math.isnan(float(r.cost)), r.cost, r.agent)))
@@ -110,7 +110,7 @@ class Nervous(Nearest):
 
 
 class ByHash(Nearest):
-    """Ties by whatever a set gives first."""
+    """Breaks ties by the iteration order of a set."""
 
     def find(self, contacts: Sequence[Report]) -> Consensus:
         found = super().find(contacts)
@@ -119,7 +119,7 @@ class ByHash(Nearest):
 
 
 class SmallIds(Nearest):
-    """Keeps the number of an agent in one signed byte."""
+    """Stores the number of an agent in one signed byte."""
 
     def find(self, contacts: Sequence[Report]) -> Consensus:
         found = super().find(contacts)
@@ -136,21 +136,21 @@ class Raises(Nearest):
 
 
 class Greedy(Cbba):
-    """Gives everything to whoever is nearest."""
+    """Ignores the capacity of the agents."""
 
     def find_group(self, contacts: Sequence[Report], items: Sequence[Item]) -> tuple[Consensus, ...]:
         return super().find_group([replace(r, capacity=99) for r in contacts], items)
 
 
 class Lazy(Cbba):
-    """Leaves out the last task."""
+    """Omits the last task."""
 
     def find_group(self, contacts: Sequence[Report], items: Sequence[Item]) -> tuple[Consensus, ...]:
         return super().find_group(contacts, items)[: len(items) - 1]
 
 
 class Peeks(CapabilityCost):
-    """Goes by the battery, and does not say so."""
+    """Reads the battery without declaring it."""
 
     reads = ("load",)  # type: ignore[assignment]
 
@@ -174,11 +174,11 @@ BREACHES: dict[str, tuple[Callable[[], Any], ...]] = {
 
 class ConformanceTests(SynchronousTestCase):
     def test_every_built_in_says_its_name(self) -> None:
-        """Each built-in strategy says the name by which it was asked for."""
+        """The name of each built-in strategy is the name that selects it."""
         self.assertEqual({name: strategy_for(name).name for name in BUILT_IN}, {name: name for name in BUILT_IN})
 
     def test_each_breach_is_seen(self) -> None:
-        """A strategy that breaks a rule fails the check of this very rule."""
+        """A strategy that breaks a rule fails the check of that rule."""
         self.assertEqual(set(BREACHES), set(CHECKS))
         unseen = [
             (rule, strategy)
@@ -189,20 +189,20 @@ class ConformanceTests(SynchronousTestCase):
         self.assertEqual(unseen, [])
 
     def test_only_what_is_broken(self) -> None:
-        """A breach of one rule is not told as one of all."""
+        """A strategy that breaks one rule fails only its check."""
         self.assertEqual(list(broken(Unnamed)), ["name"])
         self.assertEqual(list(broken(Nervous)), ["improves"])
         self.assertEqual(list(broken(Concatenates)), ["merge"])
 
     def test_examples_conform(self) -> None:
-        """The template and the example of one's own pass as they are."""
+        """The template and the example of a custom strategy conform."""
         for name in ("spare:Spare", "template:Farthest"):
             module, _, attribute = name.partition(":")
             found = runpy.run_path(str(ROOT / "examples" / "strategy" / f"{module}.py"))
             self.assertEqual(broken(found[attribute]), {}, name)
 
     def test_same_in_every_process(self) -> None:
-        """Every strategy finds the same, digest included, however the process hashes its strings."""
+        """Every strategy has the same result, digest included, for any hash seed of the process."""
         replayed(
             self,
             "import random; from middleware.consensus.conformance import team\n"

@@ -1,4 +1,4 @@
-"""Tests of the strategies that share out several tasks: what they promise of safety and of quality."""
+"""Tests of the strategies that assign several tasks: safety and quality of the assignments."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Place = tuple[float, float]
 
 
 def square(agents: int, tasks: int, seed: int, capacity: int = 0) -> tuple[list[Report], list[Item]]:
-    """A mission in the unit square: every bid, and the items."""
+    """Return a mission in the unit square: all bids, and the items."""
     dice = random.Random(f"square/{agents}/{tasks}/{seed}")
     starts = {f"a{n:03d}": (dice.random(), dice.random()) for n in range(agents)}
     items = [Item(f"t{n:03d}", (dice.random(), dice.random())) for n in range(tasks)]
@@ -33,14 +33,14 @@ def square(agents: int, tasks: int, seed: int, capacity: int = 0) -> tuple[list[
 
 
 def cost(points: tuple[Consensus, ...], reports: list[Report]) -> float:
-    """What an assignment costs."""
+    """Return the cost of an assignment."""
     known = {(r.agent, r.task): r.cost for r in reports}
     return sum(known[agent, point.task] for point in points for agent in point.assigned)
 
 
 class SharingTests(SynchronousTestCase):
     def test_one_of_several(self) -> None:
-        """Asked about one, of reports on several tasks, they say who has the first when all are shared out."""
+        """``find`` on reports of several tasks returns the decision on the first one of the whole assignment."""
         bids = {("a", "s"): 1.0, ("b", "s"): 2.0, ("a", "t"): 1.0, ("b", "t"): 10.0}
         reports = [Report(agent, cost, task=task) for (agent, task), cost in bids.items()]
         for strategy in (Cbba(), GroupOptimal()):
@@ -50,7 +50,7 @@ class SharingTests(SynchronousTestCase):
 
 class GroupOptimalTests(SynchronousTestCase):
     def test_optimum(self) -> None:
-        """With all bids nothing is cheaper: compared with every assignment there is."""
+        """With all bids the cost is the minimum over all assignments."""
         for seed in range(30):
             reports, items = square(3, 4, seed)
             known = {(r.agent, r.task): r.cost for r in reports}
@@ -63,7 +63,7 @@ class GroupOptimalTests(SynchronousTestCase):
             self.assertAlmostEqual(cost(GroupOptimal().find_group(reports, items), reports), best, 5)
 
     def test_twenty_bids(self) -> None:
-        """With 20 bids of each the cost is within 2 % of the optimum, and every task has somebody."""
+        """With 20 bids of each agent the cost is within 2 % of the optimum, and every task is assigned."""
         ratios = []
         for seed in range(4):
             reports, items = square(60, 60, seed)
@@ -75,19 +75,19 @@ class GroupOptimalTests(SynchronousTestCase):
         self.assertLessEqual(fmean(ratios), 1.02)
 
     def test_second_pass(self) -> None:
-        """A task for which nobody's best bids were is found somebody among all bids."""
+        """A task outside of all agents' best bids is assigned from the remaining bids."""
         reports = [Report("a", float(n), task=f"t{n:02d}", capacity=30) for n in range(30)]
         found = GroupOptimal().find_group(reports, [Item(f"t{n:02d}") for n in range(30)])
         self.assertEqual({point.assigned_agent for point in found}, {"a"})
 
     def test_slots(self) -> None:
-        """A task for two has two agents, never one of them twice, and one owner for each place."""
+        """A task with two slots gets two different agents."""
         reports = [Report(a, c, task=t, capacity=2) for a, c in (("a", 1.0), ("b", 5.0)) for t in ("s", "t")]
         found = GroupOptimal().find_group(reports, [Item("s", slots=2), Item("t", slots=2)])
         self.assertEqual([point.assigned for point in found], [("a", "b"), ("a", "b")])
 
     def test_holes_say_why(self) -> None:
-        """What nobody can take is said to be so, and nobody gets more than it can take."""
+        """An unassigned task has a reason, and no agent exceeds its capacity."""
         reports = [Report("a", 1.0, task="s"), Report("a", 2.0, task="t")]
         found = GroupOptimal().find_group(reports, [Item("s"), Item("t"), Item("u")])
         self.assertEqual([point.assigned_agent for point in found], ["a", None, None])
@@ -95,7 +95,7 @@ class GroupOptimalTests(SynchronousTestCase):
         self.assertEqual(found[2].reason, "no agent bid for it")
 
     def test_equal_optima(self) -> None:
-        """Among equal optima it is always the same one."""
+        """Among equal optima the same one is always chosen."""
         reports = [Report(a, 1.0, task=t) for a in "abc" for t in "xyz"]
         found = GroupOptimal().find_group(reports, [Item(t) for t in "xyz"])
         self.assertEqual([point.assigned_agent for point in found], ["a", "b", "c"])
@@ -126,13 +126,13 @@ class CbbaTests(SynchronousTestCase):
         self.assertLessEqual(fmean(ratios), 1.05)
 
     def test_nothing_left_to_exchange(self) -> None:
-        """Afterwards no task is cheaper with an agent that has room for it, no two swapped; nobody has too many."""
+        """After the exchanges no single move or swap lowers the cost, and capacities are respected."""
         for seed in range(60):
             dice = random.Random(seed)
             tasks = [f"t{n}" for n in range(9)]
             costs = {f"a{n}": {t: dice.randrange(99) for t in tasks if dice.random() < 0.6} for n in range(6)}
             room = {agent: dice.randint(1, 3) for agent in costs}
-            # Greedy with the signs turned: as bad as can be to begin with.
+            # Greedy with inverted costs gives a bad start.
             worst = greedy({agent: {t: -c for t, c in row.items()} for agent, row in costs.items()}, room)
             owner = exchanged(worst, costs, room)
             held = Counter(owner.values())
@@ -148,7 +148,7 @@ class CbbaTests(SynchronousTestCase):
 
 class SequentialTests(SynchronousTestCase):
     def test_each_task_once(self) -> None:
-        """Each task is on one way, no way has more than the capacity, and the points say the same."""
+        """Each task is on one route, no route exceeds the capacity, and the decisions match the routes."""
         for seed in range(10):
             reports, items = square(4, 10, seed, capacity=3)
             ways = ways_of(reports, items) or {}
@@ -158,7 +158,7 @@ class SequentialTests(SynchronousTestCase):
             self.assertEqual({p.task: p.assigned_agent for p in found}, {t: a for a, w in ways.items() for t in w})
 
     def test_twice_the_best_at_most(self) -> None:
-        """The sum of ways is at most twice the shortest there is, on average at most 1.15 of it."""
+        """The sum of routes is at most twice the optimum, and on average at most 1.15 of it."""
         ratios = []
         for seed in range(25):
             reports, items = square(2, 5, seed, capacity=5)
@@ -171,7 +171,7 @@ class SequentialTests(SynchronousTestCase):
         self.assertLessEqual(fmean(ratios), 1.15)
 
     def best(self, starts: list[tuple[float, ...]], places: list[tuple[float, ...]]) -> float:
-        """The shortest sum of ways of two agents, by trying all."""
+        """Return the shortest sum of routes of two agents by exhaustive search."""
         shortest: dict[tuple[int, int], float] = {}
         for which, start in enumerate(starts):
             ends: dict[tuple[int, int], float] = {(1 << n, n): math.dist(start, p) for n, p in enumerate(places)}
@@ -190,13 +190,13 @@ class SequentialTests(SynchronousTestCase):
         return min(shortest[0, mask] + shortest[1, whole - mask] for mask in range(whole + 1))
 
     def test_without_places(self) -> None:
-        """Where positions are missing, or of different kinds, the bids alone decide."""
+        """Without positions, or with positions of different dimensions, only the bids count."""
         reports = [Report("a", 2.0, task="t"), Report("b", 1.0, task="t", value=(1.0,))]
         for items in ([Item("t")], [Item("t", (1.0, 2.0))]):
             self.assertEqual([p.assigned_agent for p in Sequential().find_group(reports, items)], ["b"])
 
     def test_only_what_it_bid_for(self) -> None:
-        """An agent that bids by name goes nowhere else; one that names no task goes anywhere."""
+        """An agent that bids for named tasks gets no other; an agent that names no task may get any."""
         items = [Item("s", (0.0, 0.0)), Item("t", (1.0, 0.0))]
         near = Report("near", 0.0, task="s", value=(0.5, 0.0), capacity=2)
         self.assertEqual(ways_of([near], items), {"near": ["s"]})

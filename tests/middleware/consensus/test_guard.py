@@ -1,4 +1,4 @@
-"""Tests of what a bad strategy can do, which is little."""
+"""Tests of the limits that a guard sets to a faulty strategy."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ TEAM = [Report("a", 3.0), Report("b", 1.0), Report("c", 2.0)]
 
 
 class Raising(Nearest):
-    """Raises whenever it is asked anything."""
+    """Raises in every method."""
 
     name = "raising"
 
@@ -36,7 +36,7 @@ class Raising(Nearest):
 
 
 class Lying(Nearest):
-    """Answers whatever it is told to."""
+    """Returns the given answer."""
 
     name = "lying"
 
@@ -48,7 +48,7 @@ class Lying(Nearest):
 
 
 class Moody(Nearest):
-    """The nearest, and the next time the farthest."""
+    """Chooses the nearest and the farthest agent in turn."""
 
     name = "moody"
     asked = 0
@@ -62,7 +62,7 @@ class Moody(Nearest):
 
 
 class OrderBound(Nearest):
-    """Whoever comes first."""
+    """Chooses the first report."""
 
     name = "order_bound"
 
@@ -71,7 +71,7 @@ class OrderBound(Nearest):
 
 
 class Slow(Nearest):
-    """Never answers in time."""
+    """Always exceeds the timeout."""
 
     name = "slow"
     asked = 0
@@ -82,7 +82,7 @@ class Slow(Nearest):
 
 
 class Moments(Nearest):
-    """Late each time that it was asked ``pause`` times."""
+    """Exceeds the timeout in every call number ``pause``."""
 
     name = "moments"
     asked = 0
@@ -98,7 +98,7 @@ class Moments(Nearest):
 
 
 class Inventing(Nearest):
-    """Adds a report to each summary, and says perhaps."""
+    """Adds a report to each summary, and returns a text from ``improves``."""
 
     name = "inventing"
 
@@ -111,7 +111,7 @@ class Inventing(Nearest):
 
 class GuardTests(SynchronousTestCase):
     def assert_falls_back(self, guard: Guard, why: str) -> None:
-        """The nearest acts, the reason says so and why, and the log has the trace once."""
+        """Check that the nearest agent wins, the reason names the failure, and an error is logged."""
         found = guard.find(TEAM)
         self.assertEqual((found.assigned_agent, found.standby), ("b", ("c", "a")))
         self.assertEqual(found.strategy, "nearest")
@@ -121,7 +121,7 @@ class GuardTests(SynchronousTestCase):
         self.assertTrue(self.flushLoggedErrors())
 
     def test_raising(self) -> None:
-        """One that raises has no opinion; its exception is named, and the trace is logged once for the same."""
+        """A strategy that raises is replaced by ``Nearest``; the reason names the exception, which is logged once."""
         guard = Guard(Raising())
         found = guard.find(TEAM)
         self.assertEqual(found.assigned_agent, "b")
@@ -134,7 +134,7 @@ class GuardTests(SynchronousTestCase):
         self.assertIn("in find", logged[0].getTraceback())
 
     def test_raising_elsewhere(self) -> None:
-        """Also what is better, and summaries, are then as the nearest has it."""
+        """``improves`` and ``merge`` of a strategy that raises also fall back to ``Nearest``."""
         guard = Guard(Raising())
         self.assertTrue(guard.improves(TEAM[0], TEAM[1], 0.1))
         self.assertFalse(guard.improves(TEAM[1], TEAM[0], 0.1))
@@ -142,7 +142,7 @@ class GuardTests(SynchronousTestCase):
         self.assertEqual(len(self.flushLoggedErrors()), 2)
 
     def test_lying(self) -> None:
-        """One that names who did not report, somebody twice, crowds, novels, or no consensus at all, has no opinion."""
+        """Results with unknown, repeated or too many agents, too long texts or of another type are rejected."""
         for lie, why in (
             (Consensus("zorro"), "which did not report"),
             (Consensus("b", ("zorro",)), "which did not report"),
@@ -158,7 +158,7 @@ class GuardTests(SynchronousTestCase):
             self.assert_falls_back(Guard(Lying(lie)), why)
 
     def test_mutable_state(self) -> None:
-        """One that answers equal reports in two ways is caught, at once or when it is asked again."""
+        """A strategy with two results for equal reports is detected, at once or at the next call."""
         self.assert_falls_back(Guard(Moody(), twice=True), "two results")
         later = Guard(Moody())
         self.assertEqual(later.find(TEAM).assigned_agent, "b")
@@ -166,12 +166,12 @@ class GuardTests(SynchronousTestCase):
         self.flushLoggedErrors()
 
     def test_order(self) -> None:
-        """One that goes by the order of reports is caught, or gets them in one order."""
+        """A strategy that depends on the order of reports is detected, or gets them in a fixed order."""
         self.assert_falls_back(Guard(OrderBound(), twice=True), "two results")
         self.assertEqual(Guard(OrderBound()).find(TEAM), Guard(OrderBound()).find(TEAM[::-1]))
 
     def test_late(self) -> None:
-        """One that does not answer in time costs its deadline a few times, and then no more."""
+        """A strategy that exceeds the timeout ``STRIKES`` times is not called again."""
         slow = Slow()
         guard = Guard(slow)
         for _ in range(10):
@@ -181,7 +181,7 @@ class GuardTests(SynchronousTestCase):
         self.flushLoggedErrors()
 
     def test_late_now_and_then(self) -> None:
-        """One that is late fewer than ``STRIKES`` times in ``SPAN`` questions is asked for ever; but not more often."""
+        """A strategy with fewer than ``STRIKES`` timeouts in ``SPAN`` calls stays in use; with more it does not."""
         for pause, is_out in ((SPAN // (STRIKES - 1), False), (SPAN // (STRIKES - 1) - 1, True)):
             moments = Moments(pause)
             guard = Guard(moments)
@@ -192,14 +192,14 @@ class GuardTests(SynchronousTestCase):
         self.flushLoggedErrors()
 
     def test_inventing(self) -> None:
-        """A summary may not hold what nobody reported, and "perhaps" is no answer."""
+        """A summary with unknown reports, and a result of ``improves`` that is no bool, are rejected."""
         guard = Guard(Inventing())
         self.assertEqual(guard.merge(TEAM, ()), Nearest().merge(TEAM, ()))
         self.assertTrue(guard.improves(TEAM[0], TEAM[1], 0.1))
         self.assertEqual(len(self.flushLoggedErrors()), 2)
 
     def test_group(self) -> None:
-        """Of several tasks too: a good answer stays; one that leaves a task out or gives too much falls back."""
+        """A valid group result is kept; one that omits a task or exceeds a capacity falls back."""
         items = [Item("s"), Item("t")]
         bids = [Report(a, c, task=t) for a, c in (("a", 1.0), ("b", 2.0)) for t in "st"]
         good = Cbba().find_group(bids, items)
@@ -228,7 +228,7 @@ class GuardTests(SynchronousTestCase):
             self.flushLoggedErrors()
 
     def test_unlawful_reports_never_reach_it(self) -> None:
-        """A strategy behind a guard sees lawful reports only, so what it believes does no harm."""
+        """A guard passes only valid reports to its strategy."""
         bad = [Report("x", cost) for cost in (math.nan, math.inf, -1.0, 1e300)]
         bad += [Report("x", 0.0, age=3.0, valid_for=2.0), Report("x", 0.0, unmet=("has no camera",))]
         guard = Guard(Nearest())
@@ -237,7 +237,7 @@ class GuardTests(SynchronousTestCase):
             self.assertFalse(Guard(Lying(None)).improves(TEAM[0], offer, 0.0))
 
     def test_by_name(self) -> None:
-        """Built-in strategies come behind a guard by name; a name that nobody has is an error."""
+        """Built-in strategies are guarded by name; an unknown name is an error."""
         self.assertIsInstance(guarded("nearest").strategy, Nearest)
         error = self.assertRaises(UnknownStrategy, guarded, "farthest")
         self.assertIn("nearest", str(error))
@@ -246,7 +246,7 @@ class GuardTests(SynchronousTestCase):
 
 class StrategiesTests(SynchronousTestCase):
     def test_built_in(self) -> None:
-        """A built-in strategy is made anew for each task, also when its node has left; an unknown name is an error."""
+        """Each task gets a new instance of a built-in strategy, also after ``stop``; an unknown name is an error."""
         strategies = Strategies()
         first, second = strategies.named("nearest", {}), strategies.named("nearest", {})
         self.assertIsInstance(first.strategy, Nearest)
@@ -256,7 +256,7 @@ class StrategiesTests(SynchronousTestCase):
         self.assertRaises(UnknownStrategy, strategies.named, "farthest", {})
 
     def test_deployed(self) -> None:
-        """Each task gets the version that was deployed last; who had the one before keeps it."""
+        """Each task gets the version deployed last; an earlier instance keeps its version."""
         deployed: dict[tuple[str, str], Make] = {("strategy", "best"): Nearest}
         strategies = Strategies()
         before = strategies.named("deployed:best", deployed)

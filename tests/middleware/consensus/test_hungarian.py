@@ -1,4 +1,4 @@
-"""Tests of the exact assignment."""
+"""Tests of the optimal assignment."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from middleware.consensus.strategies.hungarian import assigned, solved
 
 class HungarianTests(SynchronousTestCase):
     def table(self, dice: random.Random, most: int = 6) -> list[list[int]]:
-        """Random costs, many of them equal."""
+        """Return random costs, many of them equal."""
         rows = dice.randint(1, most - 1)
         columns = dice.randint(rows, most)
         high = dice.choice([1, 2, 3, 10, 1000, 2**60])
         return [[dice.randint(0, high) for _ in range(columns)] for _ in range(rows)]
 
     def test_against_every_assignment(self) -> None:
-        """It is the cheapest of all there are, and of equals the first; with huge costs too."""
+        """The assignment is the cheapest of all, the first among equals, also with huge costs."""
         dice = random.Random(1)
         for _ in range(400):
             costs = self.table(dice)
@@ -30,7 +30,7 @@ class HungarianTests(SynchronousTestCase):
             self.assertEqual(tuple(assigned(costs)), best[1], costs)
 
     def test_prices_prove_it(self) -> None:
-        """Each row has a column that is cheapest for it at these prices; what nobody has is free of charge."""
+        """The prices prove the optimum: each row has its cheapest column, and unassigned columns have price 0."""
         dice = random.Random(2)
         for _ in range(200):
             costs = self.table(dice, 9)
@@ -42,7 +42,7 @@ class HungarianTests(SynchronousTestCase):
             self.assertTrue(all(p == 0 for c, p in enumerate(prices) if c not in columns))
 
     def test_edges(self) -> None:
-        """Nothing to assign, one place, and all equal are no special cases."""
+        """No rows, one cell and equal costs are handled."""
         self.assertEqual(assigned([]), [])
         self.assertEqual(assigned([[7]]), [0])
         self.assertEqual(assigned([[5] * 4] * 3), [0, 1, 2])

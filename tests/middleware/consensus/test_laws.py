@@ -1,4 +1,4 @@
-"""The laws of ``find`` and ``merge`` for every strategy, over reports of any kind, lawful or not."""
+"""Tests of the laws of ``find`` and ``merge`` for every strategy, over valid and invalid reports."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ views = st.lists(reports, max_size=7)
 
 class LawTests(SynchronousTestCase):
     def hold(self, name: str) -> None:
-        """All laws, for one strategy."""
+        """Check all laws for one strategy."""
 
         @settings(max_examples=60)
         @given(views, views, views, st.randoms(use_true_random=False))
@@ -53,7 +53,7 @@ class LawTests(SynchronousTestCase):
         laws()
 
     def test_short_summaries(self) -> None:
-        """Where a summary keeps only the best, of a team of a hundred in any groups the same is found from it."""
+        """A summary with only the best reports gives the same result as all reports, in any grouping."""
         for name in ("nearest", "capability_cost"):
             strategy = strategy_for(name)
             for seed in range(20):

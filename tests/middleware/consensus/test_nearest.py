@@ -20,19 +20,19 @@ class NearestTests(SynchronousTestCase):
         self.nearest = Nearest()
 
     def test_lowest_cost_wins(self) -> None:
-        """The nearest acts, the others stand by in the order of their distances."""
+        """The nearest agent wins, and the others are standbys in the order of their distances."""
         found = self.nearest.find([Report("a", 2.0), Report("b", 0.5), Report("c", 1.0)])
         self.assertEqual((found.assigned_agent, found.standby), ("b", ("c", "a")))
 
     def test_ties(self) -> None:
-        """Equal costs are decided by the id, so there is never none and never two; 0 and -0 are equal."""
+        """Ties are broken by the id, which gives exactly one winner; 0 and -0 are equal."""
         self.assertEqual(self.nearest.find([Report("b", 1.0), Report("a", 1.0)]).assigned_agent, "a")
         self.assertEqual(self.nearest.find([Report("b", -0.0), Report("a", 0.0)]).assigned_agent, "a")
 
     @settings(max_examples=100)
     @given(reports, st.randoms(use_true_random=False))
     def test_order_and_repetition_do_not_matter(self, contacts: list[Report], rng: object) -> None:
-        """The same reports in any order, some of them twice, give the same consensus point, digest included."""
+        """Any order and repetition of the reports gives the same consensus, digest included."""
         found = self.nearest.find(contacts)
         mixed = [*contacts, *contacts[:2]]
         rng.shuffle(mixed)  # type: ignore[attr-defined]
@@ -43,7 +43,7 @@ class NearestTests(SynchronousTestCase):
         self.assertLessEqual(set(named), lawful)
 
     def test_improves(self) -> None:
-        """Only an offer nearer by more than the share takes over; what is no distance gives way and never wins."""
+        """Only an offer that is nearer by more than the hysteresis improves; an invalid cost never wins."""
         rows = [
             (1.0, 0.89, True),
             (1.0, 0.9, False),

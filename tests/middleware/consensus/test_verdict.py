@@ -1,4 +1,4 @@
-"""Tests of ``middleware.consensus.verdict``: what one agent writes down of its decision, and what others read."""
+"""Tests of ``middleware.consensus.verdict``: writing and reading an agent's decision record."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def member(number: int, cost: float | None, status: str = WAITING) -> Member:
 def decided(
     number: int, members: list[Member], epoch: int = 1, version: str = "1", assigned: int | None = None
 ) -> Verdict:
-    """What dog ``number`` writes when it has heard of ``members``; ``assigned`` where hysteresis kept another."""
+    """Return the decision record of dog ``number`` that knows ``members``; ``assigned`` overrides the winner."""
     me = next(m for m in members if m.name == f"dog{number}")
     others = [m for m in members if m is not me]
     consensus = Nearest().find([Report(m.uuid, m.cost) for m in members if m.cost is not None])
@@ -47,7 +47,7 @@ def decided(
 
 
 def record_of(number: int, verdict: Verdict, value: bytes | None = None, name: str = "") -> Record:
-    """The record that dog ``number`` publishes."""
+    """Return the signed record that dog ``number`` publishes."""
     content = verdict.packed() if value is None else value
     slot = name or verdict.slot
     return Record(verdicts_key("t1"), slot, identity(number).public, 1, "team", 60.0, content).signed(identity(number))
@@ -58,7 +58,7 @@ THREE = [member(1, 1.5), member(2, 0.5), member(3, 1.0)]
 
 class VerdictTests(SynchronousTestCase):
     def test_survives_the_wire(self) -> None:
-        """What is packed and signed is read back as it was, its agent taken from the signature's key."""
+        """A packed and signed decision record is unpacked unchanged, with the agent from the key of the signature."""
         verdict = replace(decided(1, THREE), token=7)
         self.assertEqual(verdict_of(record_of(1, verdict)), verdict)
         self.assertEqual([r.name for r in verdict.reports], ["dog2", "dog3", "dog1"])
@@ -66,12 +66,12 @@ class VerdictTests(SynchronousTestCase):
         self.assertEqual(verdict.standby, (THREE[2].uuid, THREE[0].uuid))
 
     def test_nobody_testifies_for_another(self) -> None:
-        """A copy of dog1's account in dog2's slot is dog2's account."""
+        """A copy of dog1's decision record in dog2's slot counts as dog2's."""
         copied = verdict_of(record_of(2, decided(1, THREE)))
         self.assertEqual(copied is not None and copied.agent, identity(2).node_id.hex())
 
     def test_many_reports_are_the_best_and_a_count(self) -> None:
-        """Of thirty reports all are written, of more the best eight and the count; the size stays bounded."""
+        """Up to thirty reports are all written, of more only the best eight and the count; the size is bounded."""
         for n, written in ((MANY, MANY), (MANY + 1, BEST), (500, BEST)):
             members = [member(i, float(i)) for i in range(1, n + 1)]
             verdict = decided(1, members)
@@ -89,7 +89,7 @@ class VerdictTests(SynchronousTestCase):
         self.assertLessEqual(len(packed), MAX_VERDICT)
 
     def test_what_counted_is_told(self) -> None:
-        """What a strategy went by beside the cost, and what was agreed on, is on the account, and nothing else."""
+        """The record contains the values that the strategy read and the agreed value, and no others."""
         members = [replace(member(1, 1.5), battery=0.4, load=3), replace(member(2, 0.5), choice="red", weight=2.0)]
         members.append(replace(member(3, 1.0), value=(1.0, 2.0)))
         found = Consensus(members[1].uuid, value=(1.0, 2.5), choice="red")
@@ -103,7 +103,7 @@ class VerdictTests(SynchronousTestCase):
         self.assertEqual({r.more for r in verdict_from(*given, View()).reports}, {""})
 
     def test_hysteresis_is_told(self) -> None:
-        """The account says in words what became of whoever acted before."""
+        """The record explains the effect of hysteresis on the previously acting agent."""
         acting = [member(1, 1.0, EXECUTING), member(2, 0.95), member(3, None)]
         for assigned, words in (
             (1, "dog2 is the best, but not better by 10% than dog1, who acts"),
@@ -121,7 +121,7 @@ class VerdictTests(SynchronousTestCase):
         self.assertEqual(decided(1, [member(1, None)]).hysteresis, "no report counts")
 
     def test_decoder_is_total(self) -> None:
-        """No value of a record, however crafted, raises; what is no verdict is None."""
+        """Any value of a record gives a decision record or None, and never raises."""
         good = decided(1, THREE)
         content = msgpack.unpackb(good.packed())
         bad: dict[str, list[object]] = {
@@ -154,14 +154,14 @@ class VerdictTests(SynchronousTestCase):
             verdict_of(record_of(1, good, bytes(crafted)))
 
     def test_name_of_another_spoils_nothing(self) -> None:
-        """A member whose name would clear a terminal is shown without it, and does not make the account unreadable."""
+        """A member's name with terminal control characters is shown without them, and the record stays readable."""
         hostile = replace(member(2, 0.5), name="a\x1b[2J\ud800")
         verdict = verdict_of(record_of(1, decided(1, [hostile, member(1, 1.0)])))
         self.assertIsNotNone(verdict)
         self.assertEqual(verdict and verdict.reports[0].name, "a?[2J?")
 
     def test_of_many_the_best_tell(self) -> None:
-        """In a group of up to thirty all write; in a larger one the eight best."""
+        """In a group of up to thirty all agents write records; in a larger one the best eight do."""
         members = [member(i, float(i)) for i in range(1, MANY + 2)]
         self.assertTrue(all(decided(n, members[:MANY]).is_witness for n in range(1, MANY + 1)))
         told = [verdict for n in range(1, MANY + 2) if (verdict := decided(n, members)).is_witness]

@@ -1,4 +1,4 @@
-"""Tests of ``middleware.consensus.view``: what a strategy is shown of the members."""
+"""Tests of ``middleware.consensus.view``: the fields of members that a strategy reads."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FULL = Member(
 
 class ViewTests(SynchronousTestCase):
     def test_only_what_is_read_is_shown(self) -> None:
-        """A strategy is given what it names and nothing else; one that does not say is given everything."""
+        """A strategy gets only the fields that it declares, or all fields if it declares none."""
         self.assertEqual(view_of(Nearest()).report(FULL), Report("a", 2.5))
         self.assertEqual(View(("battery", "load")).report(FULL), Report("a", 2.5, battery=0.5, load=2.0))
         whole = Report("a", 2.5, value=(1.0, 2.0), choice="red", weight=2.0, electorate=5.0, battery=0.5, load=2.0)
@@ -27,7 +27,7 @@ class ViewTests(SynchronousTestCase):
         self.assertEqual(view_of(Guard(strategy_for("average"))).reads, ("value", "weight"))
 
     def test_odd_wishes_are_none(self) -> None:
-        """Whatever a strategy of somebody else says that it reads, only what there is comes of it."""
+        """Unknown fields in the declaration of a strategy are ignored."""
 
         class Odd(Nearest):
             reads: tuple[str, ...] = ("cost", "battery", "uuid")
@@ -37,7 +37,7 @@ class ViewTests(SynchronousTestCase):
         self.assertEqual(view_of(Odd()).reads, READABLE)
 
     def test_record_and_bid_are_one_report(self) -> None:
-        """What a member's record says and what its bid says come to the same report, in every digit of its digest."""
+        """A member's record and its bid give the same report, with the same digest."""
         for name in BUILT_IN:
             view = view_of(strategy_for(name))
             bid = view.report(FULL)
@@ -51,7 +51,7 @@ class ViewTests(SynchronousTestCase):
         self.assertEqual(digest_of([coarse]), digest_of([fine]))
 
     def test_bid_that_is_unlawful_changes_nothing(self) -> None:
-        """A bid with a hostile number, place or word leaves what the record says."""
+        """A bid with an invalid number, position or text does not change the record's values."""
         view = view_of(object())
         for bad in (
             Report("a", float("nan")),
@@ -64,5 +64,5 @@ class ViewTests(SynchronousTestCase):
             self.assertEqual(view.told(FULL, bad), FULL, bad)
 
     def test_who_reports_nothing_is_shown_to_nobody(self) -> None:
-        """A member without a cost has no report, whatever else it says."""
+        """A member without a cost has no report."""
         self.assertIsNone(view_of(object()).report(replace(FULL, cost=None)))

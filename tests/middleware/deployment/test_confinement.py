@@ -1,4 +1,4 @@
-"""Tests of ``middleware.deployment.confinement``: the filter of system calls, read as the kernel reads it."""
+"""Tests of ``middleware.deployment.confinement``: the filter of system calls, evaluated as the kernel does."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ MACHINES = {"x86_64": 0xC000003E, "aarch64": 0xC00000B7}
 
 
 def verdict(program: bytes, architecture: int, number: int) -> int:
-    """What a seccomp program answers to one system call."""
+    """Return the result of a seccomp program for one system call."""
     lines = [struct.unpack_from("=HBBI", program, at) for at in range(0, len(program), 8)]
     loaded, at = 0, 0
     while True:
@@ -30,7 +30,7 @@ def verdict(program: bytes, architecture: int, number: int) -> int:
 
 class ConfinementTests(SynchronousTestCase):
     def test_exactly_the_listed_calls(self) -> None:
-        """Of all numbers those of the listed calls are allowed, others refused; another architecture ends it."""
+        """The filter allows exactly the listed calls, refuses all others, and kills on another architecture."""
         for machine, architecture in MACHINES.items():
             program = filter_program(machine)
             _, _, numbers = confinement._NUMBERS[machine]
@@ -41,11 +41,11 @@ class ConfinementTests(SynchronousTestCase):
             self.assertEqual(verdict(program, 0x40000003, numbers[0]), KILL)
 
     def test_dangerous_calls_are_none_of_them(self) -> None:
-        """No call is listed that opens, connects, starts, traces or signals anything."""
+        """No listed call opens, connects, starts, traces or signals anything."""
         for call in ("open", "openat", "socket", "connect", "clone", "fork", "execve", "ptrace", "kill", "bpf"):
             self.assertNotIn(call, CALLS)
         self.assertNotIn("ioctl", CALLS)
 
     def test_unknown_machine(self) -> None:
-        """For a machine whose numbers are not known there is no filter."""
+        """An unknown architecture raises ``ValueError``."""
         self.assertRaises(ValueError, filter_program, "pdp11")

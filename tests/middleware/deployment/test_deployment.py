@@ -1,4 +1,4 @@
-"""Tests of ``middleware.deployment.deployment``: one node's acceptance, on a fleet in memory."""
+"""Tests of ``middleware.deployment.deployment``: acceptance by one node of a team in memory."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class DeploymentTests(FleetCase):
         self.deployment = self.allow()
 
     def allow(self, shelf: Shelf | None = None, node: SwarmNode | None = None, **more: object) -> Deployment:
-        """Let the dog (or ``node``) run "best" as the operator pushes it."""
+        """Let the dog (or ``node``) accept "best" from the operator."""
         node = self.dog if node is None else node
         key = self.operator.entangled.identity.public.hex()
         allowed = replace(DeploymentSettings(True, (key,), ("best",)), **more)  # type: ignore[arg-type]
@@ -84,12 +84,12 @@ class DeploymentTests(FleetCase):
 
     @property
     def running(self) -> int:
-        """Which version runs, 0 for none."""
+        """Return the version that runs, or 0."""
         held = self.deployment.held.get("best")
         return 0 if held is None else held.version
 
     def assert_refused(self, words: str, runs: int = 0) -> None:
-        """The dog's messages say so, its code never ran, and what ran before still runs."""
+        """Check that the dog logs ``words``, did not run the code, and still runs version ``runs``."""
         said = " | ".join(text for _, text in self.dog.presence.device.messages)
         self.assertIn(words, said)
         self.assertEqual(self.running, runs)
@@ -97,7 +97,7 @@ class DeploymentTests(FleetCase):
             self.assertNotIn(CANARY, sys.modules)
 
     def test_accepts_and_reports(self) -> None:
-        """A listed module of a listed operator runs, by its name, and the device says its version and digest."""
+        """A listed module of a listed operator runs under its name, and the device publishes version and digest."""
         manifest, source = self.version(1)
         self.push(manifest, source)
         self.assertEqual(self.running, 1)
@@ -112,7 +112,7 @@ class DeploymentTests(FleetCase):
         self.assertRaises(UnknownStrategy, strategy_for, "deployed:best")
 
     def test_objections(self) -> None:
-        """A stranger's module, one that is not listed and one that is too large are refused before they are fetched."""
+        """Modules of a stranger, unlisted modules and oversized modules are refused before they are fetched."""
         manifest, source = self.version(1)
         self.push(manifest, source, self.stranger)
         self.assert_refused(f"comes from {self.stranger.entangled.identity.public.hex()[:8]}")
@@ -123,7 +123,7 @@ class DeploymentTests(FleetCase):
         self.assert_refused(f"has {MAX_SOURCE + 1} bytes, more than {MAX_SOURCE}")
 
     def test_bad_signature_is_refused(self) -> None:
-        """A record in the operator's name that the operator did not sign is refused, though a watcher is shown it."""
+        """A record in the operator's name without its signature is refused, even if a watcher receives it."""
         manifest, source = self.version(1)
         self.done(self.world, self.operator.entangled.put(hashed_key(source_key(manifest.digest)), "source", source))
         owner = self.operator.entangled.identity.public
@@ -133,7 +133,7 @@ class DeploymentTests(FleetCase):
         self.assert_refused("is not signed by its operator")
 
     def test_wrong_kind_is_refused(self) -> None:
-        """A strategy pushed as a behaviour is refused, and a name keeps the kind that it had."""
+        """A strategy pushed as a behaviour is refused, and a name keeps its kind."""
         source = SOURCE + b"#"
         self.push(pushed("best", BEHAVIOUR, source, None, 1), source)
         said = " ".join(text for _, text in self.dog.presence.device.messages)
@@ -144,7 +144,7 @@ class DeploymentTests(FleetCase):
         self.assert_refused("is a strategy here, not a behaviour", runs=2)
 
     def test_lower_version_and_other_content_are_refused(self) -> None:
-        """Neither an older version, nor the same version with other content, takes the place of what is held."""
+        """An older version, and the same version with other content, do not replace the current version."""
         second, source = self.version(2)
         self.push(second, source)
         first, source = self.version(1)
@@ -156,7 +156,7 @@ class DeploymentTests(FleetCase):
         self.assertEqual(self.deployment.held["best"], second)
 
     def test_going_back_and_old_word_again(self) -> None:
-        """Going back holds also against the version taken back, should its word come again."""
+        """After a rollback the withdrawn version is refused, even if its record arrives again."""
         first, source = self.version(1)
         self.push(first, source)
         second, source = self.version(2, first)
@@ -169,7 +169,7 @@ class DeploymentTests(FleetCase):
         self.assert_refused("version 2 is older than the 1 held (2 was taken back)", runs=1)
 
     def test_source_may_come_late(self) -> None:
-        """A source that is not there yet, or is another than was signed, is asked for again until it comes."""
+        """A source that is missing, or differs from the signed digest, is requested again until it arrives."""
         manifest, source = self.version(1)
         wrong = source[:-2] + b"2\n"
         key = hashed_key(source_key(manifest.digest))
@@ -183,7 +183,7 @@ class DeploymentTests(FleetCase):
         self.assertEqual(self.running, 1)
 
     def test_nonsense_under_the_key(self) -> None:
-        """Values that are no manifests are refused once each, and nothing else happens."""
+        """Values that are not manifests are refused once each, without other effects."""
         for value in (b"", b"\xc1", msgpack.packb({"name": "best"}), bytes(5000)):
             self.done(self.world, self.operator.entangled.put(manifests_key(), "best", value), 1.0)
             self.done(self.world, self.stranger.entangled.put(manifests_key(), "x\x1b", value), 1.0)
@@ -191,7 +191,7 @@ class DeploymentTests(FleetCase):
         self.assertNotIn("\x1b", "".join(text for _, text in self.dog.presence.device.messages))
 
     def test_restart_loads_from_the_shelf(self) -> None:
-        """The next life runs what was accepted before it hears of anybody; two editions are on the shelf."""
+        """After a restart the accepted version runs without any peer, and two editions are stored."""
         held = None
         for number in (1, 2, 3):
             held, source = self.version(number, held)
@@ -203,7 +203,7 @@ class DeploymentTests(FleetCase):
         self.assertEqual(self.running, 3)
 
     def test_restart_checks_again(self) -> None:
-        """What was accepted does not run in the next life if the owner has struck the operator, or the name."""
+        """A stored module does not run after a restart if its operator or its name was removed from the settings."""
         manifest, source = self.version(1)
         self.push(manifest, source)
         sys.modules.pop(CANARY)
@@ -213,7 +213,7 @@ class DeploymentTests(FleetCase):
             self.assertNotIn(CANARY, sys.modules)
 
     def test_damaged_files_never_run(self) -> None:
-        """A file that was cut, or changed anywhere, is left out and named; the edition before it runs."""
+        """A truncated or changed file is skipped, and the previous edition runs."""
         folder = Path(self.mktemp())
         self.deployment = self.allow(FileShelf(folder))
         first, source = self.version(1)
@@ -236,7 +236,7 @@ class DeploymentTests(FleetCase):
         self.assertEqual(self.running, 1)
 
     def test_full_disk_is_told(self) -> None:
-        """A module that cannot be put on file runs all the same, and the device says so."""
+        """A module that cannot be stored still runs, and the device reports the full disk."""
 
         def full(source: Path, target: Path) -> None:
             raise OSError(28, "No space left on device")

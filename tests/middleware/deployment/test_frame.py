@@ -11,7 +11,7 @@ from middleware.deployment.frame import MAX_ANSWER, BadFrame, Splitter, pack, un
 
 class FrameTests(SynchronousTestCase):
     def test_stream_is_split(self) -> None:
-        """Messages come out whole however the stream is cut."""
+        """Messages are decoded whole, however the stream is split."""
         messages = [pack([number, True, b"x" * number]) for number in range(20)]
         stream, dice, splitter, found = b"".join(messages), random.Random(1), Splitter(MAX_ANSWER), []
         while stream:
@@ -21,11 +21,11 @@ class FrameTests(SynchronousTestCase):
         self.assertEqual([unpack_answer(each)[0] for each in found], list(range(20)))
 
     def test_too_large_is_refused_unread(self) -> None:
-        """A length above the limit is refused before what follows has come."""
+        """A length above the limit is refused before the content arrives."""
         self.assertRaises(BadFrame, Splitter(10).feed, b"\0\0\0\x0b")
 
     def test_nonsense(self) -> None:
-        """Any bytes are a message or a ``BadFrame``."""
+        """Any bytes are a message or raise ``BadFrame``."""
         dice = random.Random(2)
         for _ in range(2000):
             data = dice.randbytes(dice.randint(0, 30))

@@ -1,4 +1,4 @@
-"""Tests of ``middleware.deployment.manifest``: which word of an operator holds."""
+"""Tests of ``middleware.deployment.manifest``: the order of an operator's manifests."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def record_of(manifest: Manifest, value: bytes | None = None, name: str | None =
 
 
 def versions(n: int) -> list[Manifest]:
-    """``n`` versions, each pushed after the other."""
+    """Return ``n`` successive versions."""
     told: list[Manifest] = []
     for number in range(n):
         told.append(pushed("best", STRATEGY, b"x = %d" % number, told[-1] if told else None))
@@ -44,7 +44,7 @@ def versions(n: int) -> list[Manifest]:
 
 class ManifestTests(SynchronousTestCase):
     def test_survives_the_wire(self) -> None:
-        """What is packed is read back, with its history, in fewer bytes than every device holds."""
+        """A packed manifest is unpacked unchanged, with its history, and fits into a record."""
         for manifest in (*versions(9), rolled_back(versions(9)[-1])):
             assert manifest is not None
             self.assertEqual(manifest_of(record_of(manifest)), manifest)
@@ -53,7 +53,7 @@ class ManifestTests(SynchronousTestCase):
         self.assertEqual(len(versions(9)[-1].before), KEPT)
 
     def test_newest_word_holds_in_any_order(self) -> None:
-        """Push, push, back, push, back, back: whichever of these words come again in whatever order, the last holds."""
+        """After pushes and rollbacks in any order of arrival, the last manifest wins."""
         first = pushed("best", STRATEGY, b"1", None)
         second = pushed("best", STRATEGY, b"2", first)
         back = rolled_back(second)
@@ -69,7 +69,7 @@ class ManifestTests(SynchronousTestCase):
         self.assertIsNone(rolled_back(again))
 
     def test_decoder_is_total(self) -> None:
-        """No value of a record, however crafted, raises; what is no manifest is None."""
+        """No value of a record, however crafted, raises; a value that is not a manifest gives None."""
         good = versions(2)[-1]
         content = msgpack.unpackb(good.packed())
         bad: dict[str, list[object]] = {
@@ -94,7 +94,7 @@ class ManifestTests(SynchronousTestCase):
             manifest_of(record_of(good, bytes(crafted)))
 
     def test_given_version(self) -> None:
-        """A version may be named; the edition before is remembered by its digest."""
+        """A version number may be given; the previous edition is remembered by its digest."""
         first = pushed("best", STRATEGY, b"1", None, 4)
         second = pushed("best", STRATEGY, b"2", first, 9)
         self.assertEqual((first.version, second.version), (4, 9))

@@ -1,4 +1,4 @@
-"""Tests of ``middleware.deployment.module``: foreign source in, something that can be called out, or why not."""
+"""Tests of ``middleware.deployment.module``: loading an operator's source, or the reason why it is refused."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class ModuleTests(SynchronousTestCase):
         self.addCleanup(lambda: [sys.modules.pop(name) for name in sorted(set(sys.modules) - before)])
 
     def refusal(self, source: str | bytes, kind: str = STRATEGY) -> str:
-        """Why a source is refused; nothing of it stays."""
+        """Return the reason why a source is refused, and check that it leaves no module."""
         data = source.encode() if isinstance(source, str) else source
         before = set(sys.modules)
         error = self.assertRaises(Undeployable, loaded, pushed("best", kind, data, None), data)
@@ -54,7 +54,7 @@ class ModuleTests(SynchronousTestCase):
         return str(error.problem)
 
     def test_strategy_decides_under_its_name_and_version(self) -> None:
-        """A strategy is made anew each time, works, and says under which name and version it was deployed."""
+        """Each call creates a new strategy, which decides and names its deployed name and version."""
         source = GOOD.encode()
         manifest = pushed("best", STRATEGY, source, None)
         strategy = loaded(manifest, source)()
@@ -63,13 +63,13 @@ class ModuleTests(SynchronousTestCase):
         self.assertIsNot(loaded(manifest, source)(), strategy)
 
     def test_behaviour_takes_parameters(self) -> None:
-        """A behaviour is made of a task's parameters."""
+        """A behaviour is created from a task's parameters."""
         source = SPIN.encode()
         made = loaded(pushed("spin", BEHAVIOUR, source, None), source)({"cost": 2}, None)
         self.assertEqual(made.cost, 2.0)
 
     def test_what_cannot_run_is_refused(self) -> None:
-        """What does not parse, raises whatever, never ends or is of another kind is refused with its reason."""
+        """A source that does not parse, raises, does not terminate or is of another kind is refused with its reason."""
         for source, reason in (
             ("def f(:\n", "line 1: "),
             (b"\xff\xfe", ""),
@@ -91,7 +91,7 @@ class ModuleTests(SynchronousTestCase):
         self.assertIn("a behaviour has to define look", self.refusal("class Behaviour: pass", BEHAVIOUR))
 
     def test_what_is_no_strategy_is_refused(self) -> None:
-        """A strategy that loops, names a stranger, depends on the order or prefers a report to itself is refused."""
+        """A strategy that loops, names an unknown agent, depends on the order or prefers equal reports is refused."""
         for body, reason in (
             ("def find(self, c):\n  while True: pass", "takes more than"),
             ("def find(self, c): return Consensus('x' * 40 if c else None)", "did not report"),
@@ -105,7 +105,7 @@ class ModuleTests(SynchronousTestCase):
             self.assertIn(reason, self.refusal(f"{BASE}class Strategy(Nearest):\n{indented}"))
 
     def test_other_source_than_signed_never_runs(self) -> None:
-        """A source of another digest or size than the manifest's is refused before any of it runs."""
+        """A source with another digest or size than in the manifest is refused before it runs."""
         source = b"import sys; sys.modules['swarm_canary'] = sys"
         manifest = pushed("best", STRATEGY, b"x" * len(source), None)
         error = self.assertRaises(Undeployable, loaded, manifest, source)
@@ -113,7 +113,7 @@ class ModuleTests(SynchronousTestCase):
         self.assertNotIn("swarm_canary", sys.modules)
 
     def test_tracer_of_others_is_put_back(self) -> None:
-        """Whoever watches the program's steps (coverage, a debugger) goes on doing so."""
+        """A trace function (coverage, a debugger) is restored after a module was loaded."""
         before = sys.gettrace()
         self.refusal("while True: pass")
         self.assertIs(sys.gettrace(), before)

@@ -1,4 +1,4 @@
-"""Tests of ``middleware.deployment.runner``: a module's process as its node sees it, on a turned clock."""
+"""Tests of ``middleware.deployment.runner``: a module's process from the side of its node, in virtual time."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ONE = [0, "find", []]
 
 
 class Scripted:
-    """A process that answers what the test says."""
+    """A process with scripted answers."""
 
     is_behind = False
 
@@ -59,7 +59,7 @@ class RunnerTests(SynchronousTestCase):
         self.flushed = False
 
     def runner(self, answer: Callable[[int, str], bytes], kind: str = STRATEGY) -> Runner:
-        """A module whose processes answer so; it is started."""
+        """Return the started runner of a module with this scripted ``answer``."""
 
         def spawn() -> Scripted:
             self.processes.append(Scripted(answer))
@@ -71,18 +71,18 @@ class RunnerTests(SynchronousTestCase):
         return runner
 
     def good(self, number: int, verb: str) -> bytes:
-        """Loads, and finds the same each time."""
+        """Load successfully and return the same result for each call."""
         return well(number, {"limits": ["seccomp"], "reads": ["load"], "told": []} if verb != "call" else 7)
 
     def test_ready_and_asked(self) -> None:
-        """Once it has loaded it tells its limits and what it reads, and is asked."""
+        """After loading, the runner knows the limits and the fields read, and forwards calls."""
         runner = self.runner(self.good)
         self.assertEqual((runner.state, runner.limits, runner.reads), (State.READY, ("seccomp",), ("load",)))
         self.assertEqual(runner.wait_for("call", ONE), 7)
         self.assertEqual(PushedStrategy(runner).name, "deployed:best")
 
     def test_may_not_run(self) -> None:
-        """Where there is an objection no process is started, also not after a loss."""
+        """An objection prevents the start of a process, including a restart."""
         self.objection = "is revoked"
         runner = self.runner(self.good)
         self.assertEqual((runner.state, runner.why, self.processes), (State.OUT, "is revoked", []))
@@ -94,7 +94,7 @@ class RunnerTests(SynchronousTestCase):
         self.assertEqual((lost.state, len(self.processes)), (State.OUT, 1))
 
     def test_silence_costs_the_process(self) -> None:
-        """A process that gives no answer is ended; the third one is the last."""
+        """A process that does not answer is killed; after ``STRIKES`` of them no other is started."""
         runner = self.runner(lambda number, verb: self.good(number, verb) if verb == "load" else b"")
         for _ in range(STRIKES):
             self.assertRaises(Lost, runner.wait_for, "call", ONE)
@@ -103,7 +103,7 @@ class RunnerTests(SynchronousTestCase):
         self.assertEqual([each.is_ended for each in self.processes], [True] * STRIKES)
 
     def test_never_loaded(self) -> None:
-        """A process that is not ready in time is ended."""
+        """A process that is not ready in time is killed."""
         runner = self.runner(lambda number, verb: b"")
         self.assertRaises(NoOpinion, runner.wait_for, "call", ONE)
         self.now = START_S + 1.0
@@ -111,7 +111,7 @@ class RunnerTests(SynchronousTestCase):
         self.assertEqual((runner.state, self.processes[0].is_ended), (State.LOST, True))
 
     def test_hostile_answers(self) -> None:
-        """Whatever comes back instead of an answer ends the process, and raises nothing else."""
+        """An invalid answer ends the process and raises only ``NoOpinion``."""
         for nonsense in (
             frame.pack(7),
             frame.pack([1]),
@@ -130,14 +130,14 @@ class RunnerTests(SynchronousTestCase):
             self.assertIs(runner.state, State.LOST)
 
     def test_hostile_facts(self) -> None:
-        """Whatever it says of itself when it has loaded, it is used or refused, and never raises."""
+        """Invalid facts in the answer to "load" are ignored or refused, and never raise."""
         for facts in (None, 7, {}, {"limits": 7, "reads": 7}, {"limits": [None] * 99, "reads": [[], {}, 1]}):
             runner = self.runner(lambda number, verb, facts=facts: well(number, facts))  # type: ignore[misc]
             self.assertIs(runner.state, State.READY if isinstance(facts, dict) else State.OUT)
             self.assertLessEqual(len(runner.limits), 16)
 
     def test_instances(self) -> None:
-        """A behaviour's instance is made, asked and dropped; it ends with the process, which is told by its name."""
+        """An instance of a behaviour is created, called and dropped; it ends with its process and has its reason."""
         runner = self.runner(self.good, BEHAVIOUR)
         instance = runner.create({"turns": 1}, random.Random(1))
         answers: list[tuple[bool, Any]] = []
@@ -154,7 +154,7 @@ class RunnerTests(SynchronousTestCase):
         self.assertRaises(UnknownTask, runner.create, {}, random.Random(1))
 
     def test_late_behaviour_is_ended(self) -> None:
-        """A behaviour that does not answer in time is ended, and each that waits is told."""
+        """A behaviour that exceeds the timeout is killed, and its pending calls fail."""
         runner = self.runner(lambda number, verb: b"" if verb == "call" else self.good(number, verb), BEHAVIOUR)
         instance = runner.create({}, random.Random(1))
         answers: list[bool] = []
@@ -167,14 +167,14 @@ class RunnerTests(SynchronousTestCase):
         self.assertEqual((answers, runner.state, bool(instance.fault)), ([False], State.LOST, True))
 
     def test_questions_are_bounded(self) -> None:
-        """So many wait at most."""
+        """The number of pending calls is limited."""
         runner = self.runner(lambda number, verb: b"" if verb == "call" else self.good(number, verb), BEHAVIOUR)
         for _ in range(MAX_PENDING):
             runner.ask("call", [], lambda is_well, content: None)
         self.assertRaises(frame.Gone, runner.ask, "call", [], lambda is_well, content: None)
 
     def test_twin(self) -> None:
-        """The twin in memory loads, decides and refuses as a process does."""
+        """The in-memory runner loads, decides and refuses like a process."""
         runner = Runner(pushed("best", STRATEGY, NEAREST, None), NEAREST, simulated, lambda: 0.0)
         runner.start()
         runner.look()

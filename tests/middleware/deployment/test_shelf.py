@@ -1,4 +1,4 @@
-"""Tests of ``middleware.deployment.shelf``: a file is whole or not there."""
+"""Tests of ``middleware.deployment.shelf``: a stored file is complete or absent."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class FileShelfTests(SynchronousTestCase):
         self.folder = Path(self.mktemp()) / "deployed"
 
     def test_keeps_and_drops(self) -> None:
-        """Both shelves do the same: what is kept is there in the order of names, what is dropped is not."""
+        """Both implementations list the stored entries in the order of their names, without the dropped ones."""
         shelves: list[Shelf] = [FileShelf(self.folder), MemoryShelf()]
         for shelf in shelves:
             self.assertEqual(shelf.everything(), [])
@@ -27,7 +27,7 @@ class FileShelfTests(SynchronousTestCase):
             self.assertEqual(shelf.everything(), [("b", b"3")])
 
     def test_crash_in_the_middle_leaves_the_old(self) -> None:
-        """A node that ends before a file is in its place has the old one, and no remains, in its next life."""
+        """After a crash during a write, the old file is read and the temporary file is removed."""
         FileShelf(self.folder).keep("a", b"old")
         self.assertEqual(self.folder.stat().st_mode & 0o077, 0)
 

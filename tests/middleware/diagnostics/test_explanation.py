@@ -1,4 +1,4 @@
-"""Tests of ``middleware.diagnostics.explanation``: accounts in, one explanation out."""
+"""Tests of ``middleware.diagnostics.explanation``: one explanation from the agents' decision records."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ OWN = [decided(n, THREE) for n in (1, 2, 3)]
 
 class ExplanationTests(SynchronousTestCase):
     def test_all_agree(self) -> None:
-        """Three agents with the same reports agree, and nobody differs."""
+        """Three agents with the same reports agree without differences."""
         (ruling,) = explained([decided(n, THREE) for n in (1, 2, 3)]).epochs
         self.assertEqual((ruling.chosen, ruling.agree, ruling.of), ("dog2", ("dog1", "dog2", "dog3"), 3))
         self.assertEqual(ruling.differ, ())
@@ -24,7 +24,7 @@ class ExplanationTests(SynchronousTestCase):
         self.assertTrue(text.startswith("epoch 1: dog2, 3 of 3 agree\n  by nearest 1 from reports "), text)
 
     def test_who_differs_and_in_what(self) -> None:
-        """Who named another, knew other reports or used another version is named, with what it is."""
+        """An agent with another winner, other reports or another version is listed with the difference."""
         missed = [THREE[0], THREE[2]]
         moved = [THREE[0], THREE[1], member(3, 1.25)]
         for other, what in (
@@ -41,7 +41,7 @@ class ExplanationTests(SynchronousTestCase):
         self.assertIn("dog3 differs: names dog3; knew no report of dog2", text)
 
     def test_agreement_is_told(self) -> None:
-        """What was agreed on and what else counted is told, and who agreed on something else differs in that."""
+        """The explanation contains the agreed choice; an agent that agreed on another value is listed with it."""
         known = [
             replace(each, reports=(replace(each.reports[0], more="battery 40%"), *each.reports[1:])) for each in OWN
         ]
@@ -56,13 +56,13 @@ class ExplanationTests(SynchronousTestCase):
         self.assertEqual([d.what for d in ruling.differ], ["knew dog2 with nothing more"])
 
     def test_silent_agent_is_named(self) -> None:
-        """Who reported and has told no decision is no agreement."""
+        """An agent that reported without a decision record does not count as agreeing."""
         (ruling,) = explained([decided(1, THREE), decided(3, THREE)]).epochs
         self.assertEqual((len(ruling.agree), ruling.of), (2, 3))
         self.assertEqual([(d.name, d.what) for d in ruling.differ], [("dog2", "has no decision record")])
 
     def test_order_does_not_matter(self) -> None:
-        """Any order of the accounts gives the same explanation, the newest epoch first."""
+        """Any order of the decision records gives the same explanation, with the newest epoch first."""
         verdicts = [decided(n, THREE, epoch) for epoch in (1, 2, 3) for n in (1, 2, 3)]
         verdicts[4] = decided(2, THREE[:1] + [THREE[1]], 2)
         expected = explained(verdicts)
@@ -73,7 +73,7 @@ class ExplanationTests(SynchronousTestCase):
             self.assertEqual(explained(verdicts), expected)
 
     def test_most_decide_whoever_dissents(self) -> None:
-        """Two that agree outvote the third, whichever of the three it is."""
+        """Two agents that agree outvote the third, for each of the three."""
         for lone in (1, 2, 3):
             verdicts = [decided(n, THREE, assigned=1 if n == lone else None) for n in (1, 2, 3)]
             (ruling,) = explained(verdicts).epochs
@@ -81,20 +81,20 @@ class ExplanationTests(SynchronousTestCase):
             self.assertEqual([(d.name, d.what) for d in ruling.differ], [(f"dog{lone}", "names dog1")])
 
     def test_even_votes_give_the_lowest(self) -> None:
-        """Two agents that name each other: the lower uuid counts as the winner, and the other as differing."""
+        """If two agents choose each other, the lower uuid wins and the other agent differs."""
         first, second = decided(1, THREE, assigned=1), decided(2, THREE, assigned=2)
         (ruling,) = explained([first, second]).epochs
         self.assertEqual(ruling.winner, min(first.winner, second.winner))
         self.assertEqual(len(ruling.agree), 1)
 
     def test_nothing_decided(self) -> None:
-        """No account explains nothing, and a ruling without a winner names nobody."""
+        """No decision record gives an empty explanation, and an epoch without a winner names "nobody"."""
         self.assertEqual(as_text(explained([])), "")
         (ruling,) = explained([decided(1, [member(1, None)])]).epochs
         self.assertEqual((ruling.winner, ruling.chosen), ("", "nobody"))
 
     def test_of_many_the_best_are_asked(self) -> None:
-        """In a group of more than thirty the agreement is of the eight that write."""
+        """In a group of more than thirty, only the eight agents that write their records are counted."""
         members = [member(i, float(i)) for i in range(1, MANY + 2)]
         told = [verdict for n in range(1, MANY + 2) if (verdict := decided(n, members)).is_witness]
         (ruling,) = explained(told).epochs

@@ -1,7 +1,6 @@
-"""Tests of the directory as a team grows, shrinks, falls apart and heals: nobody is missing, and nobody is there twice.
+"""Tests of the directory while a team grows, shrinks, is partitioned and heals: each device is listed once.
 
-Most of them are of many devices over one table of records, which forgets what is leased as replicas do; the last ones
-are of real nodes.
+Most tests simulate many devices over one table of records with expiring leases; the last ones use real nodes.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ REVIEW = 10.0
 
 
 class Table:
-    """What all holders together hold, those of one side of a cut; ``silent`` keys are answered by nobody."""
+    """The records of all replicas on one side of a partition; keys in ``silent`` get no answer."""
 
     def __init__(self, clock: HeapClock) -> None:
         self.clock = clock
@@ -49,7 +48,7 @@ class Table:
         return succeed(sorted(live, key=lambda record: record.owner))
 
     def keys(self) -> dict[bytes, int]:
-        """How many records there are under each key."""
+        """Return the number of records under each key."""
         counts: dict[bytes, int] = {}
         for slot, (_, until) in self.slots.items():
             if until > self.clock.seconds():
@@ -58,13 +57,13 @@ class Table:
 
 
 class Roster:
-    """As much of a roster as the directory asks for."""
+    """The part of a roster that the directory reads."""
 
     is_full = False
 
 
 class Neighbour:
-    """A device with its directory over a table; it knows whom a node of its network would know."""
+    """A device with its directory over a table, and the contacts that a node of its network would have."""
 
     def __init__(self, town: Town, number: int) -> None:
         self.town = town
@@ -82,7 +81,7 @@ class Neighbour:
 
     @property
     def is_large(self) -> bool:
-        """Whether there are too many to know all."""
+        """Whether the team is too large to know every member."""
         return len(self.seen()) >= WHOLE
 
     @property
@@ -93,7 +92,7 @@ class Neighbour:
         return [n.contact for n in self.town.neighbours if n.table is self.table and n is not self]
 
     def contacts(self) -> list[Contact]:
-        """The nearest ones; in a small team all."""
+        """Return the nearest contacts; in a small team all."""
         seen = self.seen()
         if len(seen) < WHOLE:
             return seen
@@ -103,7 +102,7 @@ class Neighbour:
         return self.table.get(key, concern)
 
     def put(self, key: bytes, name: str, value: bytes, lifetime: str, lease: float) -> Deferred[None]:
-        """Write, and keep alive."""
+        """Write a record, and renew its lease from now on."""
         self.sequence += 1
         slot = Slot(key, self.identity.public, name)
         record = Record(key, name, self.identity.public, self.sequence, "leased", lease, value, bytes(64))
@@ -115,26 +114,26 @@ class Neighbour:
         self.own.pop(Slot(key, self.identity.public, name))
 
     def say(self) -> None:
-        """Announce the device where it stands now."""
+        """Announce the device at its current depth."""
         device = Device(self.identity.node_id.hex(), "d", depth=self.directory.depth)
         self.directory.announce("d", device.packed(), device.depth)
 
     def enter(self) -> None:
-        """Join; the depth is looked at now and then."""
+        """Join, and review the depth periodically."""
         Deferred.fromCoroutine(self.directory.arrive())
         self.say()
         self.chores.later(self.town.dice.uniform(0.0, REVIEW), self.review)
         self.chores.every(0.8 * self.lease, self.beat)
 
     def review(self) -> None:
-        """Move where the team is of another size."""
+        """Move if the size of the team has changed."""
         self.chores.later(REVIEW, self.review)
         before = self.directory.depth
         if self.directory.review() != before:
             self.say()
 
     def beat(self) -> None:
-        """Keep what is owned alive, in whichever table this side has."""
+        """Renew this device's records in the current table."""
         for slot, lease in self.own.items():
             if slot in self.table.slots:
                 record, _ = self.table.slots[slot]
@@ -142,7 +141,7 @@ class Neighbour:
 
 
 class Town:
-    """Neighbours that come and go, on one clock and one table, or two while it is cut in two."""
+    """Neighbours that join and leave, on one clock and one table, or two tables during a partition."""
 
     def __init__(self, seed: int = 1) -> None:
         self.seed = seed
@@ -153,7 +152,7 @@ class Town:
         self.number = 0
 
     def come(self, count: int, pause: float) -> None:
-        """So many newcomers, one after the other."""
+        """Let ``count`` neighbours join, one after the other."""
         for _ in range(count):
             self.number += 1
             self.neighbours.append(Neighbour(self, self.number))
@@ -161,20 +160,20 @@ class Town:
             self.clock.advance(pause)
 
     def go(self, gone: Iterable[Neighbour]) -> None:
-        """Some vanish without a word."""
+        """Remove neighbours without a farewell."""
         for neighbour in list(gone):
             neighbour.chores.stop()
             self.neighbours.remove(neighbour)
 
     def cut(self, away: Iterable[Neighbour]) -> None:
-        """From now on ``away`` read and write a table of their own."""
+        """Give the neighbours in ``away`` a separate table from now on."""
         other = Table(self.clock)
         other.slots = dict(self.table.slots)
         for neighbour in away:
             neighbour.table = other
 
     def heal(self) -> None:
-        """One table again, in which the newer record of each slot holds."""
+        """Merge the tables; the newer record of each slot wins."""
         for table in {id(n.table): n.table for n in self.neighbours if n.table is not self.table}.values():
             for slot, (record, until) in table.slots.items():
                 known = self.table.slots.get(slot)
@@ -185,19 +184,19 @@ class Town:
 
 
 def result(case: FleetCase, work: Any) -> Any:
-    """What a coroutine or Deferred that waits for nothing came to."""
+    """Return the result of a coroutine or Deferred that is ready."""
     return case.successResultOf(work if isinstance(work, Deferred) else Deferred.fromCoroutine(work))
 
 
 class DirectoryTests(FleetCase):
     def listed(self, reader: Neighbour) -> list[bytes]:
-        """The ids that one of them lists, each as often as it is listed."""
+        """Return the ids that ``reader`` lists, with duplicates."""
         listing: Listing = result(self, reader.directory.listed())
         self.assertTrue(listing.is_complete)
         return [device_of(record).uuid for record in listing.records]  # type: ignore[union-attr, misc]
 
     def all_there(self, town: Town, readers: int = 3, also: Iterable[Neighbour] = ()) -> None:
-        """Some readers list everybody who is here, each once, and nobody who left but those in ``also``."""
+        """Check that ``readers`` list each present device once, and of the departed ones only those in ``also``."""
         here = {n.identity.node_id.hex() for n in town.neighbours}
         late = {n.identity.node_id.hex() for n in also}
         for reader in town.dice.sample(town.neighbours, min(readers, len(town.neighbours))):
@@ -207,13 +206,13 @@ class DirectoryTests(FleetCase):
             self.assertEqual(set(listed) - here - late, set(), "somebody is listed who left")
 
     def all_stay(self, town: Town, readers: int = 2, times: int = 12, pause: float = 5.0) -> None:
-        """They are all there so many ``times``, ``pause`` seconds apart."""
+        """Repeat ``all_there`` ``times`` times, ``pause`` seconds apart."""
         for _ in range(times):
             town.clock.advance(pause)
             self.all_there(town, readers)
 
     def test_growth_and_back(self) -> None:
-        """From 3 devices to 300 and back, at every moment everybody is listed once, and at the end it is one key."""
+        """From 3 devices to 300 and back, each device is always listed once, and at the end there is one key."""
         town = Town()
         town.come(3, 1.0)
         self.assertEqual(set(town.table.keys()), {DEVICES})
@@ -234,7 +233,7 @@ class DirectoryTests(FleetCase):
         self.assertEqual(town.table.keys(), {DEVICES: len(town.neighbours)})
 
     def test_partition_and_healing(self) -> None:
-        """Both sides of a cut list themselves; when it heals, everybody lists all at once, though they stand apart."""
+        """Both sides of a partition list themselves; after it heals, all devices list all others at once."""
         town = Town(4)
         town.come(240, 0.1)
         town.clock.advance(60.0)
@@ -250,7 +249,7 @@ class DirectoryTests(FleetCase):
         self.all_stay(town)
 
     def test_a_place_whose_holders_are_lost(self) -> None:
-        """A newcomer reads one place of its neighbours; one that nobody answers for leaves the list incomplete."""
+        """A newcomer reads one prefix of its neighbourhood; an unanswered prefix makes the list incomplete."""
         town = Town(7)
         town.come(150, 0.1)
         town.clock.advance(60.0)
@@ -270,7 +269,7 @@ class DirectoryTests(FleetCase):
             self.assertTrue(neighbour.identity.public in seen or is_missed)
 
     def test_some(self) -> None:
-        """A page is the whole team where that has one place, else a few places; page by page all are shown."""
+        """A page is the whole team if there is one prefix, else a few prefixes; successive pages cover the team."""
         town = Town(9)
         town.come(30, 0.1)
         reader, before = town.neighbours[7], town.table.reads
@@ -291,7 +290,7 @@ class DirectoryTests(FleetCase):
             seen |= {record.owner for record in page.records}
         self.assertIsNone(page.following)
         self.assertEqual(seen, {n.identity.public for n in town.neighbours})
-        # A search goes on until the device is found, and ends where there is none, or after so many reads.
+        # A search continues until the device is found, and ends at the end of the directory or the read limit.
         sought = town.neighbours[120].identity.node_id.hex()
         page = result(self, reader.directory.some(1, lambda device: device.uuid == sought))
         self.assertEqual([device.uuid for device, _ in devices_of(page.records)], [sought])
@@ -303,13 +302,13 @@ class DirectoryTests(FleetCase):
 
 class TeamTests(FleetCase):
     def names(self, fleet: SwarmFleet, place: int) -> list[str]:
-        """The names of all whom one node lists."""
+        """Return the names of all devices that one node lists."""
         listing = self.done(fleet, fleet.nodes[place].list_devices(), 1.0)
         self.assertTrue(listing.is_complete)
         return sorted(device.name for device, _ in listing.devices)
 
     def test_apart_and_together_again(self) -> None:
-        """Real nodes that stand as in a large team are listed and followed whole, then all the way back to one key."""
+        """Real nodes at the depth of a large team are listed and watched completely, until they return to one key."""
         fleet = self.swarm(12, weather=Weather(0.01))
         told: list[list[Record]] = []
         following = fleet.nodes[1].watch_devices(told.append)

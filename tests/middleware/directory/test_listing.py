@@ -1,4 +1,4 @@
-"""Tests of the walk through the directory: everybody once, by any reader, and it knows whom it may have missed."""
+"""Tests of the traversal of the directory: it lists each device once, and reports unread prefixes."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ def owners(count: int, seed: int = 1) -> list[bytes]:
 
 
 def record(key: bytes, owner: bytes, depth: int, sequence: int = 1) -> Record:
-    """What a device that says it is at ``depth`` has written under ``key``."""
+    """Return the record of a device at ``depth``, as written under ``key``."""
     value = Device(node_id(owner).hex(), "d", depth=depth).packed()
     return Record(key, "d", owner, sequence, "leased", 1.0, value, bytes(64))
 
 
 def announced(depths: Mapping[bytes, int]) -> Places:
-    """What is under each key when every owner stands at its depth."""
+    """Return the records under each key if every owner is at its depth."""
     places: Places = {}
     for owner, depth in depths.items():
         for key in places_of(node_id(owner), depth):
@@ -39,7 +39,7 @@ def announced(depths: Mapping[bytes, int]) -> Places:
 
 
 def listed(places: Places, listing: Listing, silent: frozenset[bytes] = frozenset()) -> Listing:
-    """The listing when it has ended; nobody answers for the keys in ``silent``."""
+    """Run ``listing`` to its end; the keys in ``silent`` get no answer."""
     seen: list[bytes] = []
     while (place := listing.next()) is not None:
         seen.append(place.key)
@@ -53,7 +53,7 @@ def listed(places: Places, listing: Listing, silent: frozenset[bytes] = frozense
 
 class ListingTests(SynchronousTestCase):
     def test_everybody_once(self) -> None:
-        """All devices are found, each once, with one read for each place, whatever depth the reader expects."""
+        """All devices are listed once, with one read for each prefix, whatever depth the reader expects."""
         depths = dict.fromkeys(owners(600), 5)
         for floor in (0, 3, 5):
             listing = listed(announced(depths), Listing(floor))
@@ -66,14 +66,14 @@ class ListingTests(SynchronousTestCase):
     @settings(max_examples=60, deadline=None)
     @given(st.integers(2, 6), st.integers(0, 2**32))
     def test_neighbours_disagree(self, depth: int, seed: int) -> None:
-        """Where each device is at this depth or the next by chance, all are found."""
+        """All devices are found if each is randomly at one of two adjacent depths."""
         dice = random.Random(seed)
         depths = {owner: depth + dice.randint(0, 1) for owner in owners(24 << depth, seed)}
         listing = listed(announced(depths), Listing(max(0, depth - 1)))
         self.assertEqual(len(listing.records), len(depths))
 
     def test_one_that_is_ahead_or_behind(self) -> None:
-        """A single device one depth below all others is found, and any above them."""
+        """A single device one depth below all others is found, and so is a device at any depth above them."""
         team = owners(400)
         for odd in team[:40]:
             for depth in (5, 3, 1, 0):
@@ -81,20 +81,20 @@ class ListingTests(SynchronousTestCase):
                 self.assertEqual(len(listed(announced(depths), Listing(3)).records), len(team), depth)
 
     def test_two_networks_become_one(self) -> None:
-        """After a partition of 20 and 600 all are found, though the few stand under the old key alone."""
+        """After a partition of 20 and 600 devices all are found, although the 20 are under the root key only."""
         depths = {**dict.fromkeys(owners(600), 5), **dict.fromkeys(owners(20, 2), 0)}
         for floor in (0, 4):
             self.assertEqual(len(listed(announced(depths), Listing(floor)).records), 620)
 
     def test_some_know_sooner_that_the_team_is_small(self) -> None:
-        """Where most of 40 stand under the old key again, those that are two depths below are listed, too."""
+        """If most of 40 devices have returned to the root key, those up to two depths below are listed, too."""
         team = owners(40)
         for deep in (1, 2):
             depths = {owner: deep if node_id(owner)[0] >> 7 != DEVICES[0] >> 7 else 0 for owner in team}
             self.assertEqual(len(listed(announced(depths), Listing()).records), 40, deep)
 
     def test_a_place_that_does_not_answer(self) -> None:
-        """The list says that it is not complete, and which prefix is missing."""
+        """An unread prefix makes the listing incomplete, and the listing names it."""
         depths = dict.fromkeys(owners(600), 5)
         lost = prefix_of(node_id(next(iter(depths))), 5)
         listing = listed(announced(depths), Listing(), frozenset([lost.key]))
@@ -106,7 +106,7 @@ class ListingTests(SynchronousTestCase):
         self.assertTrue(absent and all(missed.has(node_id(owner)) for owner in absent))
 
     def test_wrong_places(self) -> None:
-        """Who writes where it does not stand is not listed there, and sends nobody anywhere."""
+        """A device under a prefix that does not match its id is not listed and causes no further reads."""
         team, liars = owners(20), owners(200, 9)
         places = announced(dict.fromkeys(team, 0))
         places[DEVICES] += [record(DEVICES, liar, 9) for liar in liars]
@@ -121,7 +121,7 @@ class ListingTests(SynchronousTestCase):
             self.assertEqual(standing(DEVICES, [crafted]), [], strange)
 
     def test_a_liar_costs_little(self) -> None:
-        """Who claims the deepest place there is, and stands there, costs a reader one read for each depth."""
+        """A device that claims the maximum depth costs a reader at most one read for each depth."""
         seed = next(s for s in range(10**6) if DEVICES[:2] == node_id(owners(1, s)[0])[:2])
         (liar,) = owners(1, seed)
         places = announced({**dict.fromkeys(owners(20), 0), liar: MAX_DEPTH})
@@ -129,7 +129,7 @@ class ListingTests(SynchronousTestCase):
         self.assertEqual((len(listing.records), listing.reads), (21, 1 + MAX_DEPTH))
 
     def test_only_below_a_prefix(self) -> None:
-        """A list of one part reads that part only."""
+        """A listing of one prefix reads only the keys below it."""
         depths = dict.fromkeys(owners(600), 5)
         under = prefix_of(node_id(next(iter(depths))), 3)
         listing = listed(announced(depths), Listing(5, under))
@@ -137,7 +137,7 @@ class ListingTests(SynchronousTestCase):
         self.assertLessEqual({o for o in depths if under.has(node_id(o))}, {r.owner for r in listing.records})
 
     def test_what_is_open_is_not_over(self) -> None:
-        """As long as an answer is awaited nothing is said to be complete."""
+        """While an answer is pending, the listing is neither over nor complete."""
         listing = Listing(1)
         self.assertFalse(listing.is_over)
         self.assertEqual(listing.next(), ROOT)

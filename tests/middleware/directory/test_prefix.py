@@ -1,4 +1,4 @@
-"""Tests of the places in the directory: which keys there are, who stands where, and how long it is listed."""
+"""Tests of the prefixes of the directory: their keys, the prefixes of a device, and its lease."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ def ids(count: int, seed: int = 1) -> list[bytes]:
 
 class PrefixTests(SynchronousTestCase):
     def test_depth_zero_is_the_old_key(self) -> None:
-        """At depth 0 everybody stands under the one key that small teams have always used."""
+        """At depth 0 every device is under the root key, the only key of a small team."""
         self.assertEqual(ROOT.key, DEVICES)
         for node_id in ids(20):
             self.assertEqual(places_of(node_id, 0), [DEVICES])
 
     def test_a_key_begins_as_its_devices_do(self) -> None:
-        """So the nodes closest to a place are neighbours of those that it lists."""
+        """The key of a prefix starts with the bits of its devices' ids, which places it near their nodes."""
         for node_id in ids(20):
             for depth in range(MAX_DEPTH + 1):
                 place = prefix_of(node_id, depth)
@@ -46,7 +46,7 @@ class PrefixTests(SynchronousTestCase):
                 self.assertTrue(place.has(place.first) and place.first <= node_id)
 
     def test_halves(self) -> None:
-        """Of the two halves of a place one has its key and one another, and each id is in one of them."""
+        """One half of a prefix has the same key, the other another, and each id is in exactly one half."""
         for node_id in ids(20):
             place = prefix_of(node_id, 5)
             self.assertEqual(place.along.key, place.key)
@@ -54,7 +54,7 @@ class PrefixTests(SynchronousTestCase):
             self.assertNotEqual(place.along.has(node_id), place.aside.has(node_id))
 
     def test_two_places_and_one_stays(self) -> None:
-        """A device that moves by one depth stands at one of its places all the while."""
+        """A device that moves by one depth keeps one of its keys."""
         for node_id in ids(50):
             for depth in range(MAX_DEPTH):
                 before, after = places_of(node_id, depth), places_of(node_id, depth + 1)
@@ -62,7 +62,7 @@ class PrefixTests(SynchronousTestCase):
                 self.assertLessEqual(len(after), 3 if depth < SHALLOW else 2)
 
     def test_small_team_is_never_split(self) -> None:
-        """Up to the members that are known whole the depth is 0, and a little fewer have to be left to return to it."""
+        """The depth is 0 up to ``WHOLE`` members, and returns to 0 only at ``STILL_WHOLE`` members."""
         self.assertEqual([depth_for(size, 0) for size in (1, 8, 48, WHOLE)], [0] * 4)
         self.assertEqual([depth_for(size) for size in (1, 8, 48, WHOLE)], [0] * 4)
         self.assertEqual(depth_for(WHOLE + 1, 0), 1)
@@ -70,7 +70,7 @@ class PrefixTests(SynchronousTestCase):
         self.assertEqual(depth_for(STILL_WHOLE, 1), 0)
 
     def test_hysteresis(self) -> None:
-        """Coming from any depth one arrives within a depth of the right one, and a size that sways moves nobody."""
+        """From any depth the next depths converge to the right one, and small changes of the size move no device."""
         for exponent in range(1, MAX_DEPTH):
             size = FEW * 2.0**exponent * 1.4
             if size <= WHOLE:
@@ -83,18 +83,18 @@ class PrefixTests(SynchronousTestCase):
                 self.assertEqual(depth_for(size / 1.1, depth), depth)
         border = FEW * 2.0**6
         self.assertEqual([depth_for(border * 1.05, 5), depth_for(border / 1.05, 6)], [5, 6])
-        # However large the difference, a device moves by one depth, and never beyond the deepest.
+        # A device moves by at most one depth at a time, and never beyond the maximum.
         self.assertEqual([depth_for(1e9, 0), depth_for(3, 9), depth_for(1, 0)], [1, 8, 0])
         self.assertEqual([depth_for(1e30, MAX_DEPTH), depth_for(1e30)], [MAX_DEPTH, MAX_DEPTH])
 
     def test_lease_grows_with_the_depth(self) -> None:
-        """A team with one place keeps its lease; each depth doubles it up to a minute, and none is shortened."""
+        """A team with one prefix keeps its lease; each depth doubles it up to a minute, and never shortens it."""
         self.assertEqual([lease_at(depth, 1.0) for depth in (0, 1, 2, 5)], [1.0, 2.0, 4.0, 32.0])
         self.assertEqual(lease_at(MAX_DEPTH, 1.0), LONGEST)
         self.assertEqual([lease_at(0, 90.0), lease_at(4, 90.0)], [90.0, 90.0])
 
     def test_size(self) -> None:
-        """Few contacts are counted; of many nodes the nearest ones tell how many there are, within a factor of two."""
+        """A few contacts are counted; in a large team the nearest ones estimate the size within a factor of two."""
         contacts = [Contact(random.Random(n).randbytes(32), Address("10.0.0.1", 7000)) for n in range(3000)]
         self.assertEqual(size_of(contacts[0].node_id, contacts[1:7]), 7)
         right = 0

@@ -1,4 +1,4 @@
-"""Tests of devices as records, and of what a node says of its own."""
+"""Tests of device records and of the presence that a node announces."""
 
 from __future__ import annotations
 
@@ -45,19 +45,19 @@ DEVICE = Device(
 
 
 def record(value: object, owner: Identity = DOG, name: str = "dog") -> Record:
-    """A record with this value in the slot of that name; anything but bytes is packed."""
+    """Return a record with this value in the slot ``name``; any value but bytes is packed."""
     packed = value if isinstance(value, bytes) or value is None else bytes(msgpack.packb(value))
     return Record(DEVICES, name, owner.public, 1, "leased", 1.0, packed, bytes(64))
 
 
 def content(**changes: object) -> dict[str, object]:
-    """What the record of ``DEVICE`` holds, changed."""
+    """Return the content of the record of ``DEVICE`` with ``changes``."""
     return {**msgpack.unpackb(DEVICE.packed()), **changes}
 
 
 class DeviceTests(SynchronousTestCase):
     def test_there_and_back(self) -> None:
-        """A device comes out of its record as it went in; fields that it does not use take no room."""
+        """A device survives packing and unpacking; unused fields take no space."""
         self.assertEqual(device_of(record(DEVICE.packed())), DEVICE)
         placed = replace(DEVICE, pages=("http://10.0.0.1:8080",), position={"x": 1.0, "y": 2.5, "heading": -0.5})
         self.assertEqual(device_of(record(placed.packed())), placed)
@@ -66,7 +66,7 @@ class DeviceTests(SynchronousTestCase):
         self.assertEqual({"pages", "position"} & set(msgpack.unpackb(DEVICE.packed())), set())
 
     def test_crafted(self) -> None:
-        """A record of another node, or one with a wrong type, a wrong number or no name, announces nothing."""
+        """A record of another node, or with a wrong type, an invalid number or no name, gives no device."""
         bad: dict[str, list[object]] = {
             "uuid": [None, 5, ""],
             "name": [5, None, b"dog"],
@@ -112,14 +112,14 @@ class DeviceTests(SynchronousTestCase):
         )
     )
     def test_total(self, value: object) -> None:
-        """Whatever stands in a record, reading it gives a device or nothing, and never raises."""
+        """Any record gives a device or None, and never raises."""
         one = record(value)
         self.assertIsInstance(device_of(one), Device | None)
         if isinstance(value, dict):
             device_of(record({**content(), **value}))
 
     def test_order_of_joining(self) -> None:
-        """Devices come in the order in which they joined, equal ones by uuid, and what is no device is left out."""
+        """Devices are listed in the order of joining, ties by uuid; records that are not devices are skipped."""
         cat = Device(CAT.node_id.hex(), "cat", joined=1)
         records = [record(DEVICE.packed()), record(cat.packed(), CAT, "cat"), record(b"?")]
         self.assertEqual([d.name for d, _ in devices_of(records)], ["cat", "dog"])
@@ -127,14 +127,14 @@ class DeviceTests(SynchronousTestCase):
         self.assertEqual(devices_of([record(cat.packed(), CAT, "dog")]), [])
 
     def test_one_name_twice(self) -> None:
-        """Devices of one name are told apart by their ids; a device that stands at two places is one."""
+        """Devices of the same name get a part of their ids as a suffix; two records of one device do not."""
         cat = Device(CAT.node_id.hex(), "dog", joined=1)
         records = [record(DEVICE.packed()), record(cat.packed(), CAT)]
         self.assertEqual([d.name for d, _ in devices_of(records)], [f"dog-{d.uuid[:6]}" for d in (cat, DEVICE)])
         self.assertEqual([d.name for d, _ in devices_of([records[0], records[0]])], ["dog", "dog"])
 
     def test_message_lines(self) -> None:
-        """Only the newest lines are kept, each cut to its length."""
+        """Only the newest messages are kept, each truncated to the maximum length."""
         device = DEVICE
         for n in range(9):
             device = device.with_message(float(n), f"{n}" * 100)
@@ -143,7 +143,7 @@ class DeviceTests(SynchronousTestCase):
         self.assertEqual(len(device.messages), MESSAGES_KEPT)
 
     def test_too_large_gives_way(self) -> None:
-        """Where there is too much to say, old messages go first, then the description; the rest must fit."""
+        """A record that is too large drops old messages first, then the description; the rest must fit."""
         device = Device(DEVICE.uuid, "dog", description="d" * 600)
         for n in range(5):
             device = device.with_message(float(n), f"{n}" * 70)
@@ -170,14 +170,14 @@ class PresenceTests(SynchronousTestCase):
         self.calls.append((delay, work))
 
     def test_silent_before_it_appears(self) -> None:
-        """Changes before the appearance are not announced, and are in the first announcement."""
+        """Changes before the first announcement are not announced, and are part of it."""
         self.presence.change(status=IDLE)
         self.assertEqual((self.told, self.calls), ([], []))
         self.presence.appear(7)
         self.assertEqual([(d.joined, d.status) for d in self.told if d], [(7, IDLE)])
 
     def test_changes_are_gathered(self) -> None:
-        """Many changes in a moment are one announcement, of the last of them; no change is none."""
+        """Several changes within ``PAUSE`` are announced once; a change without effect is not announced."""
         self.presence.appear(7)
         self.presence.change(status=IDLE)
         self.presence.change(task="t2")

@@ -1,4 +1,4 @@
-"""Tests of ``middleware.faults.injector.LowBattery``: a robot whose battery reads low on purpose."""
+"""Tests of ``middleware.faults.injector.LowBattery``: fault injection of a low battery reading."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from middleware.faults.injector import LowBattery
 
 
 class _Robot(SimDriver):
-    """A robot that is at once seen as the test says."""
+    """A robot with an observation that the test sets."""
 
     def __init__(self) -> None:
         super().__init__({"robot": "dog1"}, MemoryConnector(HeapClock(), lambda *_: None), HeapClock())  # type: ignore
@@ -35,7 +35,7 @@ class _Robot(SimDriver):
 
 class LowBatteryTests(SynchronousTestCase):
     def test_only_the_battery_reads_low(self) -> None:
-        """A drained robot tells of less charge, where it tells of any, and of all else as before; later of its own."""
+        """The fault lowers the battery level, if the robot reports one, and changes no other value."""
         robot = _Robot()
         driver = LowBattery(robot)
         seen: list[Any] = []
@@ -52,7 +52,7 @@ class LowBatteryTests(SynchronousTestCase):
         self.assertIs(driver.observe(), robot.shown)
 
     def test_all_else_is_the_robot(self) -> None:
-        """What it is, its state, its token and its motion are those of the robot."""
+        """Description, state, token and actions are passed through to the robot."""
         robot = _Robot()
         driver = LowBattery(robot)
         self.assertIs(driver.description, robot.description)

@@ -1,4 +1,4 @@
-"""Tests of ``middleware.faults.kinds`` and ``middleware.faults.takeover``: lawful faults, and the clock beside them."""
+"""Tests of ``middleware.faults.kinds`` and ``middleware.faults.takeover``: valid faults and takeover times."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from middleware.faults.takeover import WATCHED_S, Takeover, acting
 
 class FaultTests(SynchronousTestCase):
     def test_usual(self) -> None:
-        """Of each kind there is a usual fault, and its own amount is lawful."""
+        """Each kind has a default fault, and its default amount is valid."""
         for kind, rule in KINDS.items():
             self.assertEqual(parse_fault(kind), Fault(kind, 15.0, rule.amount))
         self.assertEqual(parse_fault("loss", 3, 0.5), Fault("loss", 3.0, 0.5))
         self.assertEqual(parse_fault("kill", None, 0), Fault("kill"))
 
     def test_begins(self) -> None:
-        """A device says when its fault begins; an answer that no node gives counts for at once."""
+        """A device answers with the start of its fault; an invalid answer counts as at once."""
         self.assertEqual(begins_in(0.5), 0.5)
         for answer in (None, "soon", True, -1.0, 3600.0, math.nan, math.inf, [0.5]):
             self.assertEqual(begins_in(answer), 0.0)
 
     def test_unlawful(self) -> None:
-        """What is no fault is refused by the name of the field, whatever comes over the wire."""
+        """An invalid fault is refused with the name of the field, for any input from the network."""
         wrong: list[tuple[tuple[Any, ...], str]] = [
             (("fly",), "kind"),
             ((None,), "kind"),
@@ -49,7 +49,7 @@ class FaultTests(SynchronousTestCase):
 
 class TakeoverTests(SynchronousTestCase):
     def test_time_the_first_other(self) -> None:
-        """The clock stops at the first other device that acts on the same task, and not again."""
+        """The timer stops at the first other device that acts on the same task, and does not change afterwards."""
         clock = Takeover("a", "t1", 10.0, 14.0)
         clock.look({"a": "t1", "b": "t2"}, 10.5)
         self.assertIsNone(clock.seconds)
@@ -58,7 +58,7 @@ class TakeoverTests(SynchronousTestCase):
         self.assertEqual((clock.seconds, clock.to), (1.5, "b"))
 
     def test_end(self) -> None:
-        """It does not run where nothing was acted upon, and no longer than a while after the fault."""
+        """The timer does not start without a task, and ends a limited time after the fault."""
         self.assertFalse(Takeover("a", "", 10.0, 14.0).is_open(10.1))
         clock = Takeover("a", "t1", 10.0, 14.0)
         self.assertTrue(clock.is_open(14.0))
@@ -66,6 +66,6 @@ class TakeoverTests(SynchronousTestCase):
         self.assertIsNone(clock.seconds)
 
     def test_acting(self) -> None:
-        """Who executes a task acts; who searches for it does not."""
+        """A device acts if it executes a task, not if it searches."""
         devices = [Device("a", "dog1", task="t", status=EXECUTING), Device("b", "dog2", task="t", status=SEARCHING)]
         self.assertEqual(acting(devices), {"a": "t"})

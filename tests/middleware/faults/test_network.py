@@ -1,4 +1,4 @@
-"""Tests of ``middleware.faults.network``: one node's network that fails on purpose."""
+"""Tests of ``middleware.faults.network``: fault injection into one node's network."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class FaultyNetworkTests(SynchronousTestCase):
         self.other.listen(lambda datagram, source: self.answers.append(datagram))
 
     def exchange(self, seconds: float = 0.01, times: int = 1) -> tuple[int, int]:
-        """How many datagrams came in and went out, of as many sent each way."""
+        """Return the numbers of datagrams received and sent, of ``times`` in each direction."""
         before = len(self.came), len(self.answers)
         for _ in range(times):
             self.other.send(b"in", self.network.address)
@@ -32,12 +32,12 @@ class FaultyNetworkTests(SynchronousTestCase):
         return len(self.came) - before[0], len(self.answers) - before[1]
 
     def test_changes_nothing_as_made(self) -> None:
-        """Without a fault everything passes both ways, at once, at the address of the network below."""
+        """Without a fault all datagrams pass both ways, at once, at the address of the network below."""
         self.assertEqual(self.network.address.host, "127.0.0.1")
         self.assertEqual(self.exchange(0.0, 20), (20, 20))
 
     def test_deaf_and_mute(self) -> None:
-        """A deaf node sends and hears nothing, a mute one hears and sends nothing, one that is both is cut off."""
+        """A deaf node only sends, a mute node only receives, and a node that is both is disconnected."""
         for deaf, mute, passes in ((True, False, (0, 1)), (False, True, (1, 0)), (True, True, (0, 0))):
             self.network.is_deaf, self.network.is_mute = deaf, mute
             self.assertEqual(self.exchange(), passes)
@@ -45,19 +45,19 @@ class FaultyNetworkTests(SynchronousTestCase):
         self.assertEqual(self.exchange(), (1, 1))
 
     def test_loss(self) -> None:
-        """Of a lossy node's datagrams the said share is lost, each way; the rest comes at once."""
+        """A lossy node loses the configured share of datagrams in each direction; the rest arrives at once."""
         self.network.weather = Weather(loss=0.2)
         came, went = self.exchange(times=1000)
         self.assertTrue(750 < came < 850 and 750 < went < 850, (came, went))
 
     def test_duplicates_and_jitter(self) -> None:
-        """Doubled datagrams come twice, jitter keeps within its bounds, reordered ones come last."""
+        """Duplicated datagrams arrive twice, jitter stays within its bounds, and reordered datagrams arrive last."""
         self.network.weather = Weather(delay_s=0.1, jitter_s=0.05, duplicate=1.0, reorder=1.0)
         self.assertEqual(self.exchange(0.14), (0, 0))
         self.assertEqual(self.exchange(0.12)[0], 2)
 
     def test_delay(self) -> None:
-        """What is delayed comes late by that much, and what is on its way when the port closes never comes."""
+        """A delayed datagram arrives late by the delay; a datagram in flight when the port closes is lost."""
         self.network.weather = Weather(delay_s=0.3)
         self.assertEqual(self.exchange(0.29), (0, 0))
         self.clock.advance(0.02)
@@ -69,7 +69,7 @@ class FaultyNetworkTests(SynchronousTestCase):
         self.assertEqual((len(self.came), len(self.answers)), (1, 1))
 
     def test_cut_catches_what_is_on_its_way(self) -> None:
-        """A node that is cut off while something is on its way does not get it, nor does it go out."""
+        """A node that is disconnected while datagrams are in flight neither receives nor sends them."""
         self.network.weather = Weather(delay_s=0.3)
         self.exchange(0.1)
         self.network.is_deaf = self.network.is_mute = True

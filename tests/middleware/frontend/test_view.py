@@ -1,4 +1,4 @@
-"""``TeamView`` over records that a test wrote."""
+"""Tests of ``TeamView`` over records that a test wrote."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ class TeamViewTests(SynchronousTestCase):
         self.write(TASKS, "new", NEW.packed())
 
     def write(self, key: bytes, name: str, value: bytes) -> None:
-        """Write a record under ``key`` beside those that stand there."""
+        """Add a record under ``key``."""
         self.records.setdefault(key, []).append(record_of(key, name, value))
 
     def test_newest_task_first(self) -> None:
-        """Tasks stand in the order of their creation, the newest first."""
+        """Tasks are sorted by their creation time, the newest first."""
         self.assertEqual([task.task_id for task in self.view.tasks], ["new", "old"])
 
     def test_task_with_a_result_is_not_open(self) -> None:
-        """A result closes a task, and progress has it as the outcome."""
+        """A task with a result is closed, and its progress contains the outcome."""
         self.write(group_key("new"), RESULT, Result(CANCELLED, "vaio").packed())
         self.assertEqual([task.task_id for task in self.view.open_tasks], ["old"])
         outcome = self.view.progress(NEW).outcome
@@ -47,7 +47,7 @@ class TeamViewTests(SynchronousTestCase):
         self.assertEqual((outcome.outcome, outcome.by), (CANCELLED, "vaio"))
 
     def test_progress_has_the_agents_and_the_newest_order(self) -> None:
-        """A task is paused by the order to pause it until a newer order or its result."""
+        """A task is paused from the order to pause until a newer order or its result."""
         self.write(group_key("old"), MEMBER, Member(UUID, "dog1", "searching").packed())
         self.write(group_key("old"), ORDER, Order(PAUSE, "vaio", 1.0).packed())
         progress = self.view.progress(OLD)
@@ -63,7 +63,7 @@ class TeamViewTests(SynchronousTestCase):
         self.assertEqual(self.view.unable(NEW), {})
 
     def test_absent_device_has_the_beginning_of_its_uuid_as_name(self) -> None:
-        """A device that left has no record, and 8 characters of its uuid stand for its name."""
+        """A device that left has no record, and its name is the first 8 characters of its uuid."""
         self.assertEqual(self.view.name_of(UUID), "dog1")
         self.assertEqual(self.view.name_of("ab" * 32), "abababab")
         self.assertIsNone(self.view.record_of("ab" * 32))

@@ -1,4 +1,4 @@
-"""Some hundred random sequences of ``tests.invariants.stops``, and a look at whether they bite."""
+"""Tests with random sequences of ``tests.invariants.stops``, and a check that they find seeded bugs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ BITING = 40
 
 class SequenceTests(SynchronousTestCase):
     def test_stop_holds(self) -> None:
-        """Whatever happens, a robot that acknowledged a stop stands until a release names that very stop."""
+        """A robot that acknowledged a stop stays stopped until a release names that stop."""
         counts: Counter[str] = Counter()
         for seed in range(1, SEQUENCES + 1):
             run(seed, counts)
@@ -25,7 +25,7 @@ class SequenceTests(SynchronousTestCase):
             self.assertGreater(counts[name], SEQUENCES // 4, name)
 
     def found(self) -> bool:
-        """Whether a few sequences show a violation."""
+        """Return whether a few sequences show a violation."""
         for seed in range(1, BITING + 1):
             try:
                 run(seed, Counter())
@@ -34,7 +34,7 @@ class SequenceTests(SynchronousTestCase):
         return False
 
     def test_they_bite(self) -> None:
-        """A release that ends stops that it does not name, one that anybody may order, and lost notes are found."""
+        """The sequences find a release of unnamed stops, a release by any sender, and stops that are not stored."""
         merge = StopSet.merge
 
         def ends_all(self: StopSet, sender: bytes, order: Statement, may_release: bool = True) -> bool:

@@ -1,4 +1,4 @@
-"""Tests of tasks, reports, results and orders as records, and of who can do what."""
+"""Tests of tasks, reports, results and orders as records, and of the capabilities that tasks require."""
 
 from __future__ import annotations
 
@@ -44,13 +44,13 @@ DONE = Result(COMPLETED, "dog", 12.5, 3, (("dog", 1.5),))
 
 
 def record(name: str, value: object, owner: Identity = DOG) -> Record:
-    """A record with this value; anything but bytes is packed."""
+    """Return a record with this value; any value but bytes is packed."""
     packed = value if isinstance(value, bytes) or value is None else bytes(msgpack.packb(value))
     return Record(hashed_key("any"), name, owner.public, 1, "team", 1.0, packed, bytes(64))
 
 
 def changed(packed: bytes, **changes: object) -> dict[str, object]:
-    """What stands in a value, changed."""
+    """Return the content of a packed value with ``changes``."""
     return {**msgpack.unpackb(packed), **changes}
 
 
@@ -69,7 +69,7 @@ DEPTH = b"\x91" * 900
 
 class DecoderTests(SynchronousTestCase):
     def test_there_and_back(self) -> None:
-        """A task, a report and a result come out of their records as they went in."""
+        """Tasks, reports and results survive packing and unpacking."""
         self.assertEqual(task_of(record("t1", TASK.packed())), TASK)
         self.assertEqual(member_of(record(MEMBER, REPORT.packed())), REPORT)
         self.assertEqual(result_of(record(RESULT, DONE.packed())), DONE)
@@ -79,17 +79,17 @@ class DecoderTests(SynchronousTestCase):
         self.assertEqual(member_of(record(MEMBER, bare.packed())), bare)
 
     def test_in_another_slot(self) -> None:
-        """A task in the slot of another name, a report or a result elsewhere than in its slot, are none."""
+        """A task, report or result in a slot with another name is ignored."""
         self.assertIsNone(task_of(record("t2", TASK.packed())))
         self.assertIsNone(member_of(record(RESULT, REPORT.packed())))
         self.assertIsNone(result_of(record(MEMBER, DONE.packed())))
 
     def test_nobody_reports_for_another(self) -> None:
-        """A report in the name of another node is none."""
+        """A report in the name of another node is ignored."""
         self.assertIsNone(member_of(record(MEMBER, REPORT.packed(), CAT)))
 
     def test_crafted_tasks(self) -> None:
-        """A task with a wrong type, a wrong number or a member of the council that is none, is no task."""
+        """A task with a wrong type, an invalid number or an invalid council member is ignored."""
         bad: dict[str, list[object]] = {
             "task_id": [5, None],
             "kind": [5],
@@ -120,7 +120,7 @@ class DecoderTests(SynchronousTestCase):
             self.assertIsNone(task_of(record("t1", value)), value)
 
     def test_crafted_reports(self) -> None:
-        """A report with a wrong type is none; one whose cost is no distance has nothing to report."""
+        """A report with a wrong type is ignored; a report with an invalid cost has no cost."""
         bad: dict[str, list[object]] = {
             "name": [5],
             "status": [5],
@@ -155,13 +155,13 @@ class DecoderTests(SynchronousTestCase):
             self.assertIsNone(member_of(record(MEMBER, nothing)), nothing)
 
     def test_report_that_is_stale_when_it_comes(self) -> None:
-        """A report older than it is valid for has nothing to report; one that says nothing of that counts."""
+        """A report that is older than its validity has no cost; a report without a validity counts."""
         for age, valid_for, cost in ((2.0, 1.0, None), (1.0, 2.0, 1.5), (9.0, 0.0, 1.5)):
             report = member_of(record(MEMBER, changed(REPORT.packed(), age=age, valid_for=valid_for)))
             self.assertEqual(report and report.cost, cost, (age, valid_for))
 
     def test_usual_fields_take_no_room(self) -> None:
-        """What is as usual is left out of a record, and comes out as usual."""
+        """Default values are omitted from a record, and restored when it is read."""
         plain = Task("t1", "search", "Find it")
         self.assertEqual(
             sorted(msgpack.unpackb(plain.packed())), ["kind", "parameters", "requirements", "task_id", "title"]
@@ -171,7 +171,7 @@ class DecoderTests(SynchronousTestCase):
         self.assertEqual(task_of(record("t1", full.packed())), full)
 
     def test_crafted_results(self) -> None:
-        """A result with a wrong type, number or outcome is none."""
+        """A result with a wrong type, number or outcome is ignored."""
         bad: dict[str, list[object]] = {
             "outcome": ["WON", []],
             "by": [5],
@@ -189,7 +189,7 @@ class DecoderTests(SynchronousTestCase):
     @settings(max_examples=250)
     @given(st.binary(max_size=60) | st.dictionaries(st.sampled_from(NAMES), anything, max_size=4) | anything)
     def test_total(self, value: object) -> None:
-        """Whatever stands in a record, reading it gives something lawful or nothing, and never raises."""
+        """Any record gives a valid object or None, and never raises."""
         values = [value]
         if isinstance(value, dict) and all(isinstance(name, str) for name in value):
             values += [changed(one, **value) for one in (TASK.packed(), REPORT.packed(), DONE.packed())]
@@ -204,7 +204,7 @@ class DecoderTests(SynchronousTestCase):
 
 class OutcomeTests(SynchronousTestCase):
     def test_highest_token_holds(self) -> None:
-        """Of several results the one with the highest token holds, in any order; without any the task is open."""
+        """Of several results the one with the highest token wins, in any order; without any the task is open."""
         late = Result(FAILED, "cat", 1.0, 7)
         records = [record(RESULT, DONE.packed()), record(RESULT, late.packed(), CAT), record(MEMBER, REPORT.packed())]
         self.assertEqual(outcome_of(TASK, records), late)
@@ -219,7 +219,7 @@ class OutcomeTests(SynchronousTestCase):
 
 class RefusalTests(SynchronousTestCase):
     def test_reasons(self) -> None:
-        """A device can do what asks no more than it has; otherwise each thing that lacks is named."""
+        """A device can perform a task if it has all required capabilities; otherwise each missing one is named."""
         has: Capabilities = {"camera": {"width": 208, "colour": "rgb"}, "legs": {}}
         rows: list[tuple[Capabilities, list[str]]] = [
             ({}, []),
@@ -243,7 +243,7 @@ class RefusalTests(SynchronousTestCase):
 
 class OrderTests(SynchronousTestCase):
     def test_newest_holds(self) -> None:
-        """Of several orders the newest holds, in any order of the records; equal moments are decided, too."""
+        """Of several orders the newest wins, in any order of the records; ties are broken deterministically."""
         resumed = replace(PAUSED, word=RESUME, at=6.0)
         records = [record(ORDER, PAUSED.packed()), record(ORDER, resumed.packed())]
         self.assertEqual(order_of(records), resumed)
@@ -252,7 +252,7 @@ class OrderTests(SynchronousTestCase):
         self.assertEqual(order_of(tie), order_of(tie[::-1]))
 
     def test_nothing(self) -> None:
-        """Without an order, or with what is none, the task goes its way."""
+        """Without a valid order the task continues."""
         lawful = msgpack.unpackb(PAUSED.packed())
         crafted = [{}, {**lawful, "word": "FLY"}, {**lawful, "by": 5}, {**lawful, "at": float("nan")}, [1], b"\xc1"]
         for value in crafted:

@@ -1,4 +1,4 @@
-"""Auctions, agents and bids that the tests of this room share."""
+"""Provide auctions, agents and bids that the tests of bidding share."""
 
 from __future__ import annotations
 
@@ -23,25 +23,25 @@ BEST_EFFORT = Auction("job", 1, COUNCIL, exclusive=False)
 
 
 def bid(place: int, cost: float | None, revision: int = 0, auction: Auction = AUCTION) -> Bid:
-    """The signed bid of the agent at ``place``."""
+    """Return the signed bid of the agent at ``place``."""
     agent = AGENTS[place]
     report = None if cost is None else Report(agent.node_id.hex(), cost)
     return Bid(agent.public, report, revision).signed(agent, auction)
 
 
 def announced(number: int, rank: int, *bids: Bid, auction: Auction = AUCTION) -> Announcement:
-    """What the council member at ``rank`` announces."""
+    """Return an announcement, signed by the council member at ``rank``."""
     entries = tuple(Entry(b.report, b.revision) for b in bids if b.report is not None)
     return Announcement(number, rank, entries).signed(AGENTS[rank].sign, auction)
 
 
 def rule() -> Rule:
-    """The rule of the nearest."""
+    """Return the rule of the strategy ``Nearest``."""
     return Rule(Nearest())
 
 
 def party(place: int, auction: Auction = AUCTION, seed: int = 1, on_summary: OnSummary = lambda reports: None) -> Party:
-    """The part of the node at ``place``, which knows all others."""
+    """Return the party of the node at ``place``, which knows all other nodes."""
     others = [contact for contact in CONTACTS if contact is not CONTACTS[place]]
     dice = random.Random(f"{seed}/{place}")
     return Party(auction, CONTACTS[place], rule(), lambda: others, dice, AGENTS[place].sign, on_summary)

@@ -1,4 +1,4 @@
-"""Tests of bids between real nodes: sent, confirmed, believed and refused on their endpoints."""
+"""Tests of bidding between real nodes: bids are sent, confirmed, accepted and refused on their endpoints."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ WAITING = 0.5
 
 
 class AuctionCase(FleetCase):
-    """A fleet and one auction."""
+    """A team and one auction."""
 
     def prepared(self, n: int, seed: int = 1, weather: Weather | None = None, strategy: str = "nearest") -> SwarmFleet:
-        """A fleet whose first three nodes by distance are the council of one task."""
+        """Return a team in which the three nodes nearest to the task are its council."""
         fleet = self.swarm(n, seed) if weather is None else self.swarm(n, seed, weather)
         key = group_key("job")
         council = closest([node.entangled.contact for node in fleet.nodes], key, 3)
@@ -41,7 +41,7 @@ class AuctionCase(FleetCase):
         return fleet
 
     def auction(self, **others: Any) -> Auction:
-        """The auction of the task."""
+        """Return the auction of the task."""
         return Auction("job", 1, self.task.council, self.task.strategy, WAITING, **others)
 
     def enter(self, fleet: SwarmFleet, *costs: float) -> list[Bidding]:
@@ -55,19 +55,19 @@ class AuctionCase(FleetCase):
         return biddings
 
     def outsider(self, fleet: SwarmFleet) -> SwarmNode:
-        """A node that is not of the council."""
+        """Return a node that is not a member of the council."""
         council = {member.node_id for member in self.task.council}
         return next(node for node in fleet.nodes if node.entangled.identity.node_id not in council)
 
     def ask(self, fleet: SwarmFleet, sender: SwarmNode, to: SwarmNode, method: str, *arguments: object) -> object:
-        """What a peer gets for a question: the value, or the exception."""
+        """Return the result of a request, its value or its exception."""
         asked = sender.entangled.endpoint.ask(to.entangled.contact, method, *arguments, changes=True)
         asked.addErrback(lambda failure: failure.value)
         return self.done(fleet, asked)
 
 
 class DisseminationTests(AuctionCase):
-    """Behaviour of ``SwarmNode.bidding``."""
+    """Tests of ``SwarmNode.bidding``."""
 
     def test_all_agree(self) -> None:
         """After the waiting period every bidder has the same reports, the cheapest first."""
@@ -81,7 +81,7 @@ class DisseminationTests(AuctionCase):
             self.assertEqual(self.views[place][-1][0].agent, fleet.nodes[1].uuid)
 
     def tree(self) -> SwarmFleet:
-        """A fleet of twelve whose bids go along the tree."""
+        """Return a team of twelve that sends its bids along the tree."""
         fleet = self.prepared(12)
         for node in fleet.nodes:
             node.dissemination._scale.way = TREE
@@ -89,18 +89,18 @@ class DisseminationTests(AuctionCase):
         return fleet
 
     def assert_agreed(self, fleet: SwarmFleet) -> None:
-        """Let all twelve bid; they agree on the last one, which is the nearest."""
+        """Let all twelve nodes bid, and check that they agree on the last one, which is the nearest."""
         self.enter(fleet, *(float(12 - place) for place in range(12)))
         fleet.run(3.0)
         winners = {self.views[place][-1][0].agent for place in range(12)}
         self.assertEqual(winners, {fleet.nodes[11].uuid})
 
     def test_tree_of_real_nodes(self) -> None:
-        """Bids that go along the tree come to the same end."""
+        """Bids that are sent along the tree lead to agreement."""
         self.assert_agreed(self.tree())
 
     def test_more_than_one_carries(self) -> None:
-        """Of many that know one contact only, those for whom it has no room go on to the council, and all agree."""
+        """If many nodes know the same single contact, those beyond its limit send to the council, and all agree."""
         fleet = self.tree()
         council = {member.node_id for member in self.task.council}
         outside = [node for node in fleet.nodes if node.entangled.identity.node_id not in council]
@@ -120,7 +120,7 @@ class DisseminationTests(AuctionCase):
         self.assertEqual(sum("send their bids here" in text for text in refused), len(outside) - 1 - 2)
 
     def test_withdrawn_and_bid_anew(self) -> None:
-        """A bid taken back counts no more, a new one counts again, and an equal one sends nothing."""
+        """A withdrawn bid does not count, a new one does, and an equal bid sends nothing."""
         fleet = self.prepared(4)
         biddings = self.enter(fleet, 3.0, 1.0, 2.0)
         fleet.run(1.0)
@@ -136,7 +136,7 @@ class DisseminationTests(AuctionCase):
         self.assertEqual(len(self.views[0]), before)
 
     def test_restarted_bidder(self) -> None:
-        """A node that comes back bids anew, though its former life had bid more often."""
+        """A restarted node can bid, although it had sent more revisions before the restart."""
         fleet = self.prepared(4)
         biddings = self.enter(fleet, 3.0, 4.0, 5.0, 6.0)
         place = fleet.nodes.index(self.outsider(fleet))
@@ -155,7 +155,7 @@ class DisseminationTests(AuctionCase):
             self.assertEqual(costs[node.uuid], 9.0)
 
     def test_bad_bids_are_errors(self) -> None:
-        """A bid that is no cost, or for somebody else, flies at the caller."""
+        """A bid with an invalid cost or for another agent raises ``ValueError``."""
         fleet = self.prepared(3)
         [bidding] = self.enter(fleet, 3.0)
         for cost in (math.nan, math.inf, -1.0):
@@ -165,7 +165,7 @@ class DisseminationTests(AuctionCase):
             bidding.report(Report(fleet.nodes[1].uuid, 1.0))
 
     def test_listener_that_raises(self) -> None:
-        """What somebody does with an announcement harms nobody else."""
+        """A callback that raises does not affect other bidders."""
         fleet = self.prepared(4)
         self.enter(fleet, 3.0, 1.0, 2.0)
         fleet.nodes[0].bidding(self.task, 1, lambda reports: 1 // 0)  # type: ignore[arg-type]
@@ -175,10 +175,10 @@ class DisseminationTests(AuctionCase):
 
 
 class HostileTests(AuctionCase):
-    """What a member of the team that lies can and cannot do."""
+    """Tests with a dishonest member of the team."""
 
     def test_announcement_of_a_stranger(self) -> None:
-        """What a node outside of the council announces is refused by name, and nobody's view changes."""
+        """An announcement of a node outside of the council is refused with a reason, and changes no view."""
         fleet = self.prepared(5)
         self.enter(fleet, 3.0, 1.0, 2.0, 4.0, 5.0)
         liar = self.outsider(fleet)
@@ -195,7 +195,7 @@ class HostileTests(AuctionCase):
             self.assertEqual(self.views[place][-1][0].agent, fleet.nodes[1].uuid)
 
     def test_announcement_in_return_for_a_bid(self) -> None:
-        """An announcement that comes in an answer is checked as any other."""
+        """An announcement in the answer to a bid is checked like any other."""
         fleet = self.prepared(4)
         self.enter(fleet, 3.0, 1.0)
         node, liar = fleet.nodes[0], self.outsider(fleet)
@@ -206,7 +206,7 @@ class HostileTests(AuctionCase):
             node.dissemination._process_announcement(party, forged.packed())
 
     def test_bids_for_others(self) -> None:
-        """A bid that its agent did not sign, for this very auction, is refused whole."""
+        """An offer with a bid that its agent did not sign for this auction is refused completely."""
         fleet = self.prepared(4)
         liar, victim = fleet.nodes[3], fleet.nodes[0]
         auction, other = self.auction(), Auction("job", 2, self.task.council, "nearest", WAITING)
@@ -220,7 +220,7 @@ class HostileTests(AuctionCase):
             self.assertIsInstance(answer, Refused)
 
     def test_bids_of_those_who_may_not(self) -> None:
-        """A bid of a member whose role lets it take no part does not count; where that was all, its carrier is told."""
+        """A bid of an agent without the right to bid is ignored; an offer of such bids alone is refused."""
         fleet = self.prepared(4)
         viewer, victim, good = fleet.nodes[3], fleet.nodes[0], fleet.nodes[1]
         public, auction = viewer.entangled.identity.public, self.auction()
@@ -241,7 +241,7 @@ class HostileTests(AuctionCase):
         self.assertIsNotNone(party.summary.of(good.uuid))
 
     def test_nonsense(self) -> None:
-        """Nonsense is refused in one line that says what is wanted; nobody stumbles."""
+        """Invalid arguments are refused in one line with the reason, and change nothing."""
         fleet = self.prepared(3)
         liar, victim = fleet.nodes[0], fleet.nodes[1]
         own, auction = liar.entangled.identity, self.auction()
@@ -264,7 +264,7 @@ class HostileTests(AuctionCase):
         self.assertEqual(len(list(victim.dissemination._parties)), 0)
 
     def test_invented_auctions(self) -> None:
-        """A peer that invents auctions fills a table that has an end, and leaves no timer behind."""
+        """A peer that invents auctions fills a limited table, and leaves no timer behind."""
         fleet = self.prepared(3)
         liar, victim = fleet.nodes[0], fleet.nodes[1]
         [bidding] = self.enter(fleet, 3.0)
@@ -282,14 +282,14 @@ class HostileTests(AuctionCase):
         self.assertEqual(self.views[1][-1][0].agent, victim.uuid)
 
     def test_unknown_strategy(self) -> None:
-        """A node that has not the task's strategy carries its bids all the same."""
+        """A node without the task's strategy still transports its bids."""
         fleet = self.prepared(4, strategy="nobody-has-this")
         self.enter(fleet, 3.0, 1.0, 2.0)
         fleet.run(2.0)
         self.assertEqual(self.views[0][-1][0].agent, fleet.nodes[1].uuid)
 
     def test_vanished_council(self) -> None:
-        """A best-effort task is decided among those that are left; a stopped node leaves nothing on the clock."""
+        """A best-effort task is decided without its council; a stopped node leaves no timer behind."""
         fleet = self.prepared(8)
         members = {member.node_id for member in self.task.council}
         for node in fleet.nodes:

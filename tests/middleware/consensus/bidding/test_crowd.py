@@ -1,4 +1,4 @@
-"""Tests of whole crowds on light links: messages, agreement, and what happens when links and nodes fail."""
+"""Tests of large teams on simulated links: messages, agreement, and failures of links and nodes."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ AFTER = 4.0
 
 
 def outcome(crowd: Crowd, until: float = AFTER) -> Outcome:
-    """What a crowd has come to."""
+    """Run a crowd and return its outcome."""
     crowd.run(until)
     return crowd.outcome()
 
 
 class SmallTests(SynchronousTestCase):
     def test_three_agents(self) -> None:
-        """Three agents agree with at most ten messages each, a tenth of the datagrams lost."""
+        """Three agents agree with at most ten messages each at 10 % datagram loss."""
         runs = [outcome(Crowd(3, seed, Weather(0.1))) for seed in range(40)]
         self.assertEqual(min(run.right for run in runs), 1.0)
         self.assertLessEqual(sum(run.messages for run in runs) / len(runs), 10.0)
 
     def test_every_second_datagram_comes_twice(self) -> None:
-        """Copies change nothing: one announcement, and everybody has it."""
+        """Duplicated datagrams change nothing: there is one announcement, and every agent receives it."""
         crowd = Crowd(30, 2, Weather(twice=0.5))
         self.assertEqual(outcome(crowd).right, 1.0)
         self.assertEqual({p.announcement and p.announcement.number for p in crowd.parties}, {1})
 
     def test_first_member_is_dead(self) -> None:
-        """The next member of the council stands in."""
+        """If the first member of the council is dead, the next member announces."""
         for seed in range(3):
             crowd = Crowd(12, seed, Weather(0.1), way=DIRECT)
             crowd.dead.add(crowd._places[crowd.auction.council[0].node_id])
@@ -44,7 +44,7 @@ class SmallTests(SynchronousTestCase):
 
 class LargeTests(SynchronousTestCase):
     def test_hundred_agents(self) -> None:
-        """A hundred agents agree along the tree within 0.6 s, with at most six messages each, a tenth lost."""
+        """A hundred agents agree along the tree within 0.6 s, with at most six messages each, at 10 % loss."""
         runs = [outcome(Crowd(100, seed, Weather(0.1))) for seed in range(5)]
         took = [t for run in runs for t in run.took]
         self.assertEqual(min(run.right for run in runs), 1.0)
@@ -52,7 +52,7 @@ class LargeTests(SynchronousTestCase):
         self.assertLessEqual(percentile(took, 0.95), 0.6)
 
     def test_thousand_agents(self) -> None:
-        """A thousand agree within 0.8 s, with at most six messages each, none handles more than the limit."""
+        """A thousand agents agree within 0.8 s, with at most six messages each; no node exceeds its limit."""
         run = outcome(Crowd(1_000, 3, Weather(0.1)))
         self.assertEqual(run.right, 1.0)
         self.assertLessEqual(run.messages, 6.0)
@@ -60,7 +60,7 @@ class LargeTests(SynchronousTestCase):
         self.assertLessEqual(percentile(run.took, 0.95), 0.8)
 
     def test_branch_dies_with_what_it_holds(self) -> None:
-        """A node that dies with its branch's bids in hand loses none for good: each bidder looks after its own."""
+        """A relay that dies with unsent bids loses none of them for good: each bidder repeats its own bid."""
         for seed in range(3):
             crowd = Crowd(100, seed, Weather(), spread=0.02)
             winner = crowd.costs.index(min(crowd.costs))
@@ -69,7 +69,7 @@ class LargeTests(SynchronousTestCase):
             def killing(place: int, errand, crowd=crowd, winner=winner, carry=carry) -> None:  # type: ignore[no-untyped-def]
                 carry(place, errand)
                 if place == winner and not crowd.dead:
-                    # Whoever has the winning bid first confirms it and then dies with it.
+                    # The first relay of the winning bid confirms it and then dies.
                     to = crowd._places[errand.to.node_id]
                     if crowd.auction.rank(errand.to.node_id) is None:
                         crowd.at(crowd.now + 0.1, crowd.dead.add, to)
@@ -80,7 +80,7 @@ class LargeTests(SynchronousTestCase):
             self.assertEqual(crowd.outcome().right, 1.0)
 
     def test_announcement_is_lost_for_a_branch(self) -> None:
-        """Bidders that are told nothing ask the council themselves."""
+        """Bidders that receive no announcement query the council."""
         crowd = Crowd(100, 4, Weather())
         crowd.run(0.45)
         relays = [i for i, p in enumerate(crowd.parties) if len(p.audience) and p._rank is None]
@@ -89,7 +89,7 @@ class LargeTests(SynchronousTestCase):
         self.assertEqual(outcome(crowd, 8.0).right, 1.0)
 
     def test_replayed(self) -> None:
-        """A seed gives the same run, another seed another."""
+        """The same seed gives the same run, another seed another run."""
         first, same, other = (outcome(Crowd(60, seed, Weather(0.1, 0.02))).digest for seed in (5, 5, 6))
         self.assertEqual(first, same)
         self.assertNotEqual(first, other)
@@ -104,7 +104,7 @@ class CutOffTests(SynchronousTestCase):
 
 class CommandTests(SynchronousTestCase):
     def test_command(self) -> None:
-        """The command prints a table and ends well where the targets are reached."""
+        """The command prints a table and returns 0 if the targets are reached."""
         with contextlib.redirect_stdout(io.StringIO()) as printed:
             self.assertEqual(main(["--n", "3", "--loss", "0", "--dead", "0", "--runs", "1"]), 0)
         self.assertEqual(len(printed.getvalue().splitlines()), 2)

@@ -1,4 +1,4 @@
-"""Tests of ``middleware.consensus.bidding.panel``: who of a large group writes a record, and when."""
+"""Tests of ``middleware.consensus.bidding.panel``: the reporters of a large group, and the times of their records."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ class PanelTests(SynchronousTestCase):
         self.turn = LISTENING + 0.5 * MANY * SPACING
 
     def full(self) -> None:
-        """There are records enough."""
+        """Let enough records exist."""
         self.panel.heard(OTHERS, MANY, 0.1)
 
     def test_all_write_in_a_small_team(self) -> None:
-        """Up to the border each report is written at once, and each participant counts."""
+        """Up to ``MOST_OPEN`` participants, each report is written at once, and each participant counts."""
         self.panel.heard(OTHERS, MOST_OPEN, 0.0)
         self.assertEqual((self.panel.is_partial(0.0), self.panel.counts(0.0)), (False, True))
         self.assertEqual(self.panel.due(ME, 0.0), 0.0)
@@ -45,7 +45,7 @@ class PanelTests(SynchronousTestCase):
         self.assertEqual(self.panel.due(replace(ME, why="waits"), 0.1), 0.1)
 
     def test_turn_comes_while_there_are_few(self) -> None:
-        """One device more, and who has nothing to decide writes when its turn comes, unless enough have written."""
+        """Above that limit, an agent without a decision writes at its turn, unless enough others have written."""
         self.panel.heard(OTHERS, MOST_OPEN + 1, 0.0)
         self.assertEqual((self.panel.is_partial(0.0), self.panel.due(ME, 0.0)), (True, math.inf))
         panel = Panel("me", 0.5)
@@ -56,36 +56,36 @@ class PanelTests(SynchronousTestCase):
         self.assertFalse(panel.counts(50.0))
 
     def test_gone_ones_are_replaced(self) -> None:
-        """When records vanish the turns begin anew."""
+        """When records disappear, the turns start again."""
         self.full()
         self.panel.heard(sorted(OTHERS)[1:], MANY, 10.0)
         self.assertAlmostEqual(self.panel.due(ME, 10.0), 10.0 + self.turn)
 
     def test_small_group_of_a_large_team(self) -> None:
-        """Where all turns are over and there are few, they are all: then each writes at once."""
+        """If few records exist after all turns, the group is small and each agent writes at once."""
         over = LISTENING + MANY * SPACING + SETTLING
         self.assertEqual([self.panel.is_partial(over - 0.01), self.panel.is_partial(over)], [True, False])
         self.assertEqual(self.panel.due(ME, over), over)
 
     def test_who_is_announced_writes(self) -> None:
-        """Whom the council announces writes at once, though there are records enough."""
+        """An agent that the council announces writes at once, even if enough records exist."""
         self.full()
         self.panel.announced(["a", "me"], 5.0)
         self.assertEqual((self.panel.due(ME, 5.0), self.panel.counts(5.0), self.panel.has_word), (5.0, True, True))
 
     def test_who_acts_writes(self) -> None:
-        """Who acts, holds a token, or thinks that it is to act writes at once."""
+        """An agent that acts, holds a token or is assigned writes at once."""
         self.full()
         for told in (replace(ME, status=EXECUTING), replace(ME, token=3), replace(ME, assigned="me")):
             self.assertEqual(self.panel.due(told, 5.0), 5.0)
 
     def test_record_of_a_former_life_is_replaced(self) -> None:
-        """Where a record of this participant stands that it did not write, it says what holds now."""
+        """A record of this agent from before a restart is replaced with the current state."""
         self.panel.heard({*OTHERS, "me"}, MANY, 1.0)
         self.assertEqual((self.panel.due(ME, 1.0), self.panel.is_written), (1.0, True))
 
     def test_few_changes_are_written(self) -> None:
-        """What it does is told at once, whom it names after a pause, and anything else by who is needed only."""
+        """A change of action is written at once, of the assigned agent after a pause, others only if needed."""
         self.full()
         self.panel.wrote(ME, 1.0)
         self.assertEqual(self.panel.due(ME, 9.0), math.inf)
@@ -98,7 +98,7 @@ class PanelTests(SynchronousTestCase):
         self.assertEqual(self.panel.due(replace(ME, why="waits"), 1.2), 1.0 + PAUSE)
 
     def test_announced_ones_are_believed_for_a_while(self) -> None:
-        """Who was announced counts as present until its record should have come, however often it is announced."""
+        """An announced agent counts as present until its record is due, even if it is announced repeatedly."""
         self.panel.announced(["a"], 1.0)
         self.panel.announced(["a", "b"], 1.9)
         late = 1.0 + BELIEVED
@@ -106,7 +106,7 @@ class PanelTests(SynchronousTestCase):
         self.assertEqual([self.panel.believes("b", late), self.panel.believes("c", late)], [True, False])
 
     def test_places_are_spread(self) -> None:
-        """The farthest from the key comes first, the nearest last."""
+        """The agent farthest from the key has the first turn, the nearest the last."""
         key = bytes(20)
         self.assertEqual(panel_of("00" * 20, key).place, 1.0)
         self.assertAlmostEqual(panel_of("ff" * 20, key).place, 0.0)

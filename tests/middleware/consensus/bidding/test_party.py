@@ -1,4 +1,4 @@
-"""Tests of the parts of a party: bidder, branch, member of the council, and the flood without one."""
+"""Tests of the parts of a party: bidder, relay, council member, and the flooding of bids without a council."""
 
 from __future__ import annotations
 
@@ -31,18 +31,18 @@ from tests.middleware.consensus.bidding.ground import (
 
 
 def offers(errands: list[Errand]) -> list[Offer]:
-    """The offers among errands."""
+    """Return the offers among ``errands``."""
     return [errand for errand in errands if isinstance(errand, Offer)]
 
 
 def notices(errands: list[Errand]) -> list[Notice]:
-    """The notices among errands."""
+    """Return the notices among ``errands``."""
     return [errand for errand in errands if isinstance(errand, Notice)]
 
 
 class RouteTests(SynchronousTestCase):
     def test_each_hop_is_nearer(self) -> None:
-        """Whom a node sends to is nearer to the key than itself, the nearest first, and then comes the council."""
+        """Next hops are nearer to the key than the node, the nearest first, followed by the council."""
         own = CONTACTS[5].node_id
         found = hops(AUCTION, own, CONTACTS)
         ahead = [c for c in found if c not in COUNCIL]
@@ -52,12 +52,12 @@ class RouteTests(SynchronousTestCase):
         self.assertEqual([c for c in found if c in COUNCIL][-1], found[-1])
 
     def test_nobody_nearer(self) -> None:
-        """A node that knows nobody nearer sends to the council itself, and never to itself."""
+        """A node without a nearer contact sends to the council, and never to itself."""
         self.assertEqual(hops(AUCTION, CONTACTS[5].node_id, []), list(COUNCIL))
         self.assertEqual(hops(AUCTION, COUNCIL[0].node_id, []), list(COUNCIL[1:]))
 
     def test_council_is_the_goal(self) -> None:
-        """Where the nearest contact is of the council it is the next hop, and the other members follow."""
+        """If the nearest contact is a council member, it is the next hop, followed by the other members."""
         key = AUCTION.key
         member = min(CONTACTS, key=lambda c: distance(c.node_id, key))
         auction = Auction(AUCTION.task_id, 1, (CONTACTS[11], member))
@@ -67,14 +67,14 @@ class RouteTests(SynchronousTestCase):
 
 class ScaleTests(SynchronousTestCase):
     def test_goes_over_once(self) -> None:
-        """A team at the border does not go back and forth between the ways."""
+        """The choice between direct bids and the tree has a hysteresis."""
         scale = Scale()
         ways = [scale.counted(n) for n in (1, MOST_DIRECT, MOST_DIRECT + 1, MOST_DIRECT, LEAST_TREE, LEAST_TREE - 1)]
         self.assertEqual(ways, [DIRECT, DIRECT, TREE, TREE, TREE, DIRECT])
         self.assertEqual(scale.counted(MOST_DIRECT), DIRECT)
 
     def test_team_size(self) -> None:
-        """A small team is counted, a large one estimated by how dense the nearest nodes lie."""
+        """A small team is counted; the size of a large team is estimated from the density of the nearest nodes."""
         own = CONTACTS[0].node_id
         self.assertEqual(team_size(own, [], False), 1)
         self.assertEqual(team_size(own, CONTACTS[1:], False), len(CONTACTS))
@@ -83,14 +83,14 @@ class ScaleTests(SynchronousTestCase):
         near = sorted(many, key=lambda c: distance(c.node_id, own))
         known = near[:40] + rng.sample(near[40:], 40)
         self.assertTrue(1_500 < team_size(own, known, False) < 12_000)
-        newcomer = near[:NEAR] + rng.sample(near[NEAR:], NEAR)  # knows few yet, but that there are many
+        newcomer = near[:NEAR] + rng.sample(near[NEAR:], NEAR)  # knows few contacts yet, but that there are many
         self.assertTrue(1_500 < team_size(own, newcomer, True) < 12_000)
         self.assertEqual(team_size(own, newcomer[: NEAR - 1], True), NEAR)
 
 
 class AudienceTests(SynchronousTestCase):
     def test_told_once(self) -> None:
-        """A listener is told each announcement once, again after losses with longer and longer pauses, not for ever."""
+        """A listener receives each announcement once; after losses it is repeated with increasing pauses."""
         audience = Audience()
         audience.add(CONTACTS[5])
         one = announced(1, 0)
@@ -112,14 +112,14 @@ class AudienceTests(SynchronousTestCase):
         self.assertEqual(len(audience.notices(announced(2, 0), True, now)), 1)
 
     def test_shared_listeners(self) -> None:
-        """Who told the whole council hears an announcement from the member who made it only."""
+        """A bidder that sent to the whole council receives an announcement only from the member that made it."""
         audience = Audience()
         audience.add(CONTACTS[5], is_shared=True)
         self.assertEqual(audience.notices(announced(1, 1), False, 0.0), [])
         self.assertEqual(len(audience.notices(announced(1, 1), True, 0.0)), 1)
 
     def test_room(self) -> None:
-        """The one that came first goes when there is no more room."""
+        """The oldest listener is removed if there are too many."""
         audience = Audience()
         for number in range(MAX_LISTENERS + 1):
             audience.add(Contact(number.to_bytes(32), Address("10.0.0.1", 1)))
@@ -132,7 +132,7 @@ class BidderTests(SynchronousTestCase):
         self.party = party(5, on_summary=lambda reports: self.told.append([r.cost for r in reports]))
 
     def test_direct(self) -> None:
-        """In a small team a bid goes to each member of the council, again where it was not confirmed."""
+        """In a small team a bid is sent to each member of the council, and repeated if it is not confirmed."""
         self.party.bid(bid(5, 2.0), DIRECT, 0.0)
         sent = offers(self.party.errands(0.0))
         self.assertEqual([offer.to for offer in sent], list(COUNCIL))
@@ -144,7 +144,7 @@ class BidderTests(SynchronousTestCase):
         self.assertEqual([offer.to for offer in again], [COUNCIL[2]])
 
     def test_new_bid_while_the_old_one_is_under_way(self) -> None:
-        """What is confirmed is the bid that was sent, not the one made meanwhile."""
+        """A confirmation applies to the bid that was sent, not to a newer one."""
         self.party.bid(bid(5, 2.0), DIRECT, 0.0)
         sent = offers(self.party.errands(0.0))
         self.party.bid(bid(5, 1.0, 1), DIRECT, 0.01)
@@ -154,7 +154,7 @@ class BidderTests(SynchronousTestCase):
         self.assertEqual([offer.bids[0].revision for offer in newer], [1, 1, 1])
 
     def test_own_bid_beats_what_is_announced(self) -> None:
-        """A bidder whose bid should have won sends it straight to the council within half the waiting period."""
+        """A bidder with a better bid than the announced one sends it directly within half a waiting period."""
         self.party.bid(bid(5, 2.0), TREE, 0.0)
         self.party.announced(announced(1, 0, bid(6, 3.0)), 0.6)
         due = self.party.due
@@ -164,13 +164,13 @@ class BidderTests(SynchronousTestCase):
         self.assertEqual((straight.to, straight.bids), (COUNCIL[0], (bid(5, 2.0),)))
 
     def test_own_bid_that_does_not_matter(self) -> None:
-        """A bidder that would not have won leaves the council alone."""
+        """A bidder with a worse bid than the announced one does not contact the council."""
         self.party.bid(bid(5, 4.0), TREE, 0.0)
         self.party.announced(announced(1, 0, bid(6, 3.0)), 0.6)
         self.assertEqual([o for t in range(10) for o in offers(self.party.errands(float(t))) if o.is_straight], [])
 
     def test_silence(self) -> None:
-        """A bidder that is announced nothing asks the council, one member after the other."""
+        """A bidder that receives no announcement queries the council members in turn."""
         self.party.bid(bid(5, 2.0), TREE, 0.0)
         asked: list[Contact] = []
         now = 0.0
@@ -188,7 +188,7 @@ class BidderTests(SynchronousTestCase):
         self.assertTrue(now < 5.0)
 
     def test_taken_back_but_still_announced(self) -> None:
-        """A bidder that took its bid back insists while the council still names it."""
+        """A bidder sends its withdrawal again while the council still announces its bid."""
         self.party.bid(bid(5, 2.0), DIRECT, 0.0)
         for offer in offers(self.party.errands(0.0)):
             self.party.answered(offer, 0.0)
@@ -200,7 +200,7 @@ class BidderTests(SynchronousTestCase):
         self.assertEqual([offer.bids for offer in sent], [(bid(5, None, 1),)])
 
     def test_bid_of_a_former_life(self) -> None:
-        """A node that forgot how often it had bid learns it from the announcement."""
+        """A restarted bidder learns its last revision from the announcement."""
         self.party.bid(bid(5, 9.0), DIRECT, 0.0)
         self.party.announced(announced(1, 0, bid(5, 1.0, 7)), 0.6)
         self.assertTrue(self.party.is_outlived)
@@ -209,7 +209,7 @@ class BidderTests(SynchronousTestCase):
         self.assertGreater(self.party.next_revision, 8)
 
     def test_later_announcements(self) -> None:
-        """Only what has precedence is told, whatever the order, and nothing is told twice."""
+        """Only an announcement with precedence is reported, in any order of arrival, and none is reported twice."""
         for announcement in (announced(2, 0, bid(6, 1.0)), announced(1, 0, bid(7, 0.5)), announced(2, 1, bid(8, 0.2))):
             self.party.announced(announcement, 1.0)
         self.party.announced(announced(3, 1, bid(6, 1.0)), 1.0)
@@ -221,7 +221,7 @@ class BranchTests(SynchronousTestCase):
         self.party = party(5)
 
     def test_one_message_for_many(self) -> None:
-        """What comes from several children within the wait goes on in one offer, to one contact nearer to the key."""
+        """Bids from several children within the wait are sent in one offer to one contact nearer to the key."""
         for place in (6, 7, 8):
             self.party.offered([bid(place, float(place))], CONTACTS[place], 0.0, False, 0.0)
         [up] = offers(self.party.errands(self.party.due))
@@ -229,7 +229,7 @@ class BranchTests(SynchronousTestCase):
         self.assertEqual(up.to, hops(AUCTION, CONTACTS[5].node_id, CONTACTS)[0])
 
     def test_nearer_ones_wait_longer(self) -> None:
-        """The nearer a node is to the key the longer it waits for what is behind it, up to half the waiting period."""
+        """Nodes nearer to the key wait longer for their children, up to half the waiting period."""
         waits = []
         for contact in sorted(CONTACTS[3:], key=lambda c: shared_bits(c.node_id, AUCTION.key)):
             one = party(CONTACTS.index(contact))
@@ -240,7 +240,7 @@ class BranchTests(SynchronousTestCase):
         self.assertTrue(0.02 < waits[-1] <= AUCTION.waiting / 2)
 
     def test_next_nearest(self) -> None:
-        """Where the parent does not answer, everything goes to the next nearest contact, and at last to the council."""
+        """If the parent does not answer, bids are sent to the next nearest contact, and finally to the council."""
         self.party.offered([bid(6, 1.0)], CONTACTS[6], 0.0, False, 0.0)
         expected = hops(AUCTION, CONTACTS[5].node_id, [c for c in CONTACTS if c is not CONTACTS[5]])
         self.assertEqual(len(expected), 4 + len(COUNCIL))
@@ -252,7 +252,7 @@ class BranchTests(SynchronousTestCase):
         self.assertEqual(asked, expected)
 
     def test_confirmed_is_not_sent_again(self) -> None:
-        """Only what the parent does not have goes out; a copy from a child sends nothing."""
+        """Only bids that the parent lacks are sent; a duplicate from a child sends nothing."""
         self.party.offered([bid(6, 1.0)], CONTACTS[6], 0.0, False, 0.0)
         [up] = offers(self.party.errands(self.party.due))
         self.party.answered(up, 0.2)
@@ -262,7 +262,7 @@ class BranchTests(SynchronousTestCase):
         self.assertEqual([b.report and b.report.cost for b in more.bids], [0.5])
 
     def test_announcement_goes_down(self) -> None:
-        """Each child is told what is announced, and one that comes late gets it in return for its offer."""
+        """Each child receives the announcement, a late child in the answer to its offer."""
         for place in (6, 7):
             self.party.offered([bid(place, 1.0)], CONTACTS[place], 0.0, False, 0.0)
         word = announced(1, 0, bid(6, 1.0))
@@ -272,7 +272,7 @@ class BranchTests(SynchronousTestCase):
         self.assertEqual(notices(self.party.errands(0.7)), [])
 
     def test_relay_asks_for_those_behind(self) -> None:
-        """A node that only carries others' bids asks the council where nothing comes down, and gives up in the end."""
+        """A relay queries the council for its children if no announcement arrives, up to a limit."""
         self.party.offered([bid(6, 1.0)], CONTACTS[6], 0.0, False, 0.0)
         straight = 0
         for step in range(600):
@@ -282,7 +282,7 @@ class BranchTests(SynchronousTestCase):
         self.assertEqual(straight, MAX_RELAYED)
 
     def test_the_council_hears_everybody(self) -> None:
-        """A member of the council has room for whoever comes: there is nobody else to go to."""
+        """A council member accepts any number of children, because they have no other destination."""
         member = party(0)
         for number in range(MAX_CHILDREN + 1):
             member.offered([], Contact(number.to_bytes(32), Address("10.0.0.1", 1)), 0.0, False, 0.0)
@@ -296,11 +296,11 @@ class TellerTests(SynchronousTestCase):
     def take(
         self, member: Party, place: int, cost: float | None, now: float, revision: int = 0, shared: bool = True
     ) -> None:
-        """Let a member of the council take a bid."""
+        """Let a member of the council receive a bid."""
         member.offered([bid(place, cost, revision)], CONTACTS[place], 0.0, shared, now)
 
     def test_closes_after_the_waiting_period(self) -> None:
-        """The first member announces when the waiting period is over, counted from the first bid anywhere."""
+        """The first member announces at the end of the waiting period, counted from the first bid at any node."""
         self.first.offered([bid(5, 2.0)], CONTACTS[5], 0.2, True, 1.0)
         self.first.errands(1.29)
         self.assertIsNone(self.first.announcement)
@@ -311,14 +311,14 @@ class TellerTests(SynchronousTestCase):
         self.assertTrue(self.first.announcement.is_genuine(AUCTION))
 
     def test_closes_when_all_have_bid(self) -> None:
-        """Nobody waits where every expected agent has bid or abstained."""
+        """The waiting period ends early once every expected agent has bid or abstained."""
         self.first.expect(2)
         self.take(self.first, 5, 2.0, 0.0)
         self.take(self.first, 6, None, 0.1)
         self.assertEqual(len(notices(self.first.errands(0.1))), 4)
 
     def test_next_member_stands_in(self) -> None:
-        """Where the first member is silent the second announces, and it does not where the first was heard."""
+        """If the first member is silent the second announces; after an announcement of the first it does not."""
         self.take(self.second, 5, 2.0, 0.0)
         self.second.errands(0.6)
         self.assertIsNone(self.second.announcement)
@@ -333,7 +333,7 @@ class TellerTests(SynchronousTestCase):
         self.assertEqual(third.announcement, announced(1, 0, bid(5, 2.0)))
 
     def test_late_bid_that_matters(self) -> None:
-        """A late bid that changes who should act is announced anew; in a large team another one is not."""
+        """A late bid that changes the winner is announced; in a large team any other late bid is not."""
         for place in (5, 6, 7):
             self.take(self.first, place, float(place), 0.0, shared=False)
         self.first.errands(0.5)
@@ -347,7 +347,7 @@ class TellerTests(SynchronousTestCase):
         self.assertEqual(self.first.announcement.reports[0].cost, 1.0)
 
     def test_fellows_share(self) -> None:
-        """What a member alone was given goes to its fellows; what all were given does not."""
+        """A member forwards to other members the bids that only it received."""
         self.take(self.second, 5, 2.0, 0.0, shared=True)
         self.assertEqual(offers(self.second.errands(0.3)), [])
         self.take(self.second, 6, 1.0, 0.3, shared=False)
@@ -358,7 +358,7 @@ class TellerTests(SynchronousTestCase):
 
 class FloodTests(SynchronousTestCase):
     def cut_off(self, auction: Auction) -> list[Errand]:
-        """What a bidder sends that reaches nobody of the council."""
+        """Return the messages of a bidder that cannot reach the council."""
         one = party(5, auction)
         one.bid(bid(5, 2.0, auction=auction), DIRECT, 0.0)
         sent: list[Errand] = []
@@ -370,13 +370,13 @@ class FloodTests(SynchronousTestCase):
         return sent
 
     def test_only_best_effort(self) -> None:
-        """Bids are cried to eight neighbours where no council answers, those for an exclusive task never."""
+        """If no council member answers, bids are flooded to eight neighbours, except those for an exclusive task."""
         cries = [e for e in self.cut_off(BEST_EFFORT) if isinstance(e, Cry)]
         self.assertEqual(len({cry.to.node_id for cry in cries}), 8)
         self.assertEqual([e for e in self.cut_off(AUCTION) if isinstance(e, Cry)], [])
 
     def test_each_change_once(self) -> None:
-        """A neighbour passes on what is news to it, and tells it when the waiting period is over."""
+        """A node forwards flooded bids once, and reports them at the end of the waiting period."""
         told: list[list[float]] = []
         one = party(5, BEST_EFFORT, on_summary=lambda reports: told.append([r.cost for r in reports]))
         one.cried([bid(6, 1.0, auction=BEST_EFFORT)], CONTACTS[6], 0.0)
@@ -390,11 +390,11 @@ class FloodTests(SynchronousTestCase):
 
 class PartiesTests(SynchronousTestCase):
     def made(self, number: int) -> Party:
-        """A party in one of many auctions."""
+        """Return a party in one of many auctions."""
         return party(5, Auction(f"job {number}", 1, COUNCIL))
 
     def test_whoever_opens_most_makes_room(self) -> None:
-        """A peer that invents auctions drives out its own; those of this node stay."""
+        """A peer that invents auctions displaces its own parties; other peers' parties stay."""
         parties = Parties()
         own, honest = self.made(0), self.made(1)
         parties.add(own, OWN, 0.0)
@@ -406,7 +406,7 @@ class PartiesTests(SynchronousTestCase):
         self.assertIs(parties.get(honest.auction.digest), honest)
 
     def test_idle_ones_are_forgotten(self) -> None:
-        """A party in which nothing happens any more goes when another comes; those of this node stay."""
+        """An idle party is removed when another is added; the parties of this node stay."""
         parties = Parties()
         own, old, busy = self.made(0), self.made(1), self.made(2)
         parties.add(own, OWN, 0.0)

@@ -1,4 +1,4 @@
-"""Tests of the group of a task where its bids go to the council as well."""
+"""Tests of the group of a task that also sends bids to the council."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from tests.fleet import FleetCase, SwarmFleet
 
 
 def member(uuid: str, cost: float | None) -> Member:
-    """What a participant's record says."""
+    """Return a participant's record."""
     return Member(uuid, uuid, "WAITING", cost)
 
 
 def costs(members: list[Member]) -> dict[str, float | None]:
-    """Who bids what."""
+    """Return the cost of each participant's bid."""
     return {m.uuid: m.cost for m in members}
 
 
@@ -30,18 +30,18 @@ class RollTests(SynchronousTestCase):
         self.roll.present([member("a", 3.0), member("b", None)])
 
     def test_announced_bids_count(self) -> None:
-        """A bid that was announced after the record counts; who is not present bids nothing."""
+        """A bid announced after the record counts; an agent that is not present has no bid."""
         self.roll.announced([Report("b", 1.0), Report("c", 0.5)])
         self.assertEqual(costs(self.roll.members()), {"a": 3.0, "b": 1.0})
 
     def test_later_record_counts(self) -> None:
-        """A record that changed after the announcement counts, also where it takes the bid back."""
+        """A record that changed after the announcement wins, including a withdrawn bid."""
         self.roll.announced([Report("a", 2.0), Report("b", 1.0)])
         self.roll.present([member("a", None), member("b", None)])
         self.assertEqual(costs(self.roll.members()), {"a": None, "b": 1.0})
 
     def test_announced_bids_tell_all_that_is_read(self) -> None:
-        """Of an announced bid all counts that the strategy reads; a record with another vote is the later word."""
+        """All fields of an announced bid that the strategy reads count; a changed record overrides them."""
         roll = Roll(View(("choice", "weight")))
         roll.present([member("a", 3.0), member("b", 2.0)])
         roll.announced([Report("a", 3.0, choice="red", weight=2.0, battery=0.1), Report("b", 2.0, weight=-1.0)])
@@ -51,7 +51,7 @@ class RollTests(SynchronousTestCase):
         self.assertEqual(roll.members()[0].choice, "blue")
 
     def test_who_left_bids_nothing(self) -> None:
-        """What was announced of a member goes with it, and does not count when it comes back."""
+        """The announced bid of an agent is dropped when the agent leaves, and does not return with it."""
         self.roll.announced([Report("b", 1.0)])
         self.roll.present([member("a", 3.0)])
         self.roll.present([member("a", 3.0), member("b", None)])
@@ -61,7 +61,7 @@ class RollTests(SynchronousTestCase):
         self.assertEqual(self.roll.awaited(), [])
 
     def test_announced_before_the_record(self) -> None:
-        """What was announced of somebody whose record is on its way counts when that comes, until it says otherwise."""
+        """A bid announced before the agent's record counts when the record arrives, until the record changes."""
         self.roll.announced([Report("c", 0.5)])
         self.assertEqual(self.roll.awaited(), [Report("c", 0.5)])
         here = [member("a", 3.0), member("b", None)]
@@ -71,7 +71,7 @@ class RollTests(SynchronousTestCase):
         self.assertEqual(costs(self.roll.members())["c"], 0.7)
 
     def test_newest_announcement_alone_awaits(self) -> None:
-        """Who is not announced any more is not awaited, and its record, which came later, holds."""
+        """An agent that is missing in the newest announcement is not awaited, and its later record wins."""
         self.roll.announced([Report("c", 0.5), Report("d", 0.6)])
         self.roll.present([member("a", 3.0), member("d", None)])
         self.roll.announced([Report("a", 2.0)])
@@ -80,14 +80,14 @@ class RollTests(SynchronousTestCase):
 
 
 class GroupTests(FleetCase):
-    """Behaviour of a ``Group`` that bids."""
+    """Tests of a ``Group`` that bids."""
 
     def setUp(self) -> None:
         super().setUp()
         self.heard: dict[int, list[dict[str, float | None]]] = {place: [] for place in range(3)}
 
     def groups(self, fleet: SwarmFleet) -> list[Group]:
-        """The places of the first three nodes in the group of a new task."""
+        """Return the groups of the first three nodes for a new task."""
         task = Task("job", "find", "Find it", waiting_period=0.5)
         task = self.done(fleet, Deferred.fromCoroutine(fleet.nodes[0].submit(task)))
         self.assertEqual(len(task.council), 3)
@@ -98,7 +98,7 @@ class GroupTests(FleetCase):
         return groups
 
     def hearing(self, place: int) -> Heard:
-        """What takes down what the node of this place hears."""
+        """Return a callback that records the members that the node at ``place`` receives."""
 
         def heard(members: list[Member], outcome: Result | None) -> None:
             self.heard[place].append(costs(members))
@@ -106,7 +106,7 @@ class GroupTests(FleetCase):
         return heard
 
     def test_bids_come_by_the_council(self) -> None:
-        """A bid counts though no record tells it: the council announced it."""
+        """A bid that is only announced by the council, without a record, counts."""
         fleet = self.swarm(4)
         groups = self.groups(fleet)
         uuid = fleet.nodes[1].uuid
@@ -117,7 +117,7 @@ class GroupTests(FleetCase):
         self.assertEqual([self.heard[place][-1][uuid] for place in range(3)], [2.5, 2.5, 2.5])
 
     def test_records_and_bids_agree(self) -> None:
-        """A report is a record and a bid; taken back, it is neither."""
+        """A report is written as a record and sent as a bid; withdrawing it removes both."""
         fleet = self.swarm(4)
         groups = self.groups(fleet)
         uuids = [fleet.nodes[place].uuid for place in range(3)]
@@ -130,7 +130,7 @@ class GroupTests(FleetCase):
             self.assertEqual(self.heard[place][-1], {uuids[0]: None, uuids[1]: 2.0, uuids[2]: 3.0})
 
     def test_who_leaves_is_not_heard_of(self) -> None:
-        """A member that left is gone for the others, and hears nothing more itself."""
+        """A member that left is removed at the others, and receives nothing more."""
         fleet = self.swarm(4)
         groups = self.groups(fleet)
         for place, group in enumerate(groups):

@@ -1,4 +1,4 @@
-"""Tests of what is gathered: the join of bids, and strategies that do not behave."""
+"""Tests of the summary of bids: the join operation, and misbehaving strategies."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ batches = st.lists(st.lists(st.tuples(places, costs, st.integers(0, 2)), max_siz
 
 
 def unsigned(place: int, cost: float | None, revision: int) -> Bid:
-    """A bid as a party sees it; what each agent says in one revision is the same wherever it is heard."""
+    """Return a bid without a signature; equal arguments give an equal bid."""
     agent = AGENTS[place]
     return Bid(agent.public, None if cost is None else Report(agent.node_id.hex(), cost), revision)
 
 
 class Finding:
-    """A strategy that has no summary of its own."""
+    """A strategy without ``merge``."""
 
     find = Nearest().find
 
@@ -39,7 +39,7 @@ class SummaryTests(SynchronousTestCase):
         self.summary = Summary(rule())
 
     def test_best_stand(self) -> None:
-        """Where the strategy does not say how many, the cheapest stand, whatever the order in which they come."""
+        """If the strategy has no ``merge``, the cheapest bids are kept, in any order of arrival."""
         self.summary = Summary(Rule(Finding()))
         for place, cost in ((3, 4.0), (4, 1.0), (5, 9.0), (6, 2.0), (7, 3.0), (8, 8.0)):
             self.summary.join([bid(place, cost)])
@@ -47,7 +47,7 @@ class SummaryTests(SynchronousTestCase):
         self.assertEqual(len(self.summary.bids()), LEADING)
 
     def test_change_is_told(self) -> None:
-        """A join says whether anything is another than before; a second copy changes nothing."""
+        """A join returns whether it changed anything; a duplicate changes nothing."""
         self.assertTrue(self.summary.join([bid(3, 1.0)]))
         self.assertFalse(self.summary.join([bid(3, 1.0)]))
         self.assertFalse(self.summary.join([]))
@@ -55,7 +55,7 @@ class SummaryTests(SynchronousTestCase):
     @given(batches, st.randoms(use_true_random=False))
     @settings(max_examples=80, deadline=None)
     def test_join_is_idempotent_and_takes_any_order(self, batches: list[list[Spoken]], dice: random.Random) -> None:
-        """However often and in whatever order bids come, what stands is the same."""
+        """The summary is the same for any order and number of repetitions of the bids."""
         batch = [[unsigned(*each) for each in one] for one in batches]
         straight, mixed = Summary(rule()), Summary(rule())
         for one in batch:
@@ -64,15 +64,15 @@ class SummaryTests(SynchronousTestCase):
         dice.shuffle(again)
         for one in again:
             mixed.join(one)
-        # Bids that were once crowded out come back when those before them are taken back: only of those that never
-        # were out of sight the same is promised.
+        # Bids that were displaced return after the withdrawal of better ones: join each batch again before the
+        # comparison.
         for one in batch:
             straight.join(one)
             mixed.join(one)
         self.assertEqual(straight.standing, mixed.standing)
 
     def test_late_copy_of_an_earlier_bid(self) -> None:
-        """A bid that was taken back, or outbid by its own agent, does not stand again by a late copy."""
+        """A late duplicate of a withdrawn or superseded bid does not count again."""
         self.summary.join([bid(3, 1.0)])
         self.summary.join([bid(3, None, 1)])
         self.summary.join([bid(3, 1.0)])
@@ -83,7 +83,7 @@ class SummaryTests(SynchronousTestCase):
         self.assertNotIn(1.0, [report.cost for report in self.summary.standing])
 
     def test_two_things_at_once(self) -> None:
-        """An agent that says two things under one revision is heard as the same everywhere."""
+        """Two bids of one agent with the same revision give the same summary in either order."""
         other = Summary(rule())
         self.summary.join([bid(3, 1.0)])
         self.summary.join([bid(3, 5.0)])
@@ -92,7 +92,7 @@ class SummaryTests(SynchronousTestCase):
         self.assertEqual(self.summary.standing, other.standing)
 
     def test_room(self) -> None:
-        """What was taken back is kept up to a limit, so nobody fills a node's memory."""
+        """The number of withdrawals that a summary keeps is limited."""
         for number in range(MAX_SUPERSEDING + 50):
             self.summary.join([Bid(number.to_bytes(32), None, 1)])
         self.assertEqual(len(self.summary.bids()), MAX_SUPERSEDING)
@@ -100,33 +100,33 @@ class SummaryTests(SynchronousTestCase):
 
 class Raising(Nearest):
     def find(self, contacts: Sequence[Report]) -> Consensus:
-        """No opinion."""
+        """Raise."""
         raise ZeroDivisionError
 
     def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
-        """No opinion."""
+        """Raise."""
         raise ZeroDivisionError
 
 
 class Lying(Nearest):
     def find(self, contacts: Sequence[Report]) -> Consensus:
-        """Somebody who never bid."""
+        """Choose an agent that did not bid."""
         return Consensus("nobody")
 
     def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
-        """Bids that nobody made, and all that were."""
+        """Return an invented bid and all others."""
         return (Report("nobody", 0.0), *a, *b)
 
 
 class Hoarding(Nearest):
     def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
-        """Everything, twice."""
+        """Return all bids, some of them twice."""
         return (*a, *b, *b)
 
 
 class RuleTests(SynchronousTestCase):
     def test_strategy_that_raises(self) -> None:
-        """A strategy that raises is blamed by name, and the nearest stand."""
+        """If the strategy raises, the failing method is reported and the nearest reports are kept."""
         blamed: list[str] = []
         raising = Rule(Raising(), lambda method, error: blamed.append(method))
         both = (Report("a", 2.0), Report("b", 1.0))
@@ -135,7 +135,7 @@ class RuleTests(SynchronousTestCase):
         self.assertEqual(blamed, ["merge", "find"])
 
     def test_strategy_that_lies(self) -> None:
-        """What a strategy makes up is dropped: nobody wins who did not bid."""
+        """Reports and winners that a strategy invents are dropped."""
         lying = Rule(Lying())
         both = (Report("a", 2.0), Report("b", 1.0))
         self.assertEqual(lying.merged(both, ()), (both[1], both[0]))
@@ -143,7 +143,7 @@ class RuleTests(SynchronousTestCase):
         self.assertIsNone(lying.decided(())[0])
 
     def test_strategy_that_hoards(self) -> None:
-        """A summary never has more reports than there is room for, and one of each agent."""
+        """A summary is limited to ``MAX_REPORTS`` reports, and one report for each agent."""
         reports = [Report(f"{n:040}", float(n)) for n in range(MAX_REPORTS + 100)]
         self.assertEqual(len(Rule(Hoarding()).merged(reports, reports)), MAX_REPORTS)
         twice = Rule(Hoarding()).merged([Report("a", 1.0)], [Report("a", 2.0)])

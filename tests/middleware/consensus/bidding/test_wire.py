@@ -1,4 +1,4 @@
-"""Tests of what travels: auctions, bids and announcements, signed, and refused where they cannot be believed."""
+"""Tests of the encoding of auctions, bids and announcements, and of their signatures."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ anything = st.recursive(leaves, lambda inner: st.lists(inner) | st.dictionaries(
 
 
 def sent(content: Any) -> Any:
-    """What arrives of ``content``."""
+    """Return ``content`` after encoding and decoding."""
     return msgpack.unpackb(msgpack.packb(content))
 
 
 class WireTests(SynchronousTestCase):
     def test_comes_as_it_went(self) -> None:
-        """An auction, a bid, its withdrawal and an announcement are the same on the other side, and genuine."""
+        """An auction, a bid, its withdrawal and an announcement survive encoding, and their signatures are valid."""
         auction = auction_of(sent(AUCTION.packed()))
         self.assertEqual((auction, auction and auction.digest), (AUCTION, AUCTION.digest))
         for one in (bid(3, 2.5), bid(3, 0), bid(3, None, 4)):
@@ -40,7 +40,7 @@ class WireTests(SynchronousTestCase):
 
 class AuctionTests(SynchronousTestCase):
     def test_council_is_part_of_it(self) -> None:
-        """Another council, epoch, strategy or waiting period makes another auction, so nobody can slip one in."""
+        """Another council, epoch, strategy or waiting period gives an auction with another digest."""
         others = [
             replace(AUCTION, council=COUNCIL[:2]),
             replace(AUCTION, epoch=2),
@@ -51,7 +51,7 @@ class AuctionTests(SynchronousTestCase):
         self.assertEqual(len({each.digest for each in [AUCTION, *others]}), 6)
 
     def test_unlawful_ones(self) -> None:
-        """A council that is empty, doubled or too large, an epoch or waiting period that is none: no auction."""
+        """An auction with an invalid council, epoch, strategy or waiting period is not decoded."""
         lawful = AUCTION.packed()
         for place, wrong in ((0, ""), (0, 7), (1, -1), (2, []), (2, [CONTACTS[0].packed()] * 2), (3, "x" * 65)):
             self.assertIsNone(auction_of([*lawful[:place], wrong, *lawful[place + 1 :]]), wrong)
@@ -61,7 +61,7 @@ class AuctionTests(SynchronousTestCase):
     @given(anything)
     @settings(max_examples=60, deadline=None)
     def test_decoders_are_total(self, content: Any) -> None:
-        """Whatever comes, a decoder gives what it promises or None, and never raises."""
+        """For any input a decoder returns a valid object or None, and never raises."""
         auction, one, announcement = auction_of(content), bid_of(content), announcement_of(content)
         for shaped in ([AUCTION.packed()[:2] + [content] * 4], [AGENTS[0].public, content, 0, b"s" * 64]):
             auction_of(shaped)
@@ -74,7 +74,7 @@ class AuctionTests(SynchronousTestCase):
 
 class BidTests(SynchronousTestCase):
     def test_forged_ones(self) -> None:
-        """Another cost, revision, key or auction than the one signed is not genuine."""
+        """A bid with another cost, revision, key or auction than the signed one is not genuine."""
         one = bid(3, 2.5)
         assert one.report is not None
         forged = [
@@ -88,7 +88,7 @@ class BidTests(SynchronousTestCase):
         self.assertFalse(one.is_genuine(replace(AUCTION, epoch=2)))
 
     def test_costs_that_are_none(self) -> None:
-        """NaN, infinite, negative and enormous costs are no bids, and neither are fields that a report has not."""
+        """NaN, infinite, negative and huge costs, and unknown fields, give no report."""
         for cost in (math.nan, math.inf, -math.inf, -1.0, 1e300, True, "1", None):
             self.assertIsNone(report_of({"cost": cost}, "a"), cost)
         self.assertIsNone(report_of({"cost": 1.0, "friend": "b"}, "a"))
@@ -97,7 +97,7 @@ class BidTests(SynchronousTestCase):
 
 class AnnouncementTests(SynchronousTestCase):
     def test_only_of_the_council(self) -> None:
-        """What a node outside of the pinned council signs, under whatever place it claims, is not genuine."""
+        """An announcement signed by a node outside of the council is not genuine, whatever rank it claims."""
         stranger = AGENTS[7]
         one = announced(1, 0, bid(4, 1.5))
         for rank in (0, 1, 2, 3, 99):
@@ -105,7 +105,7 @@ class AnnouncementTests(SynchronousTestCase):
             self.assertFalse(forged.is_genuine(AUCTION), rank)
 
     def test_forged_ones(self) -> None:
-        """Another number, place, winner or auction than the one signed is not genuine."""
+        """An announcement with another number, rank, winner or auction than the signed one is not genuine."""
         one = announced(1, 0, bid(4, 1.5))
         other = announced(1, 0, bid(5, 1.5))
         for forged in (replace(one, number=2), replace(one, rank=1), replace(one, entries=other.entries)):
@@ -113,11 +113,11 @@ class AnnouncementTests(SynchronousTestCase):
         self.assertFalse(one.is_genuine(replace(AUCTION, epoch=2)))
 
     def test_doubled_agents(self) -> None:
-        """An announcement with two reports of one agent is none."""
+        """An announcement with two reports of one agent is not decoded."""
         one = announced(1, 0, bid(4, 1.5), bid(4, 2.5))
         self.assertIsNone(announcement_of(sent(one.packed())))
 
     def test_precedence(self) -> None:
-        """The higher number holds; of equal ones that of the earlier member."""
+        """The higher number has precedence; at equal numbers the member of lower rank."""
         first, second, third = announced(1, 0), announced(1, 2), announced(2, 2)
         self.assertEqual(sorted([first, third, second], key=lambda a: a.precedence), [second, first, third])

@@ -1,4 +1,4 @@
-"""Room: a calm team for tests of leases: agents 0, 1, 2 and a council of 3, 4, 5, all on one turned clock."""
+"""Provide a small team for tests of leases: agents 0, 1, 2 and a council of 3, 4, 5, all in virtual time."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ T = "t0"
 
 
 class RoomCase(SynchronousTestCase):
-    """Agents and council members; members are born silent, so a ttl passes first."""
+    """Agents and council members; new members grant nothing for one TTL, so ``made`` waits that long."""
 
     def setUp(self) -> None:
         self.room = self.made()
 
     def made(self, stop_time: float = 0.0, rates: Sequence[float] = (1.0,) * 7, seed: str = "room") -> LeaseTeam:
-        """A team whose council may grant."""
+        """Return a team with a council that may grant."""
         room = LeaseTeam(seed, rates, 3, TTL, stop_time)
         room.add_task(T, [3, 4, 5])
         room.clock.advance(TTL + 0.1)
         return room
 
     def chartered(self, *councils: Sequence[int], signers: int = 2) -> Charter:
-        """The proof that the council of the task became these, one after the other."""
+        """Return the charter that proves these successive councils of the task."""
         charter, sitting = self.room.councils[T], [3, 4, 5]
         for number, council in enumerate(councils, start=1):
             members = tuple(self.room.contacts[place] for place in council)
@@ -42,36 +42,36 @@ class RoomCase(SynchronousTestCase):
         return charter
 
     def lessee(self, place: int) -> Lessee:
-        """The claim of an agent."""
+        """Return the lease client of an agent."""
         return self.room.bidders[place].lessee(T)
 
     def run_for(self, seconds: float) -> None:
-        """Let time pass."""
+        """Advance the clock."""
         self.room.clock.advance(seconds)
 
     def wanting(self, place: int, seconds: float = 0.1) -> Lessee:
-        """An agent that has wanted the lease for some seconds."""
+        """Return the lease client of an agent that has requested the lease ``seconds`` ago."""
         lessee = self.lessee(place)
         lessee.want()
         self.run_for(seconds)
         return lessee
 
     def holders(self) -> list[int]:
-        """Who holds the lease by its own clock."""
+        """Return the agents that hold the lease by their own clocks."""
         return [place for place in self.room.agents if self.lessee(place).lease is not None]
 
     def cut(self, place: int, *others: int) -> None:
-        """Let a place and others not hear each other."""
+        """Block the links between ``place`` and ``others``."""
         self.room.radio.cut |= {pair for other in others for pair in ((place, other), (other, place))}
 
     def token(self, place: int) -> int:
-        """The token that an agent holds."""
+        """Return the token that an agent holds."""
         lease = self.lessee(place).lease
         assert lease is not None, f"{place} holds nothing"
         return lease.token
 
     def outcome(self, work: Deferred[Any], seconds: float = 1.0) -> Any:
-        """What came of it in time: a result, or the exception."""
+        """Return the result or exception of ``work`` after ``seconds``."""
         got: list[Any] = []
         work.addCallbacks(got.append, lambda failure: got.append(failure.value))
         self.run_for(seconds)

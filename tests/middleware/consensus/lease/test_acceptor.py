@@ -18,7 +18,7 @@ TTL = 2.0
 
 
 def ballot(number: int, agent: str) -> Ballot:
-    """A ballot of the agent's only life."""
+    """Return a ballot of an agent that was never restarted."""
     return Ballot(number * LIFE, agent)
 
 
@@ -27,15 +27,15 @@ class AcceptorTests(SynchronousTestCase):
         self.acceptor = LeaseAcceptor(MemoryStore(), -math.inf)
 
     def prepare(self, number: int, agent: str, now: float, configuration: int = 1) -> Reply:
-        """Ask for a promise."""
+        """Send a prepare request."""
         return self.acceptor.prepare("t", configuration, ballot(number, agent), TTL, now)
 
     def propose(self, number: int, agent: str, token: int, now: float, configuration: int = 1) -> Reply:
-        """Ask for a lease."""
+        """Send a lease proposal."""
         return self.acceptor.lease("t", configuration, ballot(number, agent), token, TTL, now)
 
     def test_promise_for_the_time_after_a_lease(self) -> None:
-        """Shortly before a lease ends another is promised what follows; nothing is granted sooner for that."""
+        """Near the end of a lease a proposer gets a promise for the time after it, but no earlier grant."""
         self.prepare(1, "a", 0.0)
         self.propose(1, "a", 1, 0.0)
         self.assertEqual(self.prepare(2, "b", 1.5).kind, Kind.HELD)
@@ -46,7 +46,7 @@ class AcceptorTests(SynchronousTestCase):
         self.assertEqual(self.propose(2, "b", 2, 2.0).kind, Kind.GRANTED)
 
     def test_promise_ends_no_lease(self) -> None:
-        """Who holds the lease renews it in spite of the promise, also when that is given back, but claims no other."""
+        """The holder renews its lease despite another's promise, also after its release, but cannot claim a new one."""
         self.prepare(1, "a", 0.0)
         self.propose(1, "a", 1, 0.0)
         self.prepare(2, "b", 1.75)
@@ -59,13 +59,13 @@ class AcceptorTests(SynchronousTestCase):
         self.assertEqual(self.prepare(3, "b", 4.3).kind, Kind.GRANTED)
 
     def test_former_life_is_another(self) -> None:
-        """A restarted agent waits like everybody until what its former life held has run out: its robot may move."""
+        """A restarted agent must wait for the end of its earlier lease, because its robot may still move."""
         self.prepare(1, "a", 0.0)
         self.propose(1, "a", 1, 0.0)
         self.assertEqual(self.acceptor.prepare("t", 1, Ballot(9 * LIFE + 5, "a"), TTL, 1.0).kind, Kind.HELD)
 
     def test_release(self) -> None:
-        """What is given back is free at once, is told to those that asked, and no late proposal brings it back."""
+        """A released lease is free at once, waiting proposers are notified, and a late proposal does not restore it."""
         self.prepare(1, "a", 0.0)
         self.propose(1, "a", 1, 0.0)
         self.prepare(2, "b", 0.5)
@@ -76,7 +76,7 @@ class AcceptorTests(SynchronousTestCase):
         self.assertEqual(self.prepare(2, "b", 1.0).kind, Kind.GRANTED)
 
     def test_release_before_the_robot_rests(self) -> None:
-        """What is given back while the robot still moves is promised to others at once, and granted when it rests."""
+        """A release while the robot still moves gives a promise at once, and a grant when the robot stands still."""
         self.prepare(1, "a", 0.0)
         self.propose(1, "a", 1, 0.0)
         self.prepare(2, "b", 0.5)
@@ -89,7 +89,7 @@ class AcceptorTests(SynchronousTestCase):
         self.assertEqual(self.propose(2, "b", 2, 1.2).kind, Kind.GRANTED)
 
     def test_change_by_the_holder(self) -> None:
-        """Who gives its own lease back by a change keeps others away; the member of the next council does, too."""
+        """A holder that releases by a change keeps others away for a TTL, also at members of the next council."""
         self.prepare(1, "a", 0.0)
         self.propose(1, "a", 1, 0.0)
         self.prepare(2, "a", 0.1)
@@ -104,14 +104,14 @@ class AcceptorTests(SynchronousTestCase):
         self.assertEqual(self.acceptor.prepare("t", 2, ballot(5, "b"), TTL, 0.3 + TTL).kind, Kind.GRANTED)
 
     def test_release_that_overtakes_its_proposal(self) -> None:
-        """A proposal that arrives after its own release grants nothing."""
+        """A proposal that arrives after its own release is not granted."""
         self.prepare(1, "a", 0.0)
         self.acceptor.free("t", ballot(1, "a"), 0.1)
         self.assertEqual(self.propose(1, "a", 1, 0.2).kind, Kind.OUTBID)
         self.assertEqual(self.prepare(2, "a", 0.3).kind, Kind.GRANTED)
 
     def test_release_of_an_older_ballot_too(self) -> None:
-        """Who gives back the latest that it asked for gives back all, whatever of it has arrived, and in what order."""
+        """The release of the latest ballot also releases all older ballots of the agent, in any order of arrival."""
         for proposes_first in (True, False):
             self.setUp()
             self.prepare(1, "a", 0.0)
@@ -125,7 +125,7 @@ class AcceptorTests(SynchronousTestCase):
             self.assertEqual(self.prepare(3, "b", 0.6)[:4:3], (Kind.GRANTED, 0.0))
 
     def test_freed(self) -> None:
-        """A member that hears of a release as a stand-by takes it for one: from who holds that token, from no other."""
+        """A released lease is accepted from other members only with the holder and its token."""
         self.prepare(1, "a", 0.0)
         self.propose(1, "a", 1, 0.0)
         for agent, token in (("b", 1), ("a", 0), ("a", 2)):
@@ -137,7 +137,7 @@ class AcceptorTests(SynchronousTestCase):
         self.assertEqual(self.acceptor.freed("u", "a", 1, 0.5), [])
 
     def test_listeners_are_bounded(self) -> None:
-        """However many ask, those that asked last are told."""
+        """The number of waiting proposers is limited, and the most recent ones are notified."""
         self.prepare(1, "a", 0.0)
         self.propose(1, "a", 1, 0.0)
         for number in range(3 * MAX_LISTENERS):
@@ -146,7 +146,7 @@ class AcceptorTests(SynchronousTestCase):
         self.assertEqual((len(told), told[-1]), (MAX_LISTENERS, f"b{3 * MAX_LISTENERS - 1:03d}"))
 
     def test_no_room(self) -> None:
-        """A member that can remember no more tasks says so, and grants nothing that it would forget."""
+        """An acceptor that cannot store more tasks answers QUIET and grants nothing."""
         self.patch(log, "MAX_REGISTERS", 1)
         self.prepare(1, "a", 0.0)
         for reply in (
@@ -159,7 +159,7 @@ class AcceptorTests(SynchronousTestCase):
             self.assertGreater(reply.remaining, 0.0)
 
     def test_close_after_release(self) -> None:
-        """An agent that gave its lease back may end the task under its token, also after a restart; nobody else."""
+        """The last holder may close the task under its token after its release, also across a restart."""
         store = MemoryStore()
         self.acceptor = LeaseAcceptor(store, -math.inf)
         self.propose(1, "a", 3, 0.0)
@@ -172,13 +172,13 @@ class AcceptorTests(SynchronousTestCase):
         self.assertEqual(self.acceptor.close("t", "b", 1, 4, 1.0).kind, Kind.OVER)
 
     def test_close_under_a_token_of_others(self) -> None:
-        """A member that only heard of a token signs no end under it."""
+        """An acceptor that did not grant a token does not sign an end under it."""
         self.propose(1, "a", 3, 0.0)
         self.acceptor.accept("t", 1, ballot(2, "b"), MEMBERS, 3.0, 5)
         self.assertEqual([self.acceptor.close("t", agent, 1, 5, 3.0).kind for agent in ("a", "b")], [Kind.BEHIND] * 2)
 
     def test_close(self) -> None:
-        """After the end nothing is granted or renewed; who ends it learns how long another may still act."""
+        """After a close nothing is granted or renewed; the reply contains the remaining time of the lease."""
         self.prepare(1, "a", 0.0)
         self.propose(1, "a", 3, 0.0)
         self.assertEqual(self.acceptor.close("t", "b", 1, 2, 0.5).kind, Kind.OUTBID)
@@ -189,7 +189,7 @@ class AcceptorTests(SynchronousTestCase):
         self.assertEqual(self.prepare(9, "b", 99.0).kind, Kind.OVER)
 
     def test_change(self) -> None:
-        """An accepted change seals the council; whoever asks is told of it, and once it is chosen where to go."""
+        """An accepted change seals the council; a reply contains the change, and after its decision the new council."""
         self.prepare(1, "a", 0.0)
         changed = self.acceptor.accept("t", 1, ballot(1, "a"), MEMBERS[:3], 0.0, 4)
         self.assertEqual(changed.kind, Kind.GRANTED)
@@ -208,7 +208,7 @@ class AcceptorTests(SynchronousTestCase):
         self.assertEqual(self.propose(3, "b", 5, 0.4, configuration=2).kind, Kind.GRANTED)
 
     def test_promise_survives_a_restart(self) -> None:
-        """What was only promised is promised by another process, too; where a note is rotten it grants nothing."""
+        """A promise survives a restart; an acceptor with a corrupt store entry grants nothing."""
         store = MemoryStore()
         LeaseAcceptor(store, -math.inf).prepare("t", 1, ballot(2, "a"), TTL, 0.0)
         self.acceptor = LeaseAcceptor(store, 50.0)
@@ -221,7 +221,7 @@ class AcceptorTests(SynchronousTestCase):
         self.assertEqual(self.prepare(1, "b", 51.0).kind, Kind.QUIET)
 
     def test_forgotten(self) -> None:
-        """What a member forgot for want of room leaves a floor under its ballots and tokens, also after a restart."""
+        """An evicted task leaves a lower bound for ballots and tokens, also after a restart."""
         self.patch(log, "MAX_REGISTERS", 1)
         store = MemoryStore()
         self.acceptor = LeaseAcceptor(store, -math.inf)

@@ -27,7 +27,7 @@ from tests.middleware.consensus.lease.room import RoomCase, T
 
 class CharterTests(RoomCase):
     def test_chain(self) -> None:
-        """A charter names the newest council, and is the same again when it comes out of a message."""
+        """A charter contains the newest council, and survives encoding."""
         charter = self.chartered([3, 4, 6], [0, 4, 6])
         again = charter_of(charter.packed)
         self.assertEqual(again, charter)
@@ -36,7 +36,7 @@ class CharterTests(RoomCase):
         self.assertEqual((charter.configuration, charter.token, charter.ballot), (3, 7, Ballot(2, "agent")))
 
     def test_anything_changed(self) -> None:
-        """Another task, member, order, ballot, token or signer, or too few signers: it does not hold."""
+        """A charter with a changed task, member, order, ballot, token or signer, or too few signers, is not genuine."""
         charter = self.chartered([3, 4, 6], [0, 4, 6])
         first, second = charter.links
         forged = self.room.identities[6]
@@ -58,12 +58,12 @@ class CharterTests(RoomCase):
         self.assertFalse(replace(charter, first=tuple(self.room.contacts[:3])).is_genuine(T))
 
     def test_one_signer_is_no_majority(self) -> None:
-        """What a single member of three signed is no council, and no council of fewer than three is one."""
+        """A council needs the signatures of a majority, and has at least three members."""
         self.assertFalse(self.chartered([3, 4, 6], signers=1).is_genuine(T))
         self.assertFalse(self.chartered([3]).is_genuine(T))
 
     def test_judge(self) -> None:
-        """Who may not publish tasks pins no council."""
+        """A council pinned by a node without the right to publish tasks is rejected."""
         pinned = pin(self.room.identities[0], T, tuple(self.room.contacts[:3]))
         judge = self.room.judge
         self.assertIsNone(judge.read(T, pinned.packed))
@@ -71,7 +71,7 @@ class CharterTests(RoomCase):
         self.assertIsNone(judge.read(T, self.chartered([3, 4, 6], signers=1).packed))
 
     def test_bounded(self) -> None:
-        """A council changes so often and not more, and begins at no token that would leave too few."""
+        """The number of links of a charter and its token are limited."""
         charter = self.chartered([3, 4, 6])
         full = replace(charter, links=charter.links * MAX_LINKS)
         self.assertRaises(Refused, full.extended, charter.members, charter.ballot, ())
@@ -81,7 +81,7 @@ class CharterTests(RoomCase):
         self.assertEqual(replace(charter, links=(link,)).token, MAX_TOKEN)
 
     def test_ending(self) -> None:
-        """A majority of the present council proves who ended the task, and under which token."""
+        """A majority of the current council proves the agent that ended the task, and its token."""
         pinned = self.room.councils[T]
         for charter, seats in ((pinned, [3, 4, 5]), (self.chartered([0, 4, 6]), [0, 4, 6])):
             votes = [
@@ -102,7 +102,7 @@ class CharterTests(RoomCase):
     @settings(max_examples=100)
     @given(st.recursive(st.none() | st.integers() | st.binary(max_size=70) | st.text(), st.lists, max_leaves=20))
     def test_anything_from_the_wire(self, content: object) -> None:
-        """Whatever arrives is a charter or none, and raises nothing."""
+        """Any input is a charter or None, and never raises."""
         try:
             packed = bytes(msgpack.packb(content))
         except OverflowError:
@@ -112,7 +112,7 @@ class CharterTests(RoomCase):
         self.assertIsNone(self.room.judge.read(T, content))
 
     def test_signatures_are_apart(self) -> None:
-        """A signature under a change is none under an end, and the other way round."""
+        """A signature of a change is not valid for an end, and the reverse."""
         members = tuple(self.room.contacts[:3])
         identity = self.room.identities[3]
         self.assertNotEqual(sign_change(identity, T, 1, Ballot(7, "a"), members, 7), sign_end(identity, T, 1, "a", 7))
@@ -120,7 +120,7 @@ class CharterTests(RoomCase):
 
 class NumberTests(RoomCase):
     def test_believed(self) -> None:
-        """Of the numbers that members tell one alone is believed only where it is low."""
+        """A high number that a single member of three reports does not count."""
         self.assertEqual(believed([5, 7, 3], 3), 7)
         self.assertEqual(believed([2**61, 7, 3], 3), 7)
         self.assertEqual(believed([2**61, 2**60], 3), 2**60)

@@ -55,10 +55,10 @@ def _is_granted(before: bool, event: Event, actions: tuple[Action, ...]) -> bool
 
 
 class ClientStatesTests(SynchronousTestCase):
-    """The table is whole, and no path through it breaks a rule of leases."""
+    """The table is complete, and no path through it violates a rule of leases."""
 
     def test_every_pair_is_decided(self) -> None:
-        """Each pair of state and event is a transition, changes nothing, or is impossible; no pair is two of these."""
+        """Each pair of state and event is exactly one of: a transition, ignored, or impossible."""
         pairs = {(state, event) for state in State for event in Event}
         transitions = {(state, event) for state, row in TABLE.items() for event in row}
         self.assertEqual(set(TABLE), set(State))
@@ -73,14 +73,14 @@ class ClientStatesTests(SynchronousTestCase):
         self.assertEqual({state for state, _ in explore()}, set(State))
 
     def test_only_a_majority_grants(self) -> None:
-        """No path leads to a state that holds the lease but by the grants of a majority."""
+        """Each path to a state that holds the lease contains the grants of a majority."""
         for (state, is_granted), path in explore().items():
             if state in (State.HOLDING, State.OUTBID):
                 self.assertTrue(is_granted, (state, path))
                 self.assertTrue(set(GRANTED) & set(path), (state, path))
 
     def test_release_ends_every_claim(self) -> None:
-        """From each state RELEASE drops round and timer; the client then claims nothing, and an end stays an end."""
+        """In each state RELEASE cancels round and timer, and ends the claim; OVER stays OVER."""
         for state, _ in explore():
             target, actions = next_step(state, Event.RELEASE)
             self.assertEqual(target, State.OVER if state is State.OVER else State.IDLE)
@@ -90,7 +90,7 @@ class ClientStatesTests(SynchronousTestCase):
                 self.assertEqual(next_step(State.OVER, event).state, State.OVER)
 
     def test_nothing_is_asked_in_vain(self) -> None:
-        """A state with a round is entered by its question; one with a timer sets it, but for the time of a move."""
+        """A state with a round is entered with its request, one with a timer with its timer, except for MOVE."""
         for state, row in TABLE.items():
             for event, (target, actions) in row.items():
                 entered = target is not state or event in (Event.RECONFIGURED, Event.OUTRANK)
@@ -100,7 +100,7 @@ class ClientStatesTests(SynchronousTestCase):
                     self.assertTrue(TIMERS & set(actions), (state, event))
 
     def test_a_client_goes_on(self) -> None:
-        """From each state in which the agent wants the lease some path leads to holding it."""
+        """From each active state some path leads to holding the lease."""
         for begin in ACTIVE:
             found: set[State] = {begin}
             left: list[State] = [begin]
@@ -112,6 +112,6 @@ class ClientStatesTests(SynchronousTestCase):
             self.assertIn(State.HOLDING, found, begin)
 
     def test_page_has_the_table(self) -> None:
-        """The states in docs/explanation/choosing-a-robot.md are those of the code."""
+        """The states in docs/explanation/choosing-a-robot.md match the code."""
         page = Path(__file__).parents[4] / "docs" / "explanation" / "choosing-a-robot.md"
         self.assertIn(write_states(), page.read_text(encoding="utf-8"))

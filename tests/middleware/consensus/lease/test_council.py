@@ -12,16 +12,16 @@ from tests.middleware.consensus.lease.room import TTL, RoomCase, T
 
 class CouncilTests(RoomCase):
     def change(self, place: int, *members: int) -> object:
-        """What comes of a change that an agent asks for: None, or the error."""
+        """Return the result of a change requested by an agent: None, or the error."""
         council = self.lessee(place).council
         return self.outcome(council.change([self.room.contacts[n] for n in members]))
 
     def places(self, place: int) -> list[int]:
-        """The council as an agent knows it."""
+        """Return the council as an agent knows it."""
         return [self.room.place_of(member) for member in self.lessee(place).council.members]
 
     def test_change(self) -> None:
-        """The council becomes another one, configuration + 1, and the next lease is that one's, with a higher token."""
+        """A change installs the new council with configuration + 1, which grants the next lease with a higher token."""
         self.wanting(0)
         self.lessee(0).release()
         self.run_for(0.1)
@@ -33,7 +33,7 @@ class CouncilTests(RoomCase):
         self.assertEqual(self.token(1), 2)
 
     def test_who_knows_the_old_council_is_told(self) -> None:
-        """A claimant with the old record is sent on by any member, of those that left too."""
+        """A client with an old council record is redirected by any member, including departed ones."""
         self.assertIsNone(self.change(1, 0, 1, 2))
         self.assertEqual(self.places(2), [0, 1, 2])
         self.room.councils[T] = replace(self.room.councils[T], links=())
@@ -43,7 +43,7 @@ class CouncilTests(RoomCase):
         self.assertEqual((self.places(0), self.holders()), ([0, 1, 2], [0]))
 
     def test_member_that_was_away_is_told(self) -> None:
-        """A new member that was down when it was chosen learns of it from whoever claims."""
+        """A new member that was unreachable at the change learns of it from the next client that claims."""
         self.cut(6, *range(6))
         self.assertIsNone(self.change(1, 3, 4, 6))
         self.room.radio.cut.clear()
@@ -53,7 +53,7 @@ class CouncilTests(RoomCase):
         self.assertEqual(self.holders(), [1])
 
     def test_moved_by_the_holder(self) -> None:
-        """Who holds the lease has it again in the new council, under a higher token, and nobody else in between."""
+        """A holder that moves its council reacquires the lease there under a higher token, with no holder between."""
         for stop_time in (0.0, 0.3):
             self.room = self.made(stop_time)
             self.wanting(0)
@@ -72,7 +72,7 @@ class CouncilTests(RoomCase):
             self.assertEqual((self.holders(), self.places(1), self.room.referee.found), ([1], [3, 4, 6], []))
 
     def test_move_that_fails(self) -> None:
-        """A holder whose council does not change claims the lease again where it was."""
+        """If the change of the council fails, the holder claims the lease again at the old council."""
         self.wanting(0)
         self.run_for(TTL)
         moved = self.lessee(0).move([self.room.contacts[n] for n in (1, 2, 6)])
@@ -84,7 +84,7 @@ class CouncilTests(RoomCase):
         self.assertEqual(self.holders(), [0])
 
     def test_silent_members_are_known(self) -> None:
-        """The holder knows who has not answered for how long; who comes back is silent no more."""
+        """The holder knows the time since the last answer of each member; an answer resets it."""
         self.wanting(0)
         self.cut(4, *range(4), 5, 6)
         self.run_for(4.0)
@@ -103,7 +103,7 @@ class CouncilTests(RoomCase):
         self.assertEqual(council.silent(3.0), (self.room.contacts[5],))
 
     def test_learnt_from_the_record(self) -> None:
-        """A newer configuration of the task's record is taken over, an older one is not."""
+        """A newer configuration in the task's record is adopted, an older one is ignored."""
         council = self.lessee(0).council
         council.learn(self.chartered([4, 5, 6], [0, 1, 2]).packed)
         for packed in (self.chartered([4, 5, 6]).packed, b"", b"?"):
@@ -111,7 +111,7 @@ class CouncilTests(RoomCase):
             self.assertEqual((council.configuration, self.places(0)), (3, [0, 1, 2]))
 
     def test_two_changes_at_once(self) -> None:
-        """Of two that want different councils at one moment, both end up with the same one."""
+        """Two concurrent changes to different councils end with the same council at both clients."""
         for seed in range(12):
             self.room = self.made(seed=f"two {seed}")
             for place, members in ((0, (3, 4, 6)), (1, (5, 6, 2))):
@@ -125,7 +125,7 @@ class CouncilTests(RoomCase):
             self.assertEqual(self.places(0), self.places(1))
 
     def test_change_that_was_half_done_is_completed(self) -> None:
-        """Who meets a change that was accepted and not told completes it before anything is claimed."""
+        """A client that finds an accepted but unfinished change completes it before it claims the lease."""
         self.cut(1, 6, 0, 2)
         council = self.lessee(1).council
         error = self.outcome(council.change([self.room.contacts[n] for n in (0, 2, 6)]))
@@ -134,7 +134,7 @@ class CouncilTests(RoomCase):
         self.assertEqual((self.places(0), self.holders()), ([0, 2, 6], [0]))
 
     def test_change_of_the_highest_ballot_is_completed(self) -> None:
-        """Of two changes that were accepted by one member each the later one may be decided, so that one follows."""
+        """Of two changes with one acceptance each, the one with the higher ballot may be decided, and is completed."""
         for place, council in ((4, (0, 2, 6)), (3, (1, 2, 6))):
             members = tuple(self.room.contacts[n] for n in council)
             acceptor, now = self.room.bidders[place].acceptor, self.room.bidders[place].machine.seconds()
@@ -144,19 +144,19 @@ class CouncilTests(RoomCase):
         self.assertEqual(self.places(0), [1, 2, 6])
 
     def test_another_change_came_first(self) -> None:
-        """Who asks for a change of a council that was changed meanwhile is told so."""
+        """A change of a council that has changed meanwhile fails with ``Superseded``."""
         self.lessee(2)
         self.assertIsNone(self.change(1, 3, 4, 6))
         self.assertIsInstance(self.change(2, 3, 5, 6), Superseded)
         self.assertEqual(self.places(2), [3, 4, 6])
 
     def test_strange_councils(self) -> None:
-        """A council of nobody, or of too many, is the caller's mistake."""
+        """A council without members, or with too many, raises ``ValueError``."""
         for members in ([], [self.room.contacts[0]] * 8):
             self.assertRaises(ValueError, self.lessee(0).council.change, members)
 
     def test_close_waits_for_whoever_may_still_act(self) -> None:
-        """The end is acknowledged when a majority knows it and the lease that was in force has run out."""
+        """A close is acknowledged when a majority has stored it and the lease in force has expired."""
         self.wanting(0)
         self.cut(0, 3, 4, 5)
         closing = self.lessee(1).council.close()
@@ -170,14 +170,14 @@ class CouncilTests(RoomCase):
         self.assertEqual(self.holders(), [])
 
     def test_holder_closes_at_once(self) -> None:
-        """Who has done the task and stands still need not wait for its own lease."""
+        """A holder that stands still closes the task without waiting for its own lease."""
         lessee = self.wanting(0)
         self.assertIsNone(self.outcome(lessee.council.close(self.token(0)), 0.05))
         self.wanting(1, 1.0)
         self.assertEqual((self.holders(), self.lessee(1).is_over), ([], True))
 
     def test_close_by_who_missed_a_change(self) -> None:
-        """Whoever knows an older council is sent on to the newer one, and waits for the lease that this one granted."""
+        """A client with an old council is redirected on close, and waits for the lease that the new council granted."""
         stale = self.lessee(0)
         self.assertIsNone(self.change(1, 3, 6, 2))
         self.wanting(1)
@@ -191,12 +191,12 @@ class CouncilTests(RoomCase):
         self.assertEqual((self.holders(), self.lessee(1).is_over), ([], True))
 
     def test_close_without_a_majority(self) -> None:
-        """An end that only a minority knows is not acknowledged."""
+        """A close that only a minority has stored is not acknowledged."""
         self.cut(0, 3, 4)
         self.assertIsInstance(self.outcome(self.lessee(0).council.close()), NoMajority)
 
     def test_change_after_the_end(self) -> None:
-        """The council of a task that has ended stays as it is."""
+        """The council of a closed task cannot change."""
         self.outcome(self.lessee(0).council.close())
         error = self.change(1, 3, 4, 6)
         self.assertIsInstance(error, Refused)

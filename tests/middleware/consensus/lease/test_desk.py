@@ -1,4 +1,4 @@
-"""Tests of ``middleware.consensus.lease.desk``, as the nodes of a team meet it."""
+"""Tests of ``middleware.consensus.lease.desk`` between the nodes of a team."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ TASK = Task("t1", "search", "Find it")
 
 
 class SlowStore(MemoryStore):
-    """A store whose disk writes only when it is told to."""
+    """A store that writes only on request."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -27,14 +27,14 @@ class SlowStore(MemoryStore):
         self.is_slow = False
 
     def written(self) -> Deferred[None]:
-        """Fire at once, or with the next ``write``."""
+        """Return a Deferred that fires at once, or with the next ``write``."""
         if not self.is_slow:
             return super().written()
         self.owed.append(Deferred())
         return self.owed[-1]
 
     def write(self) -> None:
-        """Write everything that is owed."""
+        """Complete all pending writes."""
         owed, self.owed = self.owed, []
         for waiting in owed:
             waiting.callback(None)
@@ -42,24 +42,24 @@ class SlowStore(MemoryStore):
 
 class DeskTests(FleetCase):
     def team(self, n: int = 4) -> tuple[SwarmFleet, Task, list[Lessee]]:
-        """Nodes that may grant, a task, and everybody's claim on it."""
+        """Return nodes that may grant, a task, and the lease client of each node."""
         fleet = self.swarm(n)
         fleet.run(TASK.lease_ttl)
         task = self.done(fleet, Deferred.fromCoroutine(fleet.nodes[0].submit(TASK)), 1.0)
         return fleet, task, [node.lessee(task, lambda: None, 0) for node in fleet.nodes]
 
     def holders(self, lessees: Sequence[Lessee]) -> list[int]:
-        """Who holds the lease."""
+        """Return the nodes that hold the lease."""
         return [place for place, lessee in enumerate(lessees) if lessee.lease is not None]
 
     def end(self, fleet: SwarmFleet, lessees: Sequence[Lessee]) -> None:
-        """Let everybody go, so that no timer is left."""
+        """Release all claims, which removes the timers."""
         for lessee in lessees:
             lessee.release()
         fleet.run(2.0)
 
     def test_polite_leave_is_heard_by_those_that_stand_by(self) -> None:
-        """The council tells the stand-by over the wire, and it acts long before it would have asked again."""
+        """The council notifies a standby of a release, and the standby acts long before its next poll."""
         fleet, _, lessees = self.team()
         lessees[1].want()
         fleet.run(0.3)
@@ -72,7 +72,7 @@ class DeskTests(FleetCase):
         self.end(fleet, lessees)
 
     def test_heirs_are_told_by_the_holder(self) -> None:
-        """Whoever the holder names hears of the release from it, also where it never asked the council."""
+        """The holder notifies the named standbys of its release, even if they never polled the council."""
         fleet, _, lessees = self.team()
         lessees[1].want()
         fleet.run(0.3)
@@ -83,7 +83,7 @@ class DeskTests(FleetCase):
         self.end(fleet, lessees)
 
     def test_answers_wait_for_the_disk(self) -> None:
-        """No member says that it has promised before its promise would survive its end."""
+        """A member sends a promise only after it is stored durably."""
         fleet = self.swarm(4)
         stores = [SlowStore() for _ in range(4)]
         for node, store in zip(fleet.nodes, stores, strict=True):
@@ -107,7 +107,7 @@ class DeskTests(FleetCase):
         self.end(fleet, [lessee])
 
     def test_council_changes_over_the_wire(self) -> None:
-        """A change, and the end of the task, are decided between real nodes, and a claimant is led on."""
+        """Real nodes decide a change of the council and the end of the task, and redirect a client."""
         fleet, task, lessees = self.team(5)
         outsiders = [n.entangled.contact for n in fleet.nodes if n.entangled.contact not in task.council]
         following = [task.council[0], *outsiders[:2]]
@@ -121,7 +121,7 @@ class DeskTests(FleetCase):
         self.end(fleet, lessees)
 
     def test_news_for_nobody(self) -> None:
-        """News of a release of which nobody here waits, or that a forgotten claim would have heard, is no accident."""
+        """A release notification for an unknown or forgotten claim is ignored."""
         fleet, task, lessees = self.team()
         to = fleet.nodes[2].entangled.contact
         self.assertIsNone(
@@ -138,12 +138,12 @@ class InTimeTests(SynchronousTestCase):
         self.until = 1.0
 
     def proposed(self) -> Reply:
-        """A member that grants from a moment on."""
+        """Return the reply of a member that grants from ``until`` on."""
         left = self.until - self.clock.seconds()
         return Reply(Kind.HELD, remaining=left) if left > 0.0 else Reply(Kind.GRANTED)
 
     def test_answers_when_the_lease_ends(self) -> None:
-        """What comes a moment too early is granted at the moment from which it may be, not refused."""
+        """A proposal shortly before the end of a lease is granted at that time instead of refused."""
         self.clock.advance(1.0 - MOST_WAIT_S + 0.01)
         answer = in_time(self.proposed, self.clock)
         self.clock.advance(MOST_WAIT_S - 0.02)
@@ -152,7 +152,7 @@ class InTimeTests(SynchronousTestCase):
         self.assertEqual(self.successResultOf(answer).kind, Kind.GRANTED)
 
     def test_a_lease_that_is_renewed(self) -> None:
-        """Who was waited for in vain, since the lease goes on, is refused as late as it would have been granted."""
+        """If the lease is renewed meanwhile, the waiting proposal is refused at the time of its expected end."""
         self.clock.advance(0.95)
         answer = in_time(self.proposed, self.clock)
         self.until = 2.0
@@ -160,12 +160,12 @@ class InTimeTests(SynchronousTestCase):
         self.assertEqual(self.successResultOf(answer).kind, Kind.HELD)
 
     def test_answers_at_once(self) -> None:
-        """Whatever is no matter of a moment is answered now."""
+        """A reply that needs no short wait is returned at once."""
         for reply in (Reply(Kind.GRANTED), Reply(Kind.OUTBID), Reply(Kind.HELD, remaining=MOST_WAIT_S + 0.01)):
             self.assertEqual(self.successResultOf(in_time(lambda reply=reply: reply, self.clock)), reply)  # type: ignore[misc]
 
     def test_nobody_waits_any_more(self) -> None:
-        """An answer for which nobody waits any more leaves nothing on the clock, and grants nothing."""
+        """A cancelled answer leaves no timer and grants nothing."""
         self.clock.advance(0.95)
         answer = in_time(self.proposed, self.clock)
         answer.addErrback(lambda _: None)

@@ -26,7 +26,7 @@ ANYTHING = st.recursive(
 
 class BallotTests(SynchronousTestCase):
     def test_lives(self) -> None:
-        """Ballots of one life of an agent are kin; those of another agent or another life are not."""
+        """Ballots of one run of an agent are kin; ballots of another agent or after a restart are not."""
         one = Ballot(3 * LIFE + 7, "a")
         self.assertTrue(one.is_kin(Ballot(9 * LIFE + 7, "a"), LIFE))
         self.assertFalse(one.is_kin(Ballot(3 * LIFE + 7, "b"), LIFE))
@@ -35,7 +35,7 @@ class BallotTests(SynchronousTestCase):
 
 class ReplyTests(SynchronousTestCase):
     def test_there_and_back(self) -> None:
-        """What is packed is read as it was, of every kind."""
+        """Replies of every kind survive packing and unpacking."""
         for kind in Kind:
             reply = Reply(kind, Ballot(5, "a"), 3, 1.25, 2)
             if kind is Kind.SEALED:
@@ -43,14 +43,14 @@ class ReplyTests(SynchronousTestCase):
             self.assertEqual(unpack_reply(pack_reply(reply)), reply)
 
     def test_strange_durations(self) -> None:
-        """What cannot be a duration counts as none."""
+        """An invalid duration is read as 0."""
         for strange in (-1.0, float("nan")):
             read = unpack_reply(["granted", 1, "a", 1, strange, 1, []])
             assert read is not None
             self.assertEqual(read.remaining, 0.0)
 
     def test_unlawful(self) -> None:
-        """Anything else is no reply."""
+        """Any other content is not a reply."""
         good = pack_reply(Reply(Kind.GRANTED, Ballot(5, "a"), 3, 1.25, 2))
         for place, bad in (
             (0, "yes"),
@@ -70,7 +70,7 @@ class ReplyTests(SynchronousTestCase):
             self.assertIsNone(unpack_reply(other))
 
     def test_councils(self) -> None:
-        """A council has contacts, not too many, and none twice."""
+        """A council consists of a limited number of distinct contacts."""
         packed = [member.packed() for member in MEMBERS]
         self.assertEqual(members_of(packed[:MAX_COUNCIL]), MEMBERS[:MAX_COUNCIL])
         for bad in (packed, [packed[0], packed[0]], [[b"k", "h", 1]], [1], None, b"x"):
@@ -79,17 +79,17 @@ class ReplyTests(SynchronousTestCase):
     @settings(max_examples=300)
     @given(ANYTHING)
     def test_total(self, answer: object) -> None:
-        """Whatever a peer answers is read as a reply or as none, and never an accident."""
+        """Any answer of a peer is a reply or None, and never raises."""
         read = unpack_reply(answer)
         self.assertTrue(read is None or read.remaining >= 0.0)
         members_of(answer)
 
 
 class NoteTests(SynchronousTestCase):
-    """Notes as the versions before wrote them."""
+    """Tests of stored entries in the formats of earlier versions."""
 
     def test_old_notes(self) -> None:
-        """What was promised, leased, accepted and closed is read, whether the row has a proof and a grantee or not."""
+        """Promises, leases, accepted values and closes are read from rows with and without proof and grantee."""
         codec, members = CODEC, [member.packed() for member in MEMBERS[:3]]
         row = [2, [9, "b", 7, "a", 5, "c", 9, "b"], 4, 1.5, members, True, b"proof", "d"]
         for length, proof, grantee in ((6, b"", "a"), (7, b"proof", "a"), (8, b"proof", "d")):
@@ -104,7 +104,7 @@ class NoteTests(SynchronousTestCase):
         self.assertEqual(codec.bucket_of("t"), f"lease/{zlib.crc32(b't') % 64}")
 
     def test_old_floors(self) -> None:
-        """The floor of the version that had one for ballots and tokens, and that of the one before this."""
+        """The lower bounds of both earlier versions are read, with one number or two."""
         self.assertEqual(CODEC.unpack_floor(msgpack.packb([40, 2.0])), Floor(40, 40, 2.0))
         self.assertEqual(CODEC.unpack_floor(msgpack.packb([40, 2.0, 7])), Floor(40, 7, 2.0))
         self.assertEqual(CODEC.pack_floor(Floor(40, 7, 2.0)), msgpack.packb([40, 2.0, 7]))

@@ -11,7 +11,7 @@ from tests.middleware.consensus.lease.room import TTL, RoomCase, T
 
 class LesseeTests(RoomCase):
     def test_release_by_the_listener(self) -> None:
-        """A listener that gives up when the lease is lost ends the claim: nothing is asked after it."""
+        """A callback that releases when the lease is lost ends the claim: no further request is sent."""
         for lose in ("outrank", "cut"):
             self.room = self.made(seed=f"listener {lose}")
             lessee = self.wanting(0)
@@ -26,7 +26,7 @@ class LesseeTests(RoomCase):
             self.assertIs(lessee.state, State.IDLE, lose)
 
     def test_first_in_line_is_ready(self) -> None:
-        """It has the lease as soon as the one before it ends at a majority and an answer has come, and never sooner."""
+        """The first standby gets the lease as soon as it expires at a majority, and never earlier."""
         for seed in range(5):
             self.room = self.made(seed=f"ready {seed}")
             self.wanting(0)
@@ -41,7 +41,7 @@ class LesseeTests(RoomCase):
             self.assertIsNotNone(self.lessee(1).lease, seed)
 
     def test_ready_for_a_lease_that_is_renewed(self) -> None:
-        """Who was promised the lease of a holder that was away is no takeover when that comes back in time."""
+        """A standby with a promise does not take over if the holder returns in time."""
         self.wanting(0)
         self.lessee(1).stand_by(1)
         self.run_for(TTL)
@@ -53,7 +53,7 @@ class LesseeTests(RoomCase):
         self.assertEqual((self.holders(), self.token(0)), ([0], 1))
 
     def test_place_in_the_line_that_changes(self) -> None:
-        """Who is moved up or down shortly before the lease ends claims at the time of its new place."""
+        """A standby with a rank that changes shortly before the end of the lease claims at the time of its new rank."""
         for seed in range(5):
             self.room = self.made(seed=f"moved {seed}")
             self.wanting(0)
@@ -68,7 +68,7 @@ class LesseeTests(RoomCase):
             self.assertEqual(self.holders()[-1:], [2], seed)
 
     def test_place_in_the_line_that_changes_after_a_release(self) -> None:
-        """Who did not learn from a majority how long the lease lasts claims what is released, wherever it is moved."""
+        """A standby that does not know the remaining time from a majority claims after a release, at any new rank."""
         self.cut(1, 4, 5)
         self.lessee(1).stand_by(3)
         self.run_for(1.5 * TTL)
@@ -80,7 +80,7 @@ class LesseeTests(RoomCase):
         self.assertEqual(self.holders(), [1])
 
     def test_council_that_moved(self) -> None:
-        """Who looks and hears that the council is another one by now asks that at once, and so is told of a release."""
+        """A standby that learns of a new council polls it at once, and is notified of a release there."""
         self.wanting(0)
         self.lessee(1).stand_by(1)
         moved = self.lessee(0).move([self.room.contacts[place] for place in (3, 4, 6)])
@@ -92,7 +92,7 @@ class LesseeTests(RoomCase):
         self.assertEqual(self.holders(), [1])
 
     def test_second_in_line_lets_the_first_try(self) -> None:
-        """Of two that find at one moment that nobody holds the lease, the first in line has it."""
+        """Of two standbys that find the lease free at the same time, the first in rank gets it."""
         for seed in range(5):
             self.room = self.made(seed=f"free {seed}")
             for place, rank in ((2, 2), (1, 1)):
@@ -102,7 +102,7 @@ class LesseeTests(RoomCase):
             self.assertEqual(self.holders(), [1], seed)
 
     def test_heir_that_never_looked(self) -> None:
-        """Whoever hears of a release before its first look claims above what it has not heard of, at the first try."""
+        """A standby that is notified before its first poll claims with a sufficient ballot at its first attempt."""
         for seed in range(5):
             self.room = self.made(seed=f"heir {seed}")
             for _ in range(4):
@@ -114,7 +114,7 @@ class LesseeTests(RoomCase):
             self.assertEqual(self.holders(), [1], seed)
 
     def test_member_that_keeps_silent(self) -> None:
-        """A holder goes on under its ballot while a member may grant nothing yet: another would serve no better."""
+        """A holder keeps its ballot while a restarted member cannot grant yet, because another would not help."""
         self.room.kill(3)
         self.room.stores[3] = MemoryStore()
         self.room.bidders[3] = self.room.born(3)
@@ -125,7 +125,7 @@ class LesseeTests(RoomCase):
             self.assertEqual(self.room.bidders[place].acceptor.log.get(T).holder, first)  # type: ignore[union-attr]
 
     def test_stand_by_that_is_named(self) -> None:
-        """Who stands by and is wanted then keeps its place; who holds the lease is not put off by a rank."""
+        """A standby that then wants the lease gets it; a holder that is given a rank keeps its lease."""
         self.lessee(0).stand_by(3)
         self.lessee(0).want()
         self.run_for(2 * TTL)
@@ -135,7 +135,7 @@ class LesseeTests(RoomCase):
         self.assertEqual(self.holders(), [0])
 
     def test_outranked_while_it_holds(self) -> None:
-        """When the device says that it has obeyed a higher token its lease is void, and a higher one claimed."""
+        """If the device has obeyed a higher token, the holder's lease is void and it claims a higher token."""
         lessee = self.wanting(0)
         lessee.outrank(1)
         self.assertEqual(self.token(0), 1)
@@ -145,7 +145,7 @@ class LesseeTests(RoomCase):
         self.assertEqual(self.token(0), 8)
 
     def test_want_again_while_a_claim_is_under_way(self) -> None:
-        """What was asked for before the release is not used after it; the next claim has a token of its own."""
+        """Replies to a request from before a release are ignored; the next claim has a new token."""
         lessee = self.lessee(0)
         for _ in range(5):
             lessee.want()
@@ -156,7 +156,7 @@ class LesseeTests(RoomCase):
         self.assertEqual(self.holders(), [0])
 
     def test_claim_that_is_dropped_holds_nobody_up(self) -> None:
-        """A claim that its agent thinks better of is given back, whatever the members had granted by then."""
+        """A cancelled claim is released, whatever the members had granted by then."""
         for steps in range(1, 12):
             self.room = self.made(seed=f"dropped {steps}")
             self.wanting(0, 0.001 * steps)
@@ -165,7 +165,7 @@ class LesseeTests(RoomCase):
             self.assertEqual(self.holders(), [1], steps)
 
     def test_loss_is_told(self) -> None:
-        """Whoever held the lease and cannot renew it stops at its end, and claims again when it can."""
+        """A holder that cannot renew stops at its deadline, and claims again when it reaches the council."""
         lessee = self.wanting(0)
         self.cut(0, 3, 4)
         self.run_for(TTL)
@@ -177,7 +177,7 @@ class LesseeTests(RoomCase):
         self.assertEqual(self.token(0), 2)
 
     def test_member_that_promised_to_another_is_won_back(self) -> None:
-        """A holder goes on, with its token, though a member has promised a higher ballot while it did not hear it."""
+        """A holder keeps its lease and token, although a member promised a higher ballot while it was unreachable."""
         self.wanting(0)
         self.cut(0, 3)
         self.lessee(1).stand_by()
@@ -189,13 +189,13 @@ class LesseeTests(RoomCase):
         self.assertEqual((self.holders(), self.token(0)), ([0], 1))
 
     def test_time_to_stop_longer_than_the_lease(self) -> None:
-        """A robot that needs longer to stop than a lease lasts never gets to act."""
+        """A robot with a stopping time longer than the TTL never acts."""
         self.room = self.made(stop_time=2.0)
         self.wanting(0, 5.0)
         self.assertEqual(self.holders(), [])
 
     def test_claim_that_is_dropped_shortens_no_rest(self) -> None:
-        """Who gave a lease back and drops another claim tells, by a fast clock, no less of how long its robot moves."""
+        """Cancelling a later claim does not shorten the stopping time of the released lease, despite a fast clock."""
         self.room = self.made(stop_time=0.3, rates=(1.01, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0))
         self.wanting(0, 1.0)
         self.lessee(0).release()
@@ -210,7 +210,7 @@ class LesseeTests(RoomCase):
             self.assertGreaterEqual(until, stopped + 0.3)
 
     def test_rest_after_the_deadline_counts_on_the_clock_of_the_device(self) -> None:
-        """A holder with a fast clock that wakes after its deadline releases nothing before its robot stands still."""
+        """A holder with a fast clock that resumes after its deadline releases only when its robot stands still."""
         self.room = self.made(stop_time=0.3, rates=(1.01, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0))
         self.wanting(0, 1.0)
         machine, lease = self.room.bidders[0].machine, self.lessee(0).lease
@@ -227,7 +227,7 @@ class LesseeTests(RoomCase):
             self.assertGreaterEqual(until, obeyed_until + 0.3)
 
     def test_rough_weather(self) -> None:
-        """At half of everything lost, doubled and late there is still never more than one holder, and often one."""
+        """At 50 % loss, with duplicates and delays, there is never more than one holder, and often one."""
         self.room.radio.air = Air(0.02, 0.05, 0.5, 0.3, 5.0)
         for place in range(3):
             self.lessee(place).want()
@@ -242,11 +242,11 @@ class LesseeTests(RoomCase):
 
 class FigureTests(RoomCase):
     def test_takeover(self) -> None:
-        """Two hundred executors die at 10 % loss: half of them are followed within 1.5 s, 99 of 100 within 2."""
+        """Of two hundred takeovers at 10 % loss, half take less than 1.5 s, and 99 of 100 less than 2 s."""
         seconds = sorted(takeover(seed) for seed in range(200))
         self.assertLess(seconds[100], 1.5)
         self.assertLess(seconds[198], 2.0)
 
     def test_upkeep(self) -> None:
-        """To keep a lease costs at most twelve datagrams a second."""
+        """Keeping a lease takes at most twelve datagrams per second."""
         self.assertLessEqual(upkeep(), 12.0)

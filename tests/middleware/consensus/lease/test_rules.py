@@ -1,4 +1,4 @@
-"""The rules of leases and fencing, each a test that names it."""
+"""Tests of the rules of leases and fencing, each named after its rule."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.middleware.consensus.lease.room import TTL, RoomCase, T
 
 class PinnedTests(FleetCase):
     def test_rule_1_council_is_pinned(self) -> None:
-        """The council is the three nodes closest to the task's key at its creation, also when closer ones come."""
+        """The council is the three nodes closest to the task's key at its creation, even if closer nodes join later."""
         fleet = self.swarm(4)
         task = self.done(fleet, Deferred.fromCoroutine(fleet.nodes[0].submit(Task("t1", "search", "Find it"))), 1.0)
         key = group_key("t1")
@@ -38,7 +38,7 @@ class PinnedTests(FleetCase):
 
 class RuleTests(RoomCase):
     def test_rule_2_council_changes_by_a_majority_of_the_old_one(self) -> None:
-        """Configuration + 1, decided by the old council and never while a claim is open."""
+        """The old council decides a change by a majority, with configuration + 1, and never during an open claim."""
         council = self.lessee(1).council
         following = [self.room.contacts[n] for n in (0, 1, 2)]
         self.wanting(0)
@@ -52,7 +52,7 @@ class RuleTests(RoomCase):
         self.assertEqual((council.configuration, list(council.members)), (2, following))
 
     def test_rule_3_durations_travel_never_times(self) -> None:
-        """Clocks that show quite other times work together, and no moment of any clock is on the wire."""
+        """Nodes with different clocks work together, and no message contains a time of a clock."""
         sent: list[float] = []
         for bidder in self.room.bidders:
             answer = bidder.answer
@@ -71,7 +71,7 @@ class RuleTests(RoomCase):
         self.assertLessEqual(max(sent), TTL)
 
     def test_rule_4_token_outlives_restarts(self) -> None:
-        """Each lease has a higher token than all before it, though every member was restarted in between."""
+        """Each lease has a higher token than all earlier ones, although every member is restarted in between."""
         tokens = []
         for place in (0, 1, 2, 0):
             self.wanting(place)
@@ -85,7 +85,7 @@ class RuleTests(RoomCase):
         self.assertEqual(tokens, sorted(set(tokens)))
 
     def test_rule_4_restarted_member_keeps_silent(self) -> None:
-        """A member that lost its store grants nothing for the longest ttl; one whose store was synced need not wait."""
+        """A member that lost its store grants nothing for the maximum TTL; with its store it grants at once."""
         for is_lost in (True, False):
             self.room = self.made(seed=f"silent {is_lost}")
             self.wanting(0)
@@ -102,7 +102,7 @@ class RuleTests(RoomCase):
             self.assertEqual(self.holders(), [1])
 
     def test_rule_5_deadline_counts_from_the_sending(self) -> None:
-        """It is the moment of sending + ttl x (1 - 2 rho) - the time to stop, however late the answers come."""
+        """The deadline is the send time + TTL x (1 - 2 rho) - the stopping time, however late the answers arrive."""
         self.room = self.made(stop_time=0.3)
         lessee = self.lessee(0)
         self.wanting(0)
@@ -120,7 +120,7 @@ class RuleTests(RoomCase):
         self.assertGreater(sent, asked_at[0] - 0.02)
 
     def test_rule_5_next_one_starts_when_the_robot_stands(self) -> None:
-        """The next holder never begins before the last one's robot has come to rest, with clocks 1 % apart."""
+        """The next holder never starts before the previous robot stands still, with clocks that differ by 1 %."""
         for stop_time in (0.0, 0.4):
             self.room = self.made(stop_time, [0.99, 1.01, 1.0, 1.01, 1.01, 1.01, 1.0])
             lessee = self.wanting(0, 1.0)
@@ -138,7 +138,7 @@ class RuleTests(RoomCase):
             self.assertEqual(self.room.referee.found, [])
 
     def test_rule_6_stand_by_asks_when_pushes_are_lost(self) -> None:
-        """Whoever stands by takes over although it hears of no release, for it asks in every third of a ttl."""
+        """A standby takes over without a notification of the release, because it polls three times per TTL."""
         self.wanting(0)
         self.lessee(1).stand_by()
         self.run_for(TTL)
@@ -148,7 +148,7 @@ class RuleTests(RoomCase):
         self.assertEqual(self.holders(), [1])
 
     def test_rule_6_renewed_three_times_a_ttl(self) -> None:
-        """Two rounds in which nothing gets through do not cost the lease."""
+        """Two lost rounds of renewal do not lose the lease."""
         self.wanting(0)
         for _ in range(20):
             lease = self.lessee(0).lease
@@ -160,7 +160,7 @@ class RuleTests(RoomCase):
         self.assertEqual(self.token(0), 1)
 
     def test_rule_7_suspended_holder_knows_that_time_has_passed(self) -> None:
-        """Who wakes from a suspension holds nothing and sends nothing, and takes its late timer for a pause."""
+        """A holder that resumes after a suspension has no lease, sends nothing, and counts one pause."""
         lessee = self.wanting(0, 1.0)
         self.lessee(1).stand_by()
         self.run_for(0.2)
@@ -175,7 +175,7 @@ class RuleTests(RoomCase):
         self.assertEqual(self.room.referee.found, [])
 
     def test_rule_7_clock_that_stands_still_is_not_enough(self) -> None:
-        """On a clock that does not count the suspension the same holder would believe in its old lease."""
+        """With a clock that stops during a suspension the holder would wrongly trust its old lease."""
         self.patch(Machine, "COUNTS_SUSPENSION", False)
         lessee = self.wanting(0, 1.0)
         self.room.bidders[0].machine.freeze(is_suspended=True)
@@ -183,7 +183,7 @@ class RuleTests(RoomCase):
         self.assertIsNotNone(lessee.lease)
 
     def test_rule_8_device_refuses_lower_tokens_and_stops_by_itself(self) -> None:
-        """The device keeps the highest token, whoever sends, and says when its motion is over without being asked."""
+        """The device rejects lower tokens from any sender, and its gate ends a motion at its deadline."""
         gate = Gate()
         gate.admit(Permit(2, 5.0), 4.0)
         self.assertRaises(StaleCommand, gate.admit, Permit(1, 9.0), 4.1)
@@ -191,7 +191,7 @@ class RuleTests(RoomCase):
         self.assertEqual((gate.is_over(4.9), gate.is_over(5.0)), (False, True))
 
     def test_rule_9_the_end_carries_the_token(self) -> None:
-        """Who held the task before cannot conclude it under its old token; of two results the higher token holds."""
+        """A former holder cannot close the task under its old token; of two results the higher token wins."""
         self.wanting(0)
         self.lessee(0).release()
         self.wanting(1)
@@ -209,7 +209,7 @@ class RuleTests(RoomCase):
             self.assertEqual(outcome_of(Task(T, "search", "Find it"), told), results[0])
 
     def test_rule_10_graceful_leave(self) -> None:
-        """Stopped, given back, and in a fifth of a second the first that stands by acts, after the time to stop."""
+        """After a release the first standby acts within 0.2 s, not counting the stopping time."""
         for stop_time in (0.0, 0.4):
             self.room = self.made(stop_time)
             self.wanting(0)
@@ -224,7 +224,7 @@ class RuleTests(RoomCase):
             self.assertEqual(self.room.referee.found, [])
 
     def test_rule_11_suspicion_shortens_no_lease(self) -> None:
-        """However often a stand-by suspects, the holder's lease runs on; and when it ends the stand-by is ready."""
+        """Suspicion by a standby does not shorten the lease; when it ends, the standby is ready."""
         self.wanting(0)
         self.lessee(1).stand_by()
         for _ in range(40):

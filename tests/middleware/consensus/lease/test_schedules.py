@@ -1,4 +1,4 @@
-"""The workload of leases in short: some schedules, their replay, and a seeded bug that each kind of check shows."""
+"""Short tests of the workload of leases: schedules, their replay, and seeded bugs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tests.invariants.run import run
 
 class ScheduleTests(SynchronousTestCase):
     def test_no_violation(self) -> None:
-        """Twenty schedules of faults pass, in which leases were won many times and councils have changed."""
+        """Twenty schedules with faults pass, with many leases won and councils changed."""
         wins = changes = 0
         for seed in range(1, 21):
             schedule = Leases(seed)
@@ -22,13 +22,13 @@ class ScheduleTests(SynchronousTestCase):
         self.assertGreater(changes, 0)
 
     def test_replay(self) -> None:
-        """The same seed gives the same datagrams, another one others."""
+        """The same seed gives the same datagrams, another seed different ones."""
         digests = [run(seed, ("leases",)).digest for seed in (3, 3, 4)]
         self.assertEqual(digests[0], digests[1])
         self.assertNotEqual(digests[0], digests[2])
 
     def test_bugs_show(self) -> None:
-        """Seeded bugs of safety, liveness and the device are each found within few schedules."""
+        """Seeded bugs of safety, liveness and the device are each found within a few schedules."""
         for bug in (
             "a clock that stands still while suspended",
             "the council is whoever is closest now",
