@@ -37,7 +37,7 @@ LOADERS = {
     "webnode.routes.table",
 }
 HOOKS = {("middleware.entangled.wire.message", hook) for hook in ("ext_hook", "object_hook")}
-"""The first one refuses every extension, the second one counts."""
+"""Hooks that are allowed: the first one refuses every extension, the second one counts."""
 LOG = ("debug", "info", "warn", "error", "critical", "failure")
 FIRED: list[str] = []
 

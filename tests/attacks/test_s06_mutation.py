@@ -24,7 +24,7 @@ TARGETS: dict[str, tuple[Callable[[bytes], None], int]] = {
 }
 BOUNDED = settings(max_examples=120)
 SLOWEST_S = 0.25
-"""For one input: the promise is a millisecond on a quiet machine; this is for a busy one, with the checks around."""
+"""Maximum seconds for one input on a busy machine; an idle machine needs about a millisecond."""
 
 
 class MutationTests(SynchronousTestCase):

@@ -56,7 +56,7 @@ ARGUMENTS: dict[str, tuple[object, ...]] = {
     "stream.open": ("camera",),
     "stream.part": ("camera", 1, 0, 1, b"x", 0),
 }
-"""What the methods of a node take; the others get nothing."""
+"""Arguments of the methods of a node; the other methods are called without any."""
 
 
 class RecordedQuestionTests(SiegeCase):

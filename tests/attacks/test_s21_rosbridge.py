@@ -23,7 +23,7 @@ from tests.formats.rfc6455 import CONTINUATION, PING, PONG, TEXT, framed
 READ = 65536
 """Bytes that a reactor reads at once."""
 ROOM = 24 * 2**20
-"""Bytes that a message may cost beside itself."""
+"""Maximum memory in bytes for decoding an accepted message."""
 
 
 def published(inner: bytes) -> bytes:

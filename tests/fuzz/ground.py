@@ -32,7 +32,7 @@ STRANGER = Address("10.0.0.9", 999)
 LEFT_OUT = ("door", "counters", "_counters", "_rng", "_network", "_clock", "_log", "_limit", "_cookie_limit", "_bucket")
 PLAIN = frozenset((bytes, str, int, float, bool, type(None)))
 APART = (FunctionType, MethodType, type, random.Random, HeapClock, Switchboard)
-"""What is not a part of what a node remembers."""
+"""Types that are not part of a node's state."""
 
 
 class Violation(AssertionError):

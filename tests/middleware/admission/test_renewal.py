@@ -10,7 +10,7 @@ from middleware.admission.statement import YEAR
 from tests.middleware.admission.village import DAY, House, Village, VillageCase
 
 STEP_DAYS, STEP_S = 5, 12.0
-"""The wall clock advances by so many days while the nodes run for so many seconds."""
+"""The wall clock advances by ``STEP_DAYS`` while the nodes run for ``STEP_S`` seconds."""
 
 
 class Years(Village):

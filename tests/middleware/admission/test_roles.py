@@ -40,7 +40,7 @@ from tests.swarmnode.team import KEY, World
 from webnode import revocation
 
 ABSENT = ("roll.", "reach.")
-"""What the methods begin with that not every node has."""
+"""Prefixes of the methods that not every node exposes."""
 
 
 class RoleDoor(OpenDoor):

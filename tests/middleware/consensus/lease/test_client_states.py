@@ -28,7 +28,7 @@ QUESTIONS = {
 }
 GRANTED = (Event.GRANTS, Event.PARTIAL_GRANTS)
 OWN = (Event.KEPT, Event.OUTBID)
-"""Events that happen only while the own lease is valid."""
+"""Events that occur only while the client's lease is valid."""
 
 
 def explore() -> dict[tuple[State, bool], tuple[Event, ...]]:
