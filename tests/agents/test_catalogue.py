@@ -30,7 +30,7 @@ class CatalogueTests(SynchronousTestCase):
         self.assertEqual(refusals(capabilities, TASKS["fetch-the-ball"].requirements), ["has no gripper"])
 
     def test_phone_can_watch_and_no_more(self) -> None:
-        """A phone meets the requirements to watch the target, but not those of the tasks that need a mobile base."""
+        """A phone meets the requirements to watch the target; the tasks that need a mobile base refuse it."""
         phone, dog = describe("phone", {}).capabilities, describe("sim", {}, "dog1").capabilities
         self.assertEqual([refusals(each, TASKS["watch-target"].requirements) for each in (phone, dog)], [[], []])
         self.assertIn("has no base2d", refusals(phone, TASKS[DEMO].requirements))

@@ -56,7 +56,7 @@ class ReadingTests(SynchronousTestCase):
         self.assertEqual(by("capability_cost", busy, free).assigned, "b")
 
     def test_vote_decides(self) -> None:
-        """The option with the most weight wins, the cheapest agent that voted for it acts, and the reason names it."""
+        """The option with the most weight wins, its cheapest voter acts, and the reason names the option."""
         one, two = replace(member("a", 1.0), choice="red"), replace(member("b", 2.0), choice="blue")
         three = replace(member("c", 3.0), choice="blue")
         decision = by("weighted_vote", one, two, three)
@@ -97,7 +97,7 @@ class DecisionTests(SynchronousTestCase):
         self.assertEqual(decision.assigned, "z")
 
     def test_acting_member_with_an_unlawful_report_gives_way(self) -> None:
-        """An acting agent whose cost is invalid or out of range loses the task to one with a valid cost."""
+        """An acting agent with an invalid or too large cost loses the task to one with a valid cost."""
         nonsense: list[Any] = [10**400, float("inf"), float("nan"), -1.0, True, "1", 1e300]
         for cost in nonsense:
             self.assertIsNone(decided(member("z", cost, EXECUTING)).assigned)

@@ -15,13 +15,13 @@ WHEELS = Description("w", "", {"camera": {}}, {"base.vx": (-0.2, 0.2), "base.wz"
 
 
 def with_camera(**properties: float) -> Means:
-    """Return the motion capabilities of a wheeled robot whose camera has these properties."""
+    """Return the motion capabilities of a wheeled robot with this camera."""
     return Means(replace(WHEELS, capabilities={"camera": properties}))
 
 
 class DescriptionTests(SynchronousTestCase):
     def test_unknown_body_is_an_ers7(self) -> None:
-        """Without a description the capabilities equal exactly those of the simulated dog."""
+        """Without a description the capabilities are exactly the simulated dog's."""
         for name in ("walk", "turn", "look_turn", "strafes", "ranges", "lens", "ahead", "stop_at", "fresh", "aim"):
             self.assertEqual(getattr(Means(), name), getattr(Means(described("sim")), name), name)
         self.assertEqual((Means().walk, Means().look_turn, Means().stop_at, Means().aim), (0.16, 1.6, STOP_AT, FACING))

@@ -64,7 +64,7 @@ class CommandTests(SynchronousTestCase):
             self.assertEqual(command(letter, value).hex(" "), golden)
 
     def test_reads_commands_cut_anyhow(self) -> None:
-        """Commands that arrive byte by byte are read like those that arrive at once."""
+        """The reader gives the same commands for single bytes as for the whole stream."""
         reader = CommandReader()
         stream = command("f", 0.5) + command("r", -0.25)
         seen = [one for at in range(len(stream)) for one in reader.read(stream[at : at + 1])]

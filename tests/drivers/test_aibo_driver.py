@@ -31,7 +31,7 @@ class AiboCase(RobotCase):
 
 
 class AiboDriverTests(Conformance, AiboCase):
-    """The driver of a Tekkotsu 4 dog passes the conformance tests and those of its additional functions."""
+    """The driver of a Tekkotsu 4 dog passes the conformance tests and further tests of its functions."""
 
     def test_senses_what_an_ers7_has(self) -> None:
         """Ranges, accelerations, power, buttons, joints, switch, dialect and estimated odometry are observed."""
@@ -96,7 +96,7 @@ class AiboDriverTests(Conformance, AiboCase):
         self.assertEqual(self.true_speed(), 0.0)
 
     def test_names_rubbish_once(self) -> None:
-        """Invalid data is logged once, and once more if it starts again after valid data."""
+        """Invalid data is logged once, and a second time if it starts again after valid data."""
         ear = Ear()
         self.addCleanup(ear.close)
         self.ready()

@@ -40,7 +40,7 @@ class BittleCase(RobotCase):
 
 
 class BittleDriverTests(Conformance, BittleCase):
-    """The driver of a Bittle on a serial port passes the conformance tests and those of its own functions."""
+    """The driver of a Bittle on a serial port passes the conformance tests and further tests of its functions."""
 
     def test_returns_the_gait_that_it_really_has(self) -> None:
         """``act`` returns the velocity of the nearest gait, and the dog moves at this velocity."""

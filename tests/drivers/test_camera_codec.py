@@ -71,7 +71,7 @@ class StreamReaderTests(SynchronousTestCase):
             for has_length in (False, True):
                 said = [part(picture, has_length) for picture in (FIRST, SECOND, FIRST)]
                 data = answer(is_chunked=is_chunked) + b"".join(map(chunk, said) if is_chunked else said)
-                # Without a length a picture ends where the next one begins.
+                # Without a length a picture ends at the start of the next one.
                 self.assertEqual(read(data, 5)[0], [FIRST, SECOND, FIRST][: 3 if has_length else 2])
 
     def test_finds_its_way_back(self) -> None:

@@ -26,7 +26,7 @@ def jpeg(mark: int) -> bytes:
 
 
 class CameraDriverTests(Conformance, RobotCase):
-    """The camera driver passes the conformance tests for sensors and those of its own functions."""
+    """The camera driver passes the conformance tests for sensors and further tests of its functions."""
 
     STEP_S = 0.01
     kind = "camera"

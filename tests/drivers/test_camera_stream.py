@@ -23,7 +23,7 @@ URL = "http://10.0.0.7:81/stream"
 
 
 class StreamTests(Conformance, RobotCase):
-    """The driver of a network camera passes the conformance tests for sensors and those of its own functions."""
+    """The driver of a network camera passes the conformance tests for sensors and further tests of its functions."""
 
     END_S = 1.0
     kind = "camera"

@@ -54,7 +54,7 @@ class HeadingTests(SynchronousTestCase):
             self.assertRaises(BadFrame, heading_in, line)
 
     def test_writes_what_it_reads(self) -> None:
-        """The encoder produces sentences that equal those of real compasses."""
+        """The encoder produces the same sentences as real compasses."""
         self.assertEqual(sentence("HCHDG", "98.3", "0.0", "E", *eastward(-12.6)), b"$HCHDG,98.3,0.0,E,12.6,W*57\r\n")
         self.assertEqual(sentence("GPHDT", "274.07", "T"), b"$GPHDT,274.07,T*03\r\n")
 

@@ -16,7 +16,7 @@ from tests.drivers.contract import KeptLink, KeptLog, RobotCase
 
 
 class CompassDriverTests(Conformance, RobotCase):
-    """The compass driver passes the conformance tests for sensors and those of its own functions."""
+    """The compass driver passes the conformance tests for sensors and further tests of its functions."""
 
     kind = "compass"
     options = {"rate": 20, "host": "10.0.0.8"}

@@ -30,7 +30,7 @@ class Create2Case(RobotCase):
 
 
 class Create2DriverTests(Conformance, Create2Case):
-    """The Create 2 driver passes the conformance tests and those of its own functions."""
+    """The Create 2 driver passes the conformance tests and further tests of its functions."""
 
     def test_tells_what_it_feels(self) -> None:
         """Bumpers, cliffs, wheel drops, light, battery and mode arrive under the keys of their capabilities."""

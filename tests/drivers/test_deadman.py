@@ -64,7 +64,7 @@ class Way(Open):
 
 
 class WatchTests(SynchronousTestCase):
-    """The moment of the halt."""
+    """The time and the number of halts."""
 
     def setUp(self) -> None:
         """Guard a robot that may move until 10."""
