@@ -1,6 +1,6 @@
-"""The dead man's switch with real processes: a program that drives an emulated robot is frozen, killed and interrupted.
+"""Tests of the dead man's switch with real processes: a program that drives an emulated robot is frozen or killed.
 
-The robots are in this process, behind real sockets and pseudo-terminals; whoever drives them is not.
+The robots are in this process, behind real sockets and pseudo-terminals; the driving program is a child process.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ LATE_S = 0.4
 
 @dataclass
 class TimedBody(MemoryBody):
-    """A body that keeps when it was told what."""
+    """A base that records its motions with their times."""
 
     told: list[tuple[float, tuple[float, float, float]]] = field(default_factory=list)
 
@@ -64,13 +64,13 @@ class TimedBody(MemoryBody):
         return any(self.motion)
 
     def rested_at(self) -> float:
-        """When it came to rest for the last time."""
+        """Return the time of the last stop."""
         moving = [place for place, (_, motion) in enumerate(self.told) if any(motion)]
         return self.told[moving[-1] + 1][0]
 
 
 def is_alive(pid: int) -> bool:
-    """Whether there is such a process, zombies aside."""
+    """Return whether the process exists and is no zombie."""
     try:
         state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
     except OSError:
@@ -79,13 +79,13 @@ def is_alive(pid: int) -> bool:
 
 
 def ignores_signals(pid: int) -> bool:
-    """Whether a process has come so far that it ignores SIGTERM."""
+    """Return whether the process has reached the point at which it ignores SIGTERM."""
     status = Path(f"/proc/{pid}/status").read_text()
     return bool(int(status.partition("SigIgn:")[2].split()[0], 16) >> (signal.SIGTERM - 1) & 1)
 
 
 class Puppeteer:
-    """Starts and reads the program that drives, in a session of its own."""
+    """Starts the driving program in a new session and reads its output."""
 
     def __init__(self, path: str, kind: str, options: dict[str, object]) -> None:
         self._path = Path(path)
@@ -128,7 +128,7 @@ class Puppeteer:
 
 
 class DeadManCase(TestCase):
-    """One robot, whose driver may be frozen."""
+    """A test case with one robot and a driving program that may be frozen."""
 
     timeout = 60
 
@@ -203,7 +203,7 @@ class Wire:
         self.far.close()
 
     def heard(self) -> bytes | None:
-        """What the robot has heard since the last time; None where the link is closed."""
+        """Return the data that has arrived at the robot, or None if the link is closed."""
         try:
             return self.far.recv(1 << 20) or None
         except BlockingIOError:
@@ -330,7 +330,7 @@ class KeeperTests(TestCase):
                 os.kill(pid or 0, signal.SIGKILL)
                 await until(lambda keeper=keeper: keeper.pid is None, 1.0)  # type: ignore[misc]
             elif stage == 3:
-                os.kill(pid or 0, signal.SIGSTOP)  # which hears of no end
+                os.kill(pid or 0, signal.SIGSTOP)  # which does not receive the end
             await keeper.close()
             await keeper.close()
             self.assertFalse(pid and Path(f"/proc/{pid}").exists())
@@ -338,7 +338,7 @@ class KeeperTests(TestCase):
 
 
 class AiboDeadManTests(DeadManCase):
-    """An AIBO, which by itself would walk on for three seconds."""
+    """An AIBO, which without a switch walks on for three seconds."""
 
     def setUp(self) -> None:
         super().setUp()
@@ -402,7 +402,7 @@ class AiboDeadManTests(DeadManCase):
 
 
 class Create2DeadManTests(DeadManCase):
-    """A Create 2 on a cable, which by itself would drive on for ever."""
+    """A Create 2 on a serial port, which without a switch drives on."""
 
     if not HAS_SERIAL:
         skip = "needs the extra serial"
@@ -428,7 +428,7 @@ class Create2DeadManTests(DeadManCase):
 
 
 class BittleDeadManTests(DeadManCase):
-    """A Bittle, which by itself would walk on for ever."""
+    """A Bittle, which without a switch walks on."""
 
     async def test_frozen_on_a_cable(self) -> None:
         """Its program is stopped: it stands soon after the deadline."""
@@ -459,14 +459,14 @@ class BittleDeadManTests(DeadManCase):
 
 
 class Restless(RosbridgeRobot):
-    """One whose base has no time-out, as few have."""
+    """A robot without a timeout in its base."""
 
     def _on_no_command(self) -> None:
-        """Go on."""
+        """Move on."""
 
 
 class RosbridgeDeadManTests(DeadManCase):
-    """A ROS robot whose base has no time-out."""
+    """A ROS robot without a timeout in its base."""
 
     async def test_frozen(self) -> None:
         """Its program is stopped: it stands soon after the deadline."""

@@ -1,4 +1,4 @@
-"""``swarm driver`` as a process, against an emulated dog on real sockets, with a pseudo-terminal for its keys."""
+"""Tests of ``swarm driver`` as a process, with an emulated dog on real sockets and a pseudo-terminal for its keys."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ COMMAND = [sys.executable, "-c", "import sys; from swarmnode.command import main
 
 
 class DriverCommandTests(TestCase):
-    """The command, the sockets and the terminal are real; the dog is not."""
+    """Command, sockets and terminal are real; the dog is emulated."""
 
     timeout = 60
 
     def setUp(self) -> None:
-        """A dog on ports of this machine."""
+        """Start a dog on ports of this machine."""
         clock = IReactorTime(reactor)
         self.body = MemoryBody(jpeg=JPEG, values={"power.level": 0.8})
         ports = free_ports()
@@ -52,7 +52,7 @@ class DriverCommandTests(TestCase):
         self.addCleanup(self.folder.cleanup)
 
     def started(self, *words: str, **more: Any) -> subprocess.Popen[bytes]:
-        """The command with these words, which is ended with the test."""
+        """Start the command with these words; it is killed after the test."""
         child = subprocess.Popen([*COMMAND, *words, *self.robot], cwd=ROOT, **more)
         self.addCleanup(child.wait)
         self.addCleanup(child.kill)

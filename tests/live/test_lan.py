@@ -1,4 +1,4 @@
-"""Tests of the LAN's group over real sockets: on the loopback, and between network namespaces that the test makes."""
+"""Tests of the LAN's multicast group over real sockets on the loopback interface."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ reactor: Any = _reactor
 
 
 class LoopbackTests(TestCase):
-    """Two places in the group on the loopback."""
+    """Two members of the group on loopback."""
 
     def group(
         self, host: str = "127.0.0.1", look: Any = interfaces, moved: Callable[[], None] = lambda: None
     ) -> tuple[LanMulticast, list[tuple[bytes, Address]]]:
-        """A place in the group, and what it hears."""
+        """Return a member of the group, and the list of datagrams that it receives."""
         heard: list[tuple[bytes, Address]] = []
         group = LanMulticast(reactor, host, look)
         group.listen(lambda datagram, source: heard.append((datagram, source)), moved)
@@ -32,7 +32,7 @@ class LoopbackTests(TestCase):
         return group, heard
 
     def soon(self, heard: list[Any], count: int = 1, tries: int = 200) -> Deferred[None]:
-        """Fire when so many were heard."""
+        """Return a Deferred that fires when ``count`` datagrams have arrived."""
 
         async def wait() -> None:
             for _ in range(tries):
@@ -52,7 +52,7 @@ class LoopbackTests(TestCase):
         self.assertEqual(heard_b[0][0], b"who?")
         source = heard_b[0][1]
         self.assertEqual(source.host, "127.0.0.1")
-        await self.soon(heard_a)  # its own call
+        await self.soon(heard_a)  # its own datagram
         answering = reactor.listenUDP(0, DatagramProtocol(), "127.0.0.1")
         self.addCleanup(answering.stopListening)
         answering.write(b"here", tuple(source))
@@ -73,7 +73,7 @@ class LoopbackTests(TestCase):
         self.assertEqual(changes, [1])
 
     def test_the_loopback_is_an_interface(self) -> None:
-        """The machine's interfaces are read, the loopback among them with its address."""
+        """The machine's interfaces are listed, including loopback with its address."""
         loopback = [each for each in interfaces() if each.is_loopback]
         self.assertIn("127.0.0.1", loopback[0].addresses)
 
