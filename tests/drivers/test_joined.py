@@ -196,7 +196,7 @@ class JoinedTests(Conformance, Create2Case):
         driver.disconnect()
 
     def test_is_as_fresh_as_its_robot(self) -> None:
-        """A part's values cause no observation, and do not make those of a silent robot look new."""
+        """A part's values cause no observation, and do not make a silent robot's look new."""
         compass = Part(self.clock)
         driver, seen = self.with_parts(compass), list[Observation]()
         driver.subscribe(seen.append)

@@ -26,7 +26,7 @@ class RosbridgeDriverTests(Conformance, RobotCase):
     kind = "rosbridge"
 
     def build(self) -> None:
-        """Create a robot whose floor is no obstacle."""
+        """Create a robot without obstacles."""
         self.body.jpeg = JPEG
         self.body.values = {"power.level": 0.8, "range.near": 0.5, "range.left": math.nan, "range.chest": 0.2}
         self.robot = RosbridgeRobot(self.clock, self.body, Random(1))

@@ -63,7 +63,7 @@ class Records(Workload):
             self._history.note(Counted, place, tuple(contact.node_id for contact in known))
         return []
 
-    # -- what clients do --------------------------------------------------------------------------------------------
+    # -- operations of clients --------------------------------------------------------------------------------------
 
     def _put(self, place: int) -> None:
         key, name = self._rng.choice(KEYS), self._rng.choice(NAMES)
@@ -114,7 +114,7 @@ class Records(Workload):
         node.endpoint.expose("find_node", lambda peer, target: named)
         node.endpoint.expose("members", lambda peer, after: [] if after else named)
 
-    # -- what everybody can see -------------------------------------------------------------------------------------
+    # -- observations -----------------------------------------------------------------------------------------------
 
     def _look(self) -> None:
         fleet = self._schedule.fleet

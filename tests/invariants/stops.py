@@ -1,9 +1,9 @@
 """Run random sequences of stops, releases, partitions, restarts and hostile messages on the halts of a small team.
 
-The halts are real.  The network below them delays, repeats and loses messages, disks lose unwritten data, and replicas
-forget records and return old ones.  Checked after each step: once a robot's node has acknowledged a stop by an honest
-operator, the robot stands until it receives a release that names this stop, from a member with the right to order.
-Checked at the end, with a healthy network: an operator can release the whole team.
+The halts are the product's.  The network below them delays, repeats and loses messages, disks lose unwritten data, and
+replicas forget records and return old ones.  Checked after each step: once a robot's node has acknowledged a stop by an
+honest operator, the robot stands until it receives a release that names this stop, from a member with the right to
+order.  Checked at the end, with a healthy network: an operator can release the whole team.
 
 ``python -m tests.invariants.stops --sequences 10000 --seed 1`` runs 10,000 sequences and prints the counts of events.
 """
@@ -185,7 +185,7 @@ class Net:
         for name in NODES:
             self.begin(name)
 
-    # -- what the lives ask -----------------------------------------------------------------------------------------
+    # -- interface for the nodes ------------------------------------------------------------------------------------
 
     def may(self, public: bytes) -> bool:
         """Return whether the owner of this key is a member with the right to order."""
@@ -230,7 +230,7 @@ class Net:
                 self.released(name, msgpack.unpackb(record.value or b""))
 
     def released(self, name: str, fields: object) -> None:
-        """Remove the released stops from those that the robot must obey."""
+        """Remove the released stops from the stops that the robot must obey."""
         statement = statement_of(fields)
         if statement is not None:
             self.owed[name] -= set(statement.released)
@@ -273,7 +273,7 @@ class Net:
 
         return answered.addCallback(acknowledged)
 
-    # -- what happens -----------------------------------------------------------------------------------------------
+    # -- events -----------------------------------------------------------------------------------------------------
 
     def begin(self, name: str) -> None:
         """Start a node."""
@@ -404,7 +404,7 @@ class Net:
             if to in self.lives:
                 self.deliver(sender, to, arguments).addErrback(_expected)
 
-    # -- what must hold ---------------------------------------------------------------------------------------------
+    # -- invariants -------------------------------------------------------------------------------------------------
 
     def check(self, what: str) -> None:
         """Check that no robot with an unreleased stop may move."""

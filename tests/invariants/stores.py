@@ -84,7 +84,7 @@ class Stores(Workload):
     def _unwritten(self, failure: Failure, place: int) -> None:
         self._say("S-c", f"node {place} cannot write: {failure.value}")
 
-    # -- a rotten store ---------------------------------------------------------------------------------------------
+    # -- a corrupt store --------------------------------------------------------------------------------------------
 
     def _born(self, place: int, node: EntangledNode) -> None:
         if self._fleet.decayed and self._fleet.decayed[-1] == place:

@@ -90,7 +90,7 @@ class Tasks:
         """A hash of all assignments and their times."""
         return hashlib.blake2s("".join(self.trace).encode(), digest_size=8).hexdigest()
 
-    # -- what happens -----------------------------------------------------------------------------------------------
+    # -- events -----------------------------------------------------------------------------------------------------
 
     def birth(self, place: int) -> None:
         """Start an agent."""
@@ -202,7 +202,7 @@ class Tasks:
             self.clock.advance(0.1)
             self.watch()
 
-    # -- what everybody can see -------------------------------------------------------------------------------------
+    # -- observations -----------------------------------------------------------------------------------------------
 
     def watch(self) -> None:
         """Inspect each agent."""

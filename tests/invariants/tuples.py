@@ -79,7 +79,7 @@ class Tuples(Workload):
             space.stop()
         return []
 
-    # -- lives ------------------------------------------------------------------------------------------------------
+    # -- start and end of nodes -------------------------------------------------------------------------------------
 
     def _born(self, place: int, node: EntangledNode) -> None:
         self._lives += 1
@@ -111,7 +111,7 @@ class Tuples(Workload):
         able = [m for m in there if seats[m.contact.public].incarnation == m.incarnation]
         return 2 * len(able) > len(posted.council)
 
-    # -- what clients do --------------------------------------------------------------------------------------------
+    # -- operations of clients --------------------------------------------------------------------------------------
 
     def _put(self) -> None:
         fields = ("job", self._number, self._number / 2)

@@ -125,7 +125,7 @@ class Wire(Workload):
                 self._history.note(Size, place, what, size, cap)
         return []
 
-    # -- shots (R1, R3) ---------------------------------------------------------------------------------------------
+    # -- injected datagrams (R1, R3) --------------------------------------------------------------------------------
 
     def _shoot(self, place: int) -> None:
         """Inject a datagram that the node must drop, and compare the node's state before and after."""
@@ -202,7 +202,7 @@ class Wire(Workload):
         half_open = len(node.endpoint._half_open._unconfirmed)
         self._history.note(Size, place, "handshakes with who showed no cookie", half_open, FLOOD * 4 // 5)
 
-    # -- questions (R2) ---------------------------------------------------------------------------------------------
+    # -- requests (R2) ----------------------------------------------------------------------------------------------
 
     def _born(self, place: int, node: EntangledNode) -> None:
         self._born_at[self._schedule.fleet.address(place)] = self._schedule.fleet.clock.seconds()

@@ -49,7 +49,7 @@ class LiveCameraTests(TestCase):
     timeout = 30
 
     async def test_camera_never_holds_the_reactor_up(self) -> None:
-        """A camera that blocks does so in its own thread; one that is lost comes back; the end frees it."""
+        """A blocking camera blocks only its thread, a lost one is opened again, and ``disconnect`` ends the thread."""
         lens = SlowLens()
         film = ThreadFilm(lens, reactor.callFromThread)
         driver = CameraDriver(checked({"fps": 30}), film, reactor, "cam")

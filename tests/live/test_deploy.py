@@ -35,7 +35,7 @@ Block = tuple[str, bool, list[str]]
 
 
 class DeployTests(NamespaceCase):
-    """Each computer has its name from the page, a separate home directory, and only what the page gives it."""
+    """Each computer has its name from the page, a separate home directory, and only the page's files."""
 
     def setUp(self) -> None:
         super().setUp()

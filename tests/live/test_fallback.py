@@ -69,7 +69,7 @@ class FallbackTests(BrowserCase):
         self.page.locator(".device[data-state=IDLE]", has_text="dog3").wait_for()
 
     def test_go_on_after_a_freeze(self) -> None:
-        """After a SIGSTOP the page changes to the other node, which executes the request, although connections open."""
+        """After a SIGSTOP, with connections still accepted, the page sends the request to the other node."""
         self.opened()
         os.kill(self.pid(0), signal.SIGSTOP)
         self.page.get_by_role("button", name="Run Demo").click()

@@ -44,7 +44,7 @@ class LoopbackTests(TestCase):
         return Deferred.fromCoroutine(wait())
 
     async def test_all_in_the_group_hear_a_call_and_can_answer(self) -> None:
-        """A call reaches every place in the group on one machine, and an answer reaches the caller."""
+        """A datagram to the group reaches each member on the machine, and an answer reaches the sender."""
         a, heard_a = self.group()
         _, heard_b = self.group()
         a.send(b"who?")
@@ -60,7 +60,7 @@ class LoopbackTests(TestCase):
         self.assertEqual(heard_a[1], (b"here", Address("127.0.0.1", answering.getHost().port)))
 
     async def test_a_change_is_told(self) -> None:
-        """When the interfaces change the node is told, after the first look and not at it."""
+        """A change of the interfaces is reported, but not their first reading."""
         loopback = Interface(1, "lo", ("127.0.0.1",), is_loopback=True)
         found = [[loopback], [loopback], [Interface(1, "lo", ("127.0.0.1", "::1"), is_loopback=True)]]
         changes: list[int] = []
@@ -78,7 +78,7 @@ class LoopbackTests(TestCase):
         self.assertIn("127.0.0.1", loopback[0].addresses)
 
     async def test_no_interface_is_no_error(self) -> None:
-        """Where there is no interface a call is lost, and closing twice does no harm."""
+        """Without an interface a datagram is lost, and ``close`` may be called twice."""
         group, heard = self.group("192.0.2.77", lambda: [])
         group.send(b"who?")
         await deferLater(reactor, 0.05)
