@@ -1,4 +1,4 @@
-"""Tests of swarm-node; Hypothesis draws the same examples in each run, however slow the machine is."""
+"""Tests of swarm-node; Hypothesis generates the same examples in each run, without a time limit."""
 
 from hypothesis import settings
 

@@ -1,4 +1,4 @@
-"""Test cases with simulated nodes, for everything that takes more than one."""
+"""Test cases with several simulated nodes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ T = TypeVar("T")
 
 
 class FleetCase(SynchronousTestCase):
-    """A test with a fleet; afterwards nothing may be left on its clock."""
+    """A test with simulated nodes; at its end no timers may be left."""
 
     worlds: list[Fleet | SwarmFleet]
 
@@ -24,13 +24,13 @@ class FleetCase(SynchronousTestCase):
         self.worlds = []
 
     def fleet(self, n: int, seed: int = 1, weather: Weather = CALM) -> Fleet:
-        """A fleet that is stopped when the test ends."""
+        """Return a simulated team that is stopped at the end of the test."""
         fleet = Fleet(n, seed, weather)
         self.worlds.append(fleet)
         return fleet
 
     def swarm(self, n: int, seed: int = 1, weather: Weather = CALM, pause: float = JOINING) -> SwarmFleet:
-        """A fleet of swarm nodes that is stopped when the test ends."""
+        """Return a simulated team of swarm nodes that is stopped at the end of the test."""
         fleet = SwarmFleet(n, seed, weather, pause)
         self.worlds.append(fleet)
         return fleet
@@ -42,11 +42,11 @@ class FleetCase(SynchronousTestCase):
             self.assertEqual(weather_only, [], "a node left a timer behind")
 
     def done(self, world: World, work: Deferred[T], within: float = 5.0) -> T:
-        """What ``work`` came to, in ``within`` seconds of the world's time."""
+        """Return the result of ``work`` after ``within`` seconds of virtual time."""
         world.run(within)
         return self.successResultOf(work)
 
 
 def _is_delivery(call: object) -> bool:
-    """Whether a call is a datagram on its way, which nobody can take back."""
+    """Return whether a delayed call is a datagram in transit, which cannot be cancelled."""
     return getattr(getattr(call, "_function", None), "__self__", None).__class__ is Switchboard

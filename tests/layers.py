@@ -1,6 +1,6 @@
-"""The layers of the tree as data: the job of each package, and the packages that its modules may import.
+"""The layers of the code as data: the job of each package, and the packages that its modules may import.
 
-``tests.test_house`` checks every import against it, and ``python -m tests.layers`` writes the tables of
+``tests.test_house`` checks each import against it, and ``python -m tests.layers`` writes the tables of
 docs/explanation/architecture.md from it.
 """
 
@@ -17,7 +17,7 @@ TOP = ("agents", "drivers", "formats", "middleware", "sim", "swarmnode", "webnod
 
 @dataclass(frozen=True)
 class Layer:
-    """The ``job`` of a package in one line, and the packages or modules that it ``uses`` beside itself."""
+    """The ``job`` of a package in one line, and the other packages or modules that it ``uses``."""
 
     job: str
     uses: tuple[str, ...] = ()
@@ -144,22 +144,22 @@ LAYERS: dict[str, Layer] = {
 
 
 def layer_of(module: str) -> str:
-    """Return the package of ``LAYERS`` that ``module`` belongs to; raises ``ValueError`` where there is none."""
+    """Return the package of ``LAYERS`` that contains ``module``; raise ``ValueError`` if there is none."""
     return max((name for name in LAYERS if is_within(module, name)), key=len)
 
 
 def may_import(module: str, name: str) -> bool:
-    """Say whether the layers let ``module`` import ``name``."""
+    """Return whether the layers permit ``module`` to import ``name``."""
     package = layer_of(module)
     if not any(is_within(name, each) for each in LAYERS):
-        return False  # tests, for one, are no part of the product
+        return False  # tests, for example, are no part of the product
     if layer_of(name) == package:
         return True
     return any(is_within(name, used) for used in LAYERS[package].uses)
 
 
 def is_within(module: str, package: str) -> bool:
-    """Say whether ``module`` is ``package`` or in it."""
+    """Return whether ``module`` is ``package`` or inside it."""
     return module == package or module.startswith(package + ".")
 
 
@@ -177,7 +177,7 @@ def _uses(package: str, layer: Layer) -> str:
 
 
 def main() -> None:
-    """Put the table in its place in the page."""
+    """Replace the table in the page."""
     text = PAGE.read_text(encoding="utf-8")
     before, rest = text.split(BEGIN, 1)
     PAGE.write_text(before + write_table() + rest.split(END, 1)[1], encoding="utf-8")

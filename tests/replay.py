@@ -1,4 +1,4 @@
-"""Replay: a program that prints the same in every process, whatever the order of its sets there."""
+"""Run a program in several processes and check that each prints the same, for each order of its sets."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ LIMIT_S = 300
 
 
 def replayed(case: SynchronousTestCase, program: str) -> str:
-    """What ``program`` prints; ``case`` fails unless processes that hash strings differently print the same."""
+    """Return the output of ``program``; ``case`` fails unless processes with different hash seeds print the same."""
     printed = set()
     for hash_seed in HASH_SEEDS:
         child = subprocess.run(

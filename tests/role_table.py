@@ -12,14 +12,14 @@ BEGIN, END = "<!-- role table: python -m tests.role_table -->\n", "<!-- end of t
 
 
 def write_tables() -> str:
-    """Return the two tables: the roles that may write each namespace, and those that may call each group of methods."""
+    """Return two tables: the roles that may write each namespace, and the roles that may call each group of methods."""
     head = f"| | {' | '.join(ROLES)} |\n|---|{'---|' * len(ROLES)}\n"
     namespaces = [(f"`{name}`: {each.text}", each.roles) for name, each in NAMESPACES.items()]
     return f"{BEGIN}\n| namespace {head[2:]}{_rows(namespaces)}\n| method {head[2:]}{_rows(_group(METHODS))}\n{END}"
 
 
 def _group(methods: Mapping[str, frozenset[str]]) -> list[tuple[str, frozenset[str]]]:
-    """Methods that the same roles may call share a line."""
+    """Group the methods that the same roles may call."""
     groups: dict[frozenset[str], list[str]] = {}
     for name, roles in methods.items():
         groups.setdefault(roles, []).append(f"`{name}`")
@@ -32,7 +32,7 @@ def _rows(rows: Collection[tuple[str, Collection[str]]]) -> str:
 
 
 def main() -> None:
-    """Put the tables in their place in the page."""
+    """Replace the tables in the page."""
     text = PAGE.read_text(encoding="utf-8")
     before, rest = text.split(BEGIN, 1)
     PAGE.write_text(before + write_tables() + rest.split(END, 1)[1], encoding="utf-8")

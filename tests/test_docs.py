@@ -1,4 +1,4 @@
-"""The documents: what they point to exists, and the examples are lawful settings."""
+"""Tests of the documentation: links, names, numbers and tables agree with the code, and the examples are valid."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def value_of(expression: str) -> float:
 
 
 def part_of(document: Path, title: str) -> str:
-    """What stands below the heading ``title``, down to the next one."""
+    """Return the text below the heading ``title``, up to the next heading."""
     parts = document.read_text(encoding="utf-8").split("\n## ")
     (found,) = (part for part in parts if part.splitlines()[0] == title)
     return found
@@ -62,7 +62,7 @@ def part_of(document: Path, title: str) -> str:
 
 class DocumentTests(SynchronousTestCase):
     def test_links_lead_somewhere(self) -> None:
-        """Every relative link and picture of the documents is a file or folder beside them."""
+        """Each relative link and picture in the documentation is an existing file or folder."""
         for document in DOCUMENTS:
             for target in LINK.findall(document.read_text(encoding="utf-8")):
                 if not re.match(r"https?:|mailto:|#", target):
@@ -70,7 +70,7 @@ class DocumentTests(SynchronousTestCase):
                     self.assertTrue(place.exists(), f"{document.relative_to(ROOT)} links to {target}")
 
     def test_named_files_exist(self) -> None:
-        """Every file that a document names by its path exists, and holds the name that stands behind it."""
+        """Each file that a document names by its path exists, and defines the name after it."""
         for document in DOCUMENTS:
             for path, name in NAMED.findall(document.read_text(encoding="utf-8")):
                 if "/" not in path and not name:
@@ -83,7 +83,7 @@ class DocumentTests(SynchronousTestCase):
                     self.assertTrue(re.search(defined, text, re.MULTILINE), f"{where}::{name}")
 
     def test_numbers_are_those_of_the_code(self) -> None:
-        """A number with a marker behind it is the value of the expression in the marker."""
+        """A number with a marker equals the value of the expression in the marker."""
         marked = [(page, *found) for page in DOCUMENTS for found in MARKED.findall(page.read_text(encoding="utf-8"))]
         self.assertGreater(len(marked), 100)
         for page, number, expression in marked:
@@ -92,15 +92,15 @@ class DocumentTests(SynchronousTestCase):
             self.assertTrue(is_same, f"{page.relative_to(ROOT)} says {number}; {expression} is {value:g}")
 
     def test_role_tables_are_those_of_the_code(self) -> None:
-        """The tables of roles on the security page are made from the role table."""
+        """The tables of roles on the security page are generated from the role table."""
         self.assertIn(write_tables(), (ROOT / "docs" / "explanation" / "trust-model.md").read_text(encoding="utf-8"))
 
     def test_layers_are_those_of_the_tests(self) -> None:
-        """The table of packages on the architecture page is made from the layers that the tests hold."""
+        """The table of packages on the architecture page is generated from ``tests.layers``."""
         self.assertIn(write_table(), (ROOT / "docs" / "explanation" / "architecture.md").read_text(encoding="utf-8"))
 
     def test_every_robot_is_listed(self) -> None:
-        """The table of robots in the README has each kind of driver and no other, and leads to its page."""
+        """The table of robots in the README lists exactly the kinds of drivers, with a link to each kind's page."""
         table = part_of(ROOT / "README.md", "Robots")
         rows = re.findall(r"^\| `(\w+)` \|.*\[[\w-]+\.md\]\(docs/([\w./-]+)\) \|$", table, re.MULTILINE)
         self.assertEqual(sorted(kind for kind, _ in rows), built_in_kinds())
@@ -108,7 +108,7 @@ class DocumentTests(SynchronousTestCase):
             self.assertIn(f"`{kind}`", (ROOT / "docs" / page).read_text(encoding="utf-8"))
 
     def test_every_cast_is_listed(self) -> None:
-        """The demonstration's page and ``make help`` name each choice of ROBOT and no other, and the same default."""
+        """The demonstration's page and ``make help`` list exactly the choices of ROBOT, with the same default."""
         rows = re.findall(
             r"^\| `(\w+)`", part_of(ROOT / "docs" / "tutorials" / "demo.md", "Which robots"), re.MULTILINE
         )
@@ -119,7 +119,7 @@ class DocumentTests(SynchronousTestCase):
         self.assertIn(f"| `{default}` (default) |", part_of(ROOT / "docs" / "tutorials" / "demo.md", "Which robots"))
 
     def test_emulators_serve_the_tables_of_their_pages(self) -> None:
-        """The page of each kind that has an emulator shows a table that the yard takes; so does the yard's own page."""
+        """The page of each kind with an emulator, and the simulator's page, show a table that the simulator accepts."""
         clock = Clock()
         for page in ("how-to/simulate-robots", *(f"robots/{kind}" for kind in emulated_kinds())):
             played: set[str] = set()
@@ -149,7 +149,7 @@ class DocumentTests(SynchronousTestCase):
             self.assertIn(f"(images/figure-5-{number}.png)", chapters["Figures"])
 
     def test_pictures_are_light(self) -> None:
-        """No picture of the documents weighs more than 300 kB, and each is shown somewhere."""
+        """Each picture in the documentation has at most 300 kB, and is shown in a document."""
         shown = " ".join(document.read_text(encoding="utf-8") for document in DOCUMENTS)
         for picture in sorted((ROOT / "docs" / "images").iterdir()):
             self.assertLess(picture.stat().st_size, 300_000, picture.name)
@@ -158,7 +158,7 @@ class DocumentTests(SynchronousTestCase):
 
 class ExampleTests(SynchronousTestCase):
     def test_load(self) -> None:
-        """Every example is a settings file without a fault, and names a driver and options that there are."""
+        """Each example is a valid settings file with a known driver and valid options."""
         self.assertEqual([file.stem for file in EXAMPLES], ["dog1", "dog2", "dog3", "laptop-bootstrap", "sensor"])
         for file in EXAMPLES:
             settings = Settings.load(str(file))
@@ -167,7 +167,7 @@ class ExampleTests(SynchronousTestCase):
                 self.assertIn("camera", body.capabilities)
 
     def test_belong_together(self) -> None:
-        """All examples are of one team, and each knows the laptop at the address where it listens."""
+        """All examples belong to one team, and each knows the laptop's address."""
         every = {file.stem: Settings.load(str(file)) for file in EXAMPLES}
         laptop = every.pop("laptop-bootstrap").node
         self.assertEqual(laptop.known_nodes, ())

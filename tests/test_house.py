@@ -1,4 +1,4 @@
-"""The rules of the house as tests: who imports whom, what is pure, what is packaged, how tests are written."""
+"""The rules of the codebase as tests: imports, pure modules, packaging, and the form of tests."""
 
 from __future__ import annotations
 
@@ -165,7 +165,7 @@ PURE = (
 PURE_LAST_NAMES = ("codec",)
 NOT_IN_PURE = ("twisted", "time", "socket", "threading", "asyncio", "selectors", "subprocess", "secrets", "sqlite3")
 
-# The only modules of the lower floors that may touch the clock, the sockets, threads or the dice of the machine.
+# The only modules of the lower layers that may use the machine's clock, sockets, threads or random generator.
 EDGES = (
     "drivers.camera.thread",
     "drivers.deadman.keeper",
@@ -219,7 +219,7 @@ def _imports(module: str) -> list[str]:
 
 
 def _import_names(module: str) -> Iterator[str]:
-    """Every module that ``module`` imports, wherever in the file; a name out of a package counts as that module."""
+    """Yield each module that ``module`` imports, anywhere in the file; a name in a package counts as that module."""
     for node in ast.walk(TREES[module]):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -235,24 +235,24 @@ def _ours(module: str) -> list[str]:
 
 
 def _crosses(module: str, name: str) -> bool:
-    """Say whether ``module`` may not import ``name``."""
+    """Return whether ``module`` must not import ``name``."""
     if module.startswith("drivers.") and name.startswith("drivers.") and module != "drivers.registry":
-        # A kind of robot never knows another kind; only the registry knows them all.
+        # A kind of robot never imports another kind; only the registry imports all of them.
         kinds = {file.split(".")[1] for file in FILES if re.fullmatch(r"drivers\.\w+\.driver", file)}
         return name.split(".")[1] in kinds - {module.split(".")[1]}
     return not may_import(module, name)
 
 
 class FloorPlanTests(SynchronousTestCase):
-    """Imports only go down."""
+    """Imports only go to lower layers."""
 
     def test_imports_follow_the_floor_plan(self) -> None:
-        """No module imports a room that lies above it, beside it, or behind a contract."""
+        """No module imports a package that is above it, in another branch, or behind a contract."""
         wrong = [f"{module} imports {name}" for module in FILES for name in _ours(module) if _crosses(module, name)]
         self.assertEqual(wrong, [])
 
     def test_every_layer_has_a_wall(self) -> None:
-        """A module of any package but the topmost that imported a package above it would be named."""
+        """In each package except the topmost, an import of a package above it is detected."""
         above = [
             ("middleware.entangled.wire", "middleware.entangled.kademlia.overlay"),
             ("middleware.entangled.space", "middleware.entangled.node"),
@@ -265,13 +265,13 @@ class FloorPlanTests(SynchronousTestCase):
         self.assertEqual([pair for pair in above if not _crosses(f"{pair[0]}.new", pair[1])], [])
 
     def test_middleware_has_packages(self) -> None:
-        """``middleware`` has no modules of its own but the node and the errors."""
+        """``middleware`` contains no modules except the node and the errors."""
         flat = {module for module in FILES if module.count(".") == 1 and module.startswith("middleware.")}
         modules = {module for module in flat if FILES[module].name != "__init__.py"}
         self.assertEqual(modules, {"middleware.errors", "middleware.node"})
 
     def test_imports_are_absolute(self) -> None:
-        """No module uses a relative import, so the tree can be searched by name."""
+        """No module uses a relative import, so that the code can be searched by name."""
         wrong = [
             f"{module} line {node.lineno}"
             for module, tree in TREES.items()
@@ -281,7 +281,7 @@ class FloorPlanTests(SynchronousTestCase):
         self.assertEqual(wrong, [])
 
     def test_imports_make_no_circle(self) -> None:
-        """No module reaches itself by imports, those inside functions and for types included."""
+        """No module imports itself indirectly, including imports in functions and for types."""
         arrows = {module: sorted({name for name in _ours(module) if name in FILES} - {module}) for module in FILES}
         done: set[str] = set()
         circles: list[str] = []
@@ -300,10 +300,10 @@ class FloorPlanTests(SynchronousTestCase):
 
 
 class PurityTests(SynchronousTestCase):
-    """Logic is a function of its arguments; the world comes in at listed edges."""
+    """Logic is a function of its arguments; only listed modules access the outside world."""
 
     def test_pure_modules_touch_no_world(self) -> None:
-        """What is listed as pure imports no Twisted, clock, socket, thread or store."""
+        """The modules listed as pure import no Twisted, clock, socket, thread or store."""
         wrong = [
             f"{module} imports {name}"
             for module in FILES
@@ -314,7 +314,7 @@ class PurityTests(SynchronousTestCase):
         self.assertEqual(wrong, [])
 
     def test_world_enters_at_the_edges_only(self) -> None:
-        """Below the front door only the listed edges import the clock, sockets, threads or the reactor."""
+        """In the lower layers only the listed modules import the clock, sockets, threads or the reactor."""
         wrong = [
             f"{module} imports {name}; take it as an argument, or make it an edge"
             for module in FILES
@@ -325,7 +325,7 @@ class PurityTests(SynchronousTestCase):
         self.assertEqual(wrong, [])
 
     def test_dice_are_handed_in(self) -> None:
-        """No module throws the dice of the process (``random.random()``): only ``random.Random`` may be named."""
+        """No module uses the process's random generator (``random.random()``); only ``random.Random`` is permitted."""
         wrong = []
         for module in FILES:
             for node in ast.walk(TREES[module]):
@@ -339,7 +339,7 @@ class PurityTests(SynchronousTestCase):
         self.assertEqual(wrong, [])
 
     def test_nobody_replaces_a_listener(self) -> None:
-        """An ``on_`` attribute is set by its own object only: others add themselves to its ``Listeners``."""
+        """An ``on_`` attribute is set only by its object; other code adds itself to its ``Listeners``."""
         wrong = []
         for module in FILES:
             for node in ast.walk(TREES[module]):
@@ -352,7 +352,7 @@ class PurityTests(SynchronousTestCase):
         self.assertEqual(wrong, [])
 
     def test_package_files_hold_only_a_docstring(self) -> None:
-        """An ``__init__`` runs no code, so that importing one module never imports its neighbours."""
+        """An ``__init__`` runs no code, so that the import of one module does not import its siblings."""
         wrong = [
             str(path.relative_to(ROOT))
             for module, path in FILES.items()
@@ -362,7 +362,7 @@ class PurityTests(SynchronousTestCase):
         self.assertEqual(wrong, [])
 
     def test_edge_node_loads_nothing_heavy(self) -> None:
-        """The front door, the node and the simulated driver load neither the page's nor the yard's libraries."""
+        """The service, the node and the simulated driver load no libraries of the page or the simulator."""
         wanted = [
             name
             for name in ("middleware.node", "agents.loop", "drivers.registry", "drivers.sim.driver")
@@ -376,14 +376,14 @@ class PurityTests(SynchronousTestCase):
         self.assertEqual((child.returncode, child.stdout.strip()), (0, ""), child.stderr)
 
     def test_plain_node_loads_what_it_needs(self) -> None:
-        """A node without agent, page and deployment loads neither the verdicts nor what runs foreign modules."""
+        """A node without agent, page and deployment loads neither decision records nor the runner of pushed modules."""
         program = "import sys, swarmnode.plugin; print(*[n for n in sys.modules if n.startswith(('middleware.',))])"
         child = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=60)
         unwanted = [name for name in child.stdout.split() if _is_within_any(name, *ON_DEMAND)]
         self.assertEqual((child.returncode, unwanted), (0, []), child.stderr)
 
     def test_node_runs_no_pushed_code(self) -> None:
-        """What a node that allows deployment loads for it does not lead to the module that runs pushed source."""
+        """The modules that a node with deployment loads do not import the module that runs pushed source."""
         known, left = set[str](), ["middleware.deployment.deployment", "middleware.deployment.process"]
         while left:
             module = left.pop()
@@ -393,29 +393,29 @@ class PurityTests(SynchronousTestCase):
 
 
 class PackagingTests(SynchronousTestCase):
-    """What is in the tree is what gets installed."""
+    """The installed packages are the packages in the source tree."""
 
     def setUp(self) -> None:
         self.setup = configparser.ConfigParser()
         self.setup.read(ROOT / "setup.cfg", encoding="utf-8")
 
     def test_wheel_has_every_package(self) -> None:
-        """A forgotten package works in an editable install and is missing in the wheel, so the search is compared."""
+        """The wheel contains each package; a missing one would not be noticed in an editable install."""
         search = self.setup["options.packages.find"]
         wheel = find_namespace_packages(str(ROOT), search["exclude"].split(), search["include"].split())
         found = {".".join(path.parent.relative_to(ROOT).parts) for room in TOP for path in (ROOT / room).rglob("*.py")}
         self.assertEqual(set(wheel), found | {"twisted.plugins"})
 
     def test_every_room_is_marked_as_typed(self) -> None:
-        """Each room ships ``py.typed``, or type checkers of users ignore our annotations."""
+        """Each package ships ``py.typed``, without which type checkers ignore its annotations."""
         self.assertEqual([room for room in TOP if not (ROOT / room / "py.typed").exists()], [])
 
     def test_twisted_is_not_hidden(self) -> None:
-        """No ``__init__.py`` in our ``twisted`` folders: one would hide Twisted itself, or the plugin."""
+        """The ``twisted`` folders have no ``__init__.py``, which would hide Twisted or the plugin."""
         self.assertEqual(list((ROOT / "twisted").rglob("__init__.py")), [])
 
     def test_nobody_else_owns_our_names(self) -> None:
-        """No other installed distribution has a top-level package of our names; files of both would mix silently."""
+        """No other installed distribution has a top-level package with one of our names, as their files would mix."""
         owners = packages_distributions()
         foreign = {
             room: others
@@ -426,10 +426,10 @@ class PackagingTests(SynchronousTestCase):
 
 
 class TestCustomTests(SynchronousTestCase):
-    """Tests keep their own manners."""
+    """The form of tests."""
 
     def test_every_test_says_what_it_shows(self) -> None:
-        """Each test method has a docstring, each test folder an ``__init__.py`` and nothing is patched from outside."""
+        """Each test method has a docstring, each test folder an ``__init__.py``, and no test uses ``unittest.mock``."""
         wrong = []
         for path in sorted((ROOT / "tests").rglob("*.py")):
             tree = ast.parse(path.read_text(encoding="utf-8"), str(path))
@@ -444,7 +444,7 @@ class TestCustomTests(SynchronousTestCase):
         self.assertEqual(wrong, [])
 
     def test_tests_wait_for_conditions(self) -> None:
-        """No test sleeps: what another process does is waited for by ``tests.live.until`` alone."""
+        """No test sleeps: ``tests.live.until`` is the only wait for another process."""
         texts = {path: path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("*.py")}
         sleeping = {
             path.relative_to(ROOT).as_posix()

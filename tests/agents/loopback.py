@@ -1,4 +1,4 @@
-"""Loopback: the way to a behaviour of this process, through the same plain values as one in another process."""
+"""Call a behaviour in this process with the same plain values that another process would receive."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from middleware.deployment import frame
 
 
 class Loopback:
-    """A conversation that answers at once, or where ``is_held`` when ``let`` is called."""
+    """A conversation with a behaviour that answers at once, or on ``let`` if ``is_held`` is set."""
 
     def __init__(self, make: Make, parameters: Mapping[str, Any] | None = None) -> None:
         self.fault = ""
@@ -27,11 +27,11 @@ class Loopback:
 
     @classmethod
     def of(cls, make: Make) -> Callable[..., Loopback]:
-        """What makes a conversation with one of these."""
+        """Return a factory of conversations with behaviours that ``make`` creates."""
         return lambda parameters, rng: cls(make, parameters)
 
     def ask(self, method: str, arguments: list[Any], take: Callable[[bool, Any], None]) -> bool:
-        """Ask the behaviour."""
+        """Call ``method`` of the behaviour and pass the result to ``take``."""
         if self.fault:
             return False
         self.asked.append(method)
@@ -47,14 +47,14 @@ class Loopback:
         return True
 
     def let(self) -> None:
-        """Have what was held arrive."""
+        """Deliver the results that are held back."""
         held, self._held = self._held, []
         for each in held:
             each()
 
     def look(self) -> None:
-        """Nothing comes by itself."""
+        """Do nothing: no events arrive without a call."""
 
     def close(self) -> None:
-        """Note it."""
+        """Record that the conversation is closed."""
         self.is_closed = True

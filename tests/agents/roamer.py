@@ -1,6 +1,6 @@
-"""Roamer: a robot of any kind in the yard, as its driver describes it, for tests of behaviours without nodes and links.
+"""A simulated robot of any kind, built from its driver's description, to test behaviours without nodes and links.
 
-It does at once what its driver would say that it does, and senses no more than it has.
+It executes each action at once, as its driver would report it, and has only the sensors of its kind.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ Does = Callable[[Action], Action]
 
 
 def filming(description: Description, fps: float = 15.0) -> Description:
-    """The description with a camera on the robot's back."""
+    """Return the description with a camera added."""
     capabilities = {**description.capabilities, "camera": {**LENS, "fps": fps}}
     return replace(description, capabilities=capabilities, rates={**description.rates, "camera": fps})
 
 
 def described(kind: str) -> Description:
-    """A robot with a camera."""
+    """Return the description of a robot of this kind that has a camera."""
     if kind == "sim":
         return describe(kind, {"robot": "dog1"})
     if kind == "create2":
@@ -50,14 +50,14 @@ def described(kind: str) -> Description:
 
 
 def clipped(description: Description) -> Does:
-    """Does what it is told, within its limits."""
+    """Return a function that clips an action to the limits of the description."""
     return lambda action: {
         k: min(max(v, description.limits[k][0]), description.limits[k][1]) for k, v in action.items()
     }
 
 
 def quantised(description: Description, gaits: Mapping[str, Velocity] = GAITS) -> Does:
-    """Does what the nearest of its gaits does."""
+    """Return a function that replaces an action by the velocity of the nearest gait."""
 
     def does(action: Action) -> Action:
         wished = clipped(description)(action)
@@ -68,7 +68,7 @@ def quantised(description: Description, gaits: Mapping[str, Velocity] = GAITS) -
 
 
 class Roamer:
-    """A robot in place of the yard's first dog; ``lag`` seconds pass before it does what it is told."""
+    """A robot in place of the simulator's first dog; it executes each action after ``lag`` seconds."""
 
     def __init__(
         self, kind: str, seed: int, does: Does | None = None, lag: float = 0.1, description: Description | None = None
@@ -101,14 +101,14 @@ class Roamer:
 
     @property
     def gap(self) -> float:
-        """Metres between its body and the target."""
+        """Return the distance in metres between the robot and the target."""
         target = self.world.target
         assert target is not None
         away = math.dist((target.x, target.y), (self.dog.x, self.dog.y))
         return away - target.radius - self.description.radius
 
     def sense(self) -> Mapping[str, Value]:
-        """What a robot of this kind feels."""
+        """Return the values of the sensors that a robot of this kind has."""
         told: dict[str, Value] = dict(self.senses.values())
         if self._kind != "sim":
             told.pop("compass.heading")
@@ -127,7 +127,7 @@ class Roamer:
         return told
 
     def touched(self) -> float | None:
-        """On which side it touches something with its front half: radians, left positive; None: nothing."""
+        """Return the bearing in radians (left is positive) of an object that the front half touches, or None."""
         dog, radius = self.dog, self.description.radius
         width, height = self.world.scene.width, self.world.scene.height
         others = [(d.x, d.y, 0.12) for d in self.world.dogs.values() if d is not dog]
@@ -139,7 +139,7 @@ class Roamer:
         return min((side for side in sides if abs(side) < 1.7), key=abs, default=None)
 
     def live(self, act: Callable[[float], Action | None]) -> Action | None:
-        """One tick: sense, look, act."""
+        """Run one tick: sense, observe, act."""
         for _ in range(STEPS):
             self.world.step()
             self.senses.sample()
@@ -163,29 +163,29 @@ class Roamer:
         self.reversals += self.done.get("base.wz", 0.0) * before.get("base.wz", 0.0) < 0.0
         self._lag.append(Motion(*(self.done.get(key, 0.0) for key in ("base.vx", "base.vy", "base.wz"))))
         self._reckon()
-        # Not by way of ``drive``, which knows the limits of an ERS-7 only.
+        # ``drive`` applies the limits of an ERS-7, so it is not used here.
         self.dog.command = self._lag.popleft()
         return action
 
     def _reckon(self) -> None:
-        """Where it is by what it was told to do, as a dog without encoders reckons."""
+        """Integrate the executed actions into a pose estimate, as a dog without encoders does."""
         x, y, yaw = self._reckoned
         way = self.done.get("base.vx", 0.0) * TICK
         turned = math.remainder(yaw + self.done.get("base.wz", 0.0) * TICK, math.tau)
         self._reckoned = [x + way * math.cos(yaw), y + way * math.sin(yaw), turned]
 
     def find(self, limit: float) -> float | None:
-        """Search until it can tell the cost."""
+        """Search until the behaviour has a cost, or until ``limit``; return the cost."""
         while self.behaviour.cost is None and self.now < limit:
             self.live(self.behaviour.search)
         return self.behaviour.cost
 
     def reach(self, limit: float) -> bool:
-        """Go there; whether it says that it is done."""
+        """Execute the task until it is done, for at most ``limit`` seconds; return whether it is done."""
         end = self.now + limit
         while self.now < end:
             if self.live(lambda now: self.behaviour.execute(Context(now))) is None:
-                for _ in range(10):  # it comes to rest
+                for _ in range(10):  # the robot comes to rest
                     self.live(lambda now: {"base.vx": 0.0, "base.vy": 0.0, "base.wz": 0.0})
                 return True
         return False

@@ -1,4 +1,4 @@
-"""Tests of ``agents.behaviour``: what a task's kind may bring into a node."""
+"""Tests of ``agents.behaviour``: the choice and creation of a behaviour from a task's kind and parameters."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ TASK = Task("t1", "turn-around", "Turn")
 
 class BehaviourTests(SynchronousTestCase):
     def refusal(self, task: Task) -> str:
-        """Why the task gets no behaviour."""
+        """Return the error message of a task that gets no behaviour."""
         return str(self.assertRaises(UnknownTask, behaviour_for, task, random.Random(1)))
 
     def test_known_kinds_are_made(self) -> None:
-        """Each kind that is listed can be made, and knows no cost before it has looked."""
+        """Each listed kind can be created, and has no cost before the first observation."""
         for kind in KINDS:
             self.assertIsNone(behaviour_for(replace(TASK, kind=kind), random.Random(1)).cost)
 
     def test_behaviour_is_told_what_its_body_can_do(self) -> None:
-        """Whoever asks for it gets the means of the body, whether it is installed or deployed; others go without."""
+        """An installed or deployed behaviour receives the motion capabilities if it has the method ``embody``."""
         told: list[Means] = []
 
         class Bodied:
@@ -50,28 +50,28 @@ class BehaviourTests(SynchronousTestCase):
         self.assertIs(turn._means, means)
 
     def test_unknown_kind_names_those_there_are(self) -> None:
-        """A kind that nobody knows is refused with the list of those there are."""
+        """An unknown kind is refused with the list of the known kinds."""
         self.assertEqual(
             self.refusal(replace(TASK, kind="fetch")),
             "no behaviour for tasks of kind 'fetch'; known kinds: find-target, turn-around, watch-target",
         )
 
     def test_kind_from_the_wire_is_never_imported(self) -> None:
-        """A kind that is written as a module and a name is looked up like any other, and imports nothing."""
+        """A kind with the form ``module:name`` is unknown, and the node imports nothing."""
         sys.modules.pop("this", None)
         for kind in ("this:s", "os:system", "subprocess:Popen", "agents.turn:TurnAround"):
             self.assertIn("no behaviour", self.refusal(replace(TASK, kind=kind)))
         self.assertNotIn("this", sys.modules)
 
     def test_wrong_parameters_are_refused(self) -> None:
-        """Parameters that a behaviour cannot have are an UnknownTask with the reason, and no other error."""
+        """Invalid parameters raise UnknownTask with the reason, and no other error."""
         every: list[Any] = [{"turns": "x"}, {"turns": -1.0}, {"turns": []}, [], None, 7]
         for parameters in every:
             task = replace(TASK, parameters=parameters)
             self.assertIn("invalid parameters", self.refusal(task))
 
     def test_missing_vision_names_the_extra(self) -> None:
-        """Where OpenCV is not installed a task that needs eyes says what to install."""
+        """Without OpenCV, a task that needs vision raises an error that names the extra to install."""
         hidden = {n: sys.modules.pop(n) for n in list(sys.modules) if n in ("agents.search", "agents.vision", "cv2")}
         sys.modules["cv2"] = None  # type: ignore[assignment]
 

@@ -1,4 +1,4 @@
-"""Tests of ``agents.search`` with bodies of all kinds, in closed loops over the yard in virtual time."""
+"""Tests of ``agents.search`` with robots of all kinds, in closed loop with the simulator in virtual time."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ JERKS = {"f": Velocity(0.15, 0.0), "b": Velocity(-0.1, 0.0), "l": Velocity(0.0, 
 
 
 def roamer(kind: str, seed: int) -> Roamer:
-    """A robot of this kind somewhere in the yard, with a target somewhere else."""
+    """Return a robot of this kind at a random position, with a target at another."""
     return Roamer(kind, seed, lag=LAG.get(kind, 0.1))
 
 
 def with_gaits(gaits: dict[str, Velocity], seed: int) -> Roamer:
-    """A robot dog with these gaits and no others."""
+    """Return a robot dog with exactly these gaits."""
     known = described("bittle")
     limits = {
         "base.vx": (min(one.vx for one in gaits.values()), max(one.vx for one in gaits.values())),
@@ -39,13 +39,13 @@ def with_gaits(gaits: dict[str, Velocity], seed: int) -> Roamer:
 
 class BodyTests(SynchronousTestCase):
     def arrived(self, robot: Roamer, limit: float = 60.0) -> None:
-        """It goes to the target, stands before it, and touched nothing harder than at a slow walk."""
+        """Check that the robot reaches the target, stops close to it, and touched nothing faster than a slow walk."""
         self.assertTrue(robot.reach(limit), "never done")
         self.assertLessEqual(robot.gap, 0.15)
         self.assertLessEqual(robot.hardest, max(WALK, robot.means.walk) + 0.01)
 
     def test_robots_that_feel_their_way_find_it_too(self) -> None:
-        """Who ranges nothing walks about for a minute, bumps no harder than it walks, and still gets there."""
+        """A robot without a ranger walks for a minute, bumps no faster than it walks, and then reaches the target."""
         for kind in ("create2", "bittle"):
             with self.subTest(kind=kind):
                 robot = roamer(kind, 1)
@@ -57,7 +57,7 @@ class BodyTests(SynchronousTestCase):
                 self.arrived(robot)
 
     def test_robot_that_turns_in_jerks_does_not_swing_for_ever(self) -> None:
-        """A body that knows 1.2 rad/s or nothing accepts a coarse aim: it gets there, and hardly swings."""
+        """A robot that can only turn at 1.2 rad/s aims coarsely: it reaches the target and reverses its turn rarely."""
         for seed in (1, 2):
             with self.subTest(seed=seed):
                 robot = with_gaits(JERKS, seed)
@@ -66,7 +66,7 @@ class BodyTests(SynchronousTestCase):
                 self.assertLess(robot.reversals, 10)
 
     def test_robot_that_turns_only_as_it_walks_gets_there(self) -> None:
-        """A body without a turn on the spot searches and approaches on arcs, and backs off from what is too near."""
+        """A robot that cannot turn on the spot searches on arcs, and backs off from a target within their radius."""
         for seed in (1, 2):
             with self.subTest(seed=seed):
                 robot = with_gaits(ARCS, seed)
@@ -88,13 +88,13 @@ class BodyTests(SynchronousTestCase):
 
 class BumpTests(SynchronousTestCase):
     def facing(self, seed: int = 1) -> Roamer:
-        """A Create 2 that has found the target."""
+        """Return a Create 2 that has found the target."""
         robot = roamer("create2", seed)
         self.assertIsNotNone(robot.find(60.0))
         return robot
 
     def test_bump_into_the_target_is_an_arrival(self) -> None:
-        """A target smaller than the task says seems farther away than it is: the bump says that it is reached."""
+        """A target smaller than the task says looks farther away than it is; a bump into it completes the task."""
         robot = roamer("create2", 1)
         robot.behaviour = SearchAndApproach({"target_radius": 0.16, "target_height": 0.44}, Random(4))
         robot.behaviour.embody(robot.means)
@@ -104,7 +104,7 @@ class BumpTests(SynchronousTestCase):
         self.assertLessEqual(robot.hardest, 0.17)
 
     def test_bump_on_the_way_is_gone_round(self) -> None:
-        """Something invisible on the way is touched once, backed off from, gone round, and the target is reached."""
+        """The robot bumps into an invisible obstacle once, backs off, drives around it and reaches the target."""
         robot = self.facing()
         for _ in range(60):
             robot.live(lambda now: robot.behaviour.execute(Context(now)))
@@ -121,7 +121,7 @@ class BumpTests(SynchronousTestCase):
         self.assertLessEqual(robot.gap, 0.15)
 
     def test_body_that_goes_nowhere_has_bumped(self) -> None:
-        """Who has neither bumper nor ranger, and walks without its odometry moving, backs off after two seconds."""
+        """A robot without bumper and ranger backs off if its odometry does not change for two seconds of walking."""
         robot = roamer("bittle", 1)
         robot.world.clear_target()
         behaviour, means = robot.behaviour, robot.means
@@ -141,7 +141,7 @@ class BumpTests(SynchronousTestCase):
 
 
 class Told:
-    """A behaviour in a body of this kind that is told where the target is, instead of seeing it."""
+    """A behaviour on a robot of this kind that receives target positions instead of camera frames."""
 
     def __init__(self, kind: str) -> None:
         self.means = Means(described(kind))
@@ -150,7 +150,7 @@ class Told:
         self.now = 0.0
 
     def see(self, distance: float, bearing: float = 0.0, **values: Value) -> None:
-        """Look once; ``bump_left`` stands for ``bump.left``."""
+        """Process one observation; ``bump_left`` stands for ``bump.left``."""
         self.now += 0.05
         told: dict[str, Value] = {"odom.x": 0.0, "odom.y": 0.0, "odom.yaw": 0.0}
         told |= {key.replace("_", "."): value for key, value in values.items()}
@@ -158,13 +158,13 @@ class Told:
         self.behaviour._add_sighting(self.now, self.behaviour._pose, Sighting(bearing, distance, True))
 
     def execute(self) -> Action | None:
-        """What it does next."""
+        """Return the next action."""
         return self.behaviour.execute(Context(self.now))
 
 
 class NearTests(SynchronousTestCase):
     def acts(self, distance: float, bearing: float) -> list[Action | None]:
-        """What a Create 2 does in five ticks with its bumper pressed and the target there."""
+        """Return five actions of a Create 2 with its bumper pressed and the target at this distance and bearing."""
         told, acts = Told("create2"), []
         for _ in range(5):
             told.see(distance, bearing, bump_left=True)
@@ -172,14 +172,14 @@ class NearTests(SynchronousTestCase):
         return acts
 
     def test_bump_counts_as_arrival_before_the_target_only(self) -> None:
-        """A bump while the target is near and straight ahead ends it; one aside, or far from it, is backed off from."""
+        """A bump completes the task only if the target is near and ahead; otherwise the robot backs off."""
         self.assertIsNone(self.acts(0.33, 0.05)[-1])
         for distance, bearing in ((0.33, 0.6), (1.0, 0.05)):
             acts = self.acts(distance, bearing)
             self.assertTrue(all(action is not None and action["base.vx"] < 0.0 for action in acts), (distance, bearing))
 
     def test_who_turns_on_a_circle_backs_off_from_what_is_in_it(self) -> None:
-        """A target aside within the turning circle is backed off from; one farther away is turned to."""
+        """A robot backs off from a target inside its turning circle, and turns towards one that is farther away."""
         told = Told("bittle")
         told.means.circle = 0.15
         for distance, sign in ((0.2, -1.0), (1.0, 1.0)):
@@ -192,7 +192,7 @@ class NearTests(SynchronousTestCase):
 
 class WayTests(SynchronousTestCase):
     def test_robot_that_cannot_step_aside_goes_round(self) -> None:
-        """With another robot in between, one that ranges but cannot step aside goes round it and does not push."""
+        """A robot with a ranger that cannot step sideways drives around another robot without pushing it."""
         robot = roamer("rosbridge", 1)
         world = robot.world
         world.clear_target()

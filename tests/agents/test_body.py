@@ -1,4 +1,4 @@
-"""Tests of ``agents.body``: what reaches a robot of what its behaviour wishes, and what is learned from it."""
+"""Tests of ``agents.body``: the actions that reach a robot, and the capabilities learned from their execution."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.agents.roamer import described, quantised
 
 
 class Robot:
-    """A driver of a Bittle, as far as a body needs one to move."""
+    """A driver of a Bittle with the methods that a body needs to move it."""
 
     def __init__(self) -> None:
         self.description = described("bittle")
@@ -24,7 +24,7 @@ class Robot:
         self.asked: list[Action] = []
 
     def act(self, action: Action, permit: Permit) -> Action:
-        """What the nearest gait does."""
+        """Execute the nearest gait."""
         self.asked.append(action)
         return quantised(self.description)(action)
 
@@ -35,17 +35,17 @@ class BodyTests(SynchronousTestCase):
         self.body = Body(cast(Driver, self.robot), Clock(), lambda seen: None, lambda why: None)
 
     def do(self, **wished: float) -> None:
-        """Have it do this, beside what stands."""
+        """Send these velocities to the body; all other axes rest."""
         action = {**STAND, **{f"base.{axis}": value for axis, value in wished.items()}}
         self.assertTrue(self.body.do(Deed(action, Permit(1, 1.0))))
 
     def test_robot_is_asked_for_nothing_that_it_has_not(self) -> None:
-        """A robot without a sideways gait is not told to rest sideways, which it would refuse as unknown."""
+        """A robot without a sideways gait receives no sideways value, which its driver would refuse as unknown."""
         self.do(vx=0.1)
         self.assertEqual(self.robot.asked, [{"base.vx": 0.1, "base.wz": 0.0}])
 
     def test_what_it_really_does_is_learned(self) -> None:
-        """A turn that comes out faster than was asked for makes the aim of all its behaviours coarser."""
+        """A robot that turns faster than requested makes the aim of all its behaviours coarser."""
         self.assertFalse(self.body.means.is_coarse)
         self.do(wz=0.15)
         self.assertTrue(self.body.means.is_coarse)

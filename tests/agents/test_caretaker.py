@@ -1,4 +1,4 @@
-"""Tests of ``agents.part``: the council of a task outlives its members, one after the other."""
+"""Tests of ``agents.part``: the council of a task survives the successive failure of its members."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class CaretakerTests(SynchronousTestCase):
         self.made(VirtualTeam(3, 0.1, others=OTHERS))
 
     def made(self, team: VirtualTeam) -> None:
-        """Begin with ``team``."""
+        """Use ``team`` in this test."""
         self.team = team
         self.addCleanup(self.team.stop)
         self.node = self.team.services[VirtualTeam.BOOTSTRAP].assembly.node
@@ -38,7 +38,7 @@ class CaretakerTests(SynchronousTestCase):
         self.node.watch_group("turn", lambda records: self.group.__setitem__(slice(None), records))
 
     def given(self, *council: str, turns: float = TURNS) -> None:
-        """A task to turn around for a long time, with these nodes as its council."""
+        """Write a long turn-around task with these nodes as its council."""
         task = replace(task_named("turn-around", "turn", 0.0), waiting_period=1.0, parameters={"turns": turns})
         members = tuple(self.team.services[name].assembly.node.entangled.contact for name in council)
         task = task.with_council(pin(self.node.entangled.identity, "turn", members))
@@ -48,7 +48,7 @@ class CaretakerTests(SynchronousTestCase):
 
     @property
     def task(self) -> Task:
-        """The task as its newest record tells it."""
+        """Return the task with its newest council."""
         return council_of(tasks_of(self.records)["turn"], self.group)
 
     @property
@@ -58,18 +58,18 @@ class CaretakerTests(SynchronousTestCase):
         return sorted(names[member.node_id.hex()] for member in self.task.council)
 
     def moving(self) -> list[str]:
-        """The dogs that move."""
+        """Return the names of the dogs that move."""
         return [name for name, dog in self.team.yard.world.dogs.items() if dog.is_moving]
 
     def run_for(self, seconds: float) -> None:
-        """Let time pass, in steps in which no two dogs may move."""
+        """Advance the time in steps, and check in each that at most one dog moves."""
         end = self.team.clock.seconds() + seconds
         while self.team.clock.seconds() < end:
             self.team.clock.advance(0.05)
             self.assertLessEqual(len(self.moving()), 1)
 
     def test_who_acts_fills_the_council(self) -> None:
-        """A dead member is replaced while a dog acts, which goes on; another dies, then that dog: the task is done."""
+        """The acting agent replaces dead members of the council and continues; if it fails, another completes."""
         self.given("witness1", "witness2", "dog1", turns=12.0)
         self.run_for(3.0)
         (first,) = self.moving()
@@ -91,7 +91,7 @@ class CaretakerTests(SynchronousTestCase):
         self.assertNotEqual(outcome.by, first)
 
     def test_before_anybody_acts(self) -> None:
-        """While a task rests two of its council die one after the other; it is resumed, and a dog acts."""
+        """Two members of the council fail one after the other during a pause; after the resume one dog acts."""
         self.given("witness1", "witness2", "witness3")
         self.successResultOf(self.ordered(PAUSE))
         self.run_for(2.0)
@@ -103,7 +103,7 @@ class CaretakerTests(SynchronousTestCase):
         self.assertEqual(len(self.moving()), 1)
 
     def test_nobody_to_follow(self) -> None:
-        """Where nobody is left who could take the seat the council stays, and whoever acts is not disturbed."""
+        """If no node is left to replace a dead member, the council stays, and the acting agent is not interrupted."""
         self.made(VirtualTeam(4, 0.1, dogs=("dog1", "dog2")))
         self.given("vaio", "dog1", "dog2")
         self.run_for(3.0)
@@ -113,7 +113,7 @@ class CaretakerTests(SynchronousTestCase):
         self.assertEqual((self.task.configuration, self.moving()), (1, [first]))
 
     def ordered(self, word: str) -> Deferred[Any]:
-        """Tell the team to rest, or to go on."""
+        """Write a pause or resume order."""
         done = self.node.order("turn", Order(word, "test", 0.0).packed())
         self.team.clock.advance(0.5)
         return done

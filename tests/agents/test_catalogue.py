@@ -15,7 +15,7 @@ from middleware.tasks.task import refusals, task_of
 
 class CatalogueTests(SynchronousTestCase):
     def test_tasks_survive_the_wire(self) -> None:
-        """Each predefined task is a lawful record that reads back as it was, with a strategy that exists."""
+        """Each predefined task survives encoding in a valid record, and its strategy exists."""
         for name in TASKS:
             task = task_named(name, "t1", 5.0)
             record = Record(KEY, "t1", bytes(32), 1, "team", 60.0, task.packed())
@@ -23,20 +23,20 @@ class CatalogueTests(SynchronousTestCase):
             strategy_for(task.strategy)
 
     def test_yards_dog_can_do_what_it_is_made_for(self) -> None:
-        """A dog of the yard meets the demonstration's requirements, and lacks a gripper for the ball."""
+        """A simulated dog meets the requirements of the demonstration, and lacks the gripper to fetch the ball."""
         capabilities = describe("sim", {}, "dog1").capabilities
         self.assertEqual(refusals(capabilities, TASKS[DEMO].requirements), [])
         self.assertEqual(refusals(capabilities, TASKS["turn-around"].requirements), [])
         self.assertEqual(refusals(capabilities, TASKS["fetch-the-ball"].requirements), ["has no gripper"])
 
     def test_phone_can_watch_and_no_more(self) -> None:
-        """A phone may keep the target in view, as a dog may; for what walks it lacks the legs."""
+        """A phone meets the requirements to watch the target; the tasks that need a mobile base refuse it."""
         phone, dog = describe("phone", {}).capabilities, describe("sim", {}, "dog1").capabilities
         self.assertEqual([refusals(each, TASKS["watch-target"].requirements) for each in (phone, dog)], [[], []])
         self.assertIn("has no base2d", refusals(phone, TASKS[DEMO].requirements))
         self.assertIn("has no base2d", refusals(phone, TASKS["turn-around"].requirements))
 
     def test_unknown_name_lists_the_known(self) -> None:
-        """A task that is not predefined is refused with those that are."""
+        """An unknown task name is refused with the list of the known names."""
         error = self.assertRaises(UnknownTask, task_named, "dance", "t1", 0.0)
         self.assertIn("'dance'; known tasks: fetch-the-ball, find-red-target, turn-around, watch-target", str(error))

@@ -1,4 +1,4 @@
-"""Tests of ``agents.conference`` and ``agents.conference``: rounds of a task, and what counts of what is heard."""
+"""Tests of ``agents.conference``: the rounds of a task, and the reports that count in a decision."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ B = Member("b", "dog2", "WAITING", 2.0, "a", "d1", epoch=3, serial=1)
 
 class EpochTests(SynchronousTestCase):
     def test_first_decision_opens_no_round(self) -> None:
-        """Until somebody is named nothing raises the number, and the first name does not either."""
+        """Neither a changed basis without a decision nor the first decision opens a round."""
         epoch = Epoch()
         for basis in (("a",), ("a", "b")):
             self.assertEqual(epoch.decide(basis, "", "", ()), 0)
         self.assertEqual(epoch.decide(("a", "b", 1), "a", "d1", ()), 0)
 
     def test_change_after_a_decision_opens_a_round(self) -> None:
-        """What a decision depends on changes: a new round, one for each change and none without."""
+        """Each change of a decision's basis opens one round; without a change none opens."""
         epoch = Epoch()
         epoch.decide((1,), "a", "d1", ())
         self.assertEqual([epoch.decide((n,), "a", "d1", ()) for n in (1, 2, 2, 3)], [0, 1, 1, 2])
 
     def test_same_decision_joins_the_round_of_another(self) -> None:
-        """Who comes to the decision that another has already told in a newer round joins it."""
+        """An agent whose decision equals another agent's in a newer round joins that round."""
         epoch = Epoch()
         epoch.decide((1,), "a", "d0", ())
         epoch.hear(3)
@@ -38,11 +38,11 @@ class EpochTests(SynchronousTestCase):
 
 class CircleTests(SynchronousTestCase):
     def costs(self, circle: Circle, now: float) -> dict[str, float | None]:
-        """What counts now."""
+        """Return the valid cost of each member."""
         return {member.uuid: member.cost for member in circle.members(now)}
 
     def test_old_round_is_ignored(self) -> None:
-        """A report of an older round changes nothing, whenever it comes; a newer one does."""
+        """A report of an older round is ignored, whenever it arrives; a report of a newer round counts."""
         circle = Circle("a")
         circle.hear([B], 0.0)
         circle.hear([replace(B, cost=9.0, epoch=2, serial=7)], 1.0)
@@ -51,7 +51,7 @@ class CircleTests(SynchronousTestCase):
         self.assertEqual(self.costs(circle, 2.0), {"b": 1.0})
 
     def test_who_left_is_forgotten_after_a_while(self) -> None:
-        """A late report of one that left is known to be old; a new life is heard when the old one is forgotten."""
+        """A late report of a member that left is ignored; after ``LINGERING`` a restarted member is accepted."""
         circle = Circle("a")
         circle.hear([B], 0.0)
         circle.hear([], 1.0)
@@ -62,18 +62,18 @@ class CircleTests(SynchronousTestCase):
         self.assertEqual(len(circle), 1)
 
     def test_stale_report_is_no_bid(self) -> None:
-        """A bid counts for as long as it is valid, less its age when it was told, and again when it is renewed."""
+        """A bid expires after its validity period, reduced by its age on arrival; a newer serial number renews it."""
         circle = Circle("a")
         bid = replace(B, valid_for=3.0, age=1.0)
         circle.hear([bid], 10.0)
         self.assertEqual(self.costs(circle, 12.0), {"b": 2.0})
-        circle.hear([bid], 12.1)  # the same record once more is no news
+        circle.hear([bid], 12.1)  # the same record has no effect
         self.assertEqual(self.costs(circle, 12.1), {"b": None})
         circle.hear([replace(bid, serial=2)], 12.2)
         self.assertEqual(self.costs(circle, 12.3), {"b": 2.0})
 
     def test_own_report_comes_back(self) -> None:
-        """The own report is kept apart: of an older life, it says where the others' counting stands."""
+        """An agent's own report from an earlier run is not a member; it only shows the last round and serial number."""
         circle = Circle("b")
         circle.hear([B], 0.0)
         self.assertEqual((len(circle), circle.echo), (0, B))

@@ -1,4 +1,4 @@
-"""Tests of ``agents.decision``: who is assigned, from the reports of all."""
+"""Tests of ``agents.decision``: the assignment of an agent from all reports."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from middleware.tasks.task import Member
 
 
 def member(uuid: str, cost: float | None, status: str = WAITING) -> Member:
-    """One report."""
+    """Return a report."""
     return Member(uuid, f"dog-{uuid}", status, cost)
 
 
 def decided(*members: Member, since: float | None = 100.0, hysteresis: float = 0.1) -> Decision:
-    """The decision with a waiting period of 8 s."""
+    """Return the decision with a waiting period of 8 s."""
     return decide(members, Nearest(), hysteresis, 8.0, since)
 
 
@@ -40,15 +40,15 @@ REPORTS = st.lists(
 
 
 def by(strategy: str, *members: Member) -> Decision:
-    """The decision by another strategy, long after the waiting period."""
+    """Return the decision of another strategy, long after the waiting period."""
     return decide(members, Guard(strategy_for(strategy)), 0.1, 8.0, 100.0)
 
 
 class ReadingTests(SynchronousTestCase):
-    """Strategies that go by more than the cost are given it."""
+    """Strategies that use more than the cost receive the other values."""
 
     def test_charged_one_is_preferred(self) -> None:
-        """Of two equally near the one with more charge goes, and of equally charged the one with fewer tasks."""
+        """At equal distance the robot with more battery charge is assigned; at equal charge, fewer tasks count."""
         low, full = replace(member("a", 5.0), battery=0.2), replace(member("b", 5.0), battery=0.9)
         self.assertEqual(by("capability_cost", low, full).assigned, "b")
         self.assertEqual(by("nearest", low, full).assigned, "a")
@@ -56,7 +56,7 @@ class ReadingTests(SynchronousTestCase):
         self.assertEqual(by("capability_cost", busy, free).assigned, "b")
 
     def test_vote_decides(self) -> None:
-        """The option with most of the weight is agreed on, the cheapest of its side goes, and the reason says so."""
+        """The option with the most weight wins, its cheapest voter acts, and the reason names the option."""
         one, two = replace(member("a", 1.0), choice="red"), replace(member("b", 2.0), choice="blue")
         three = replace(member("c", 3.0), choice="blue")
         decision = by("weighted_vote", one, two, three)
@@ -67,37 +67,37 @@ class ReadingTests(SynchronousTestCase):
 
 class DecisionTests(SynchronousTestCase):
     def test_nearest_of_all_is_assigned(self) -> None:
-        """When everybody has reported, the nearest is assigned at once, before the waiting period is over."""
+        """If all agents have reported, the nearest is assigned before the end of the waiting period."""
         decision = decided(member("a", 2.0), member("b", 1.0), member("c", 3.0), since=0.0)
         self.assertEqual(decision.assigned, "b")
         self.assertEqual(decision.why, "dog-b, 1.00, best of 3")
 
     def test_waiting_period_holds_for_those_who_are_missing(self) -> None:
-        """Within the waiting period nobody goes while a report is missing, and the reason names who is missing."""
+        """During the waiting period no agent is assigned while a report is missing, and the reason names it."""
         members = member("a", 2.0), member("c", None, SEARCHING), member("b", None, SEARCHING)
         early = decided(*members, since=7.9)
         self.assertEqual((early.assigned, early.why), (None, "waiting for dog-b, dog-c"))
         self.assertEqual(decided(*members, since=8.0).assigned, "a")
 
     def test_nobody_goes_without_a_report(self) -> None:
-        """Without any report nobody is assigned, however long it takes."""
+        """Without any report no agent is ever assigned."""
         for members in ([], [member("a", None)]):
             decision = decided(*members, since=None)
             self.assertEqual((decision.assigned, decision.why), (None, "no agent has reported yet"))
 
     def test_acting_member_keeps_the_task_within_the_hysteresis(self) -> None:
-        """Whoever acts goes on when another is nearer by less than the hysteresis, and gives way to a better one."""
+        """The acting agent keeps the task unless another agent's cost is lower by at least the hysteresis."""
         acting = member("z", 1.0, EXECUTING)
         for cost, assigned in ((0.95, "z"), (0.90, "z"), (0.89, "a")):
             self.assertEqual(decided(acting, member("a", cost)).assigned, assigned, cost)
 
     def test_acting_member_is_not_stopped_by_a_missing_report(self) -> None:
-        """A member that comes and has not reported yet does not take the task from whoever acts."""
+        """A new member without a report does not take the task from the acting agent."""
         decision = decided(member("z", 1.0, EXECUTING), member("a", None, SEARCHING), since=0.0)
         self.assertEqual(decision.assigned, "z")
 
     def test_acting_member_with_an_unlawful_report_gives_way(self) -> None:
-        """Who acts and reports what is no cost, or none on this planet, does not keep the task from the others."""
+        """An acting agent with an invalid or too large cost loses the task to one with a valid cost."""
         nonsense: list[Any] = [10**400, float("inf"), float("nan"), -1.0, True, "1", 1e300]
         for cost in nonsense:
             self.assertIsNone(decided(member("z", cost, EXECUTING)).assigned)
@@ -107,7 +107,7 @@ class DecisionTests(SynchronousTestCase):
                 self.assertEqual(decision.assigned, "a", (cost, hysteresis))
 
     def test_two_acting_members_come_down_to_one(self) -> None:
-        """Where two say to act, all name the nearer of them, and of equals the lower uuid."""
+        """If two agents report that they act, all choose the cheaper one, and at equal cost the lower uuid."""
         self.assertEqual(decided(member("a", 1.02, EXECUTING), member("b", 1.0, EXECUTING)).assigned, "b")
         self.assertEqual(decided(member("b", 1.0, EXECUTING), member("a", 1.0, EXECUTING)).assigned, "a")
 
@@ -116,7 +116,7 @@ class DecisionTests(SynchronousTestCase):
     def test_order_of_members_does_not_matter(
         self, entries: list[tuple[int, float | None, str]], since: float, rng: object
     ) -> None:
-        """Members that hear the same reports in any order decide the same, in every word."""
+        """Agents that receive the same reports in any order reach the same decision with the same reason."""
         members = [member(f"{number:x}", cost, status) for number, cost, status in entries]
         shuffled = list(members)
         rng.shuffle(shuffled)  # type: ignore[attr-defined]
@@ -125,7 +125,7 @@ class DecisionTests(SynchronousTestCase):
     @settings(max_examples=60)
     @given(REPORTS)
     def test_assigned_agent_has_reported_and_is_good_enough(self, entries: list[tuple[int, float | None, str]]) -> None:
-        """After the waiting period one is assigned when anybody reported; nobody else beats it by the hysteresis."""
+        """After the waiting period a reporting agent is assigned, and none beats it by the hysteresis."""
         members = [member(f"{number:x}", cost, status) for number, cost, status in entries]
         costs = {m.uuid: m.cost for m in members if m.cost is not None}
         decision = decided(*members)
@@ -138,21 +138,21 @@ class DecisionTests(SynchronousTestCase):
 
 
 class PanelTests(SynchronousTestCase):
-    """Decisions where the members are only a panel of all."""
+    """Decisions from the reports of a subset of the agents (the reporters)."""
 
     def panelled(self, since: float, has_word: bool, *members: Member) -> str | None:
-        """Who is assigned."""
+        """Return the assigned agent."""
         return decide(members, Nearest(), 0.1, 8.0, since, has_word).assigned
 
     def test_council_is_waited_for(self) -> None:
-        """That all of the panel have reported decides nothing until the council has spoken, or for too long has not."""
+        """Complete reports of the subset decide nothing until the council answers or a timeout ends."""
         panel = member("a", 2.0), member("b", 1.0)
         self.assertIsNone(self.panelled(0.0, False, *panel))
         self.assertIsNone(self.panelled(8.0 + PATIENCE - 0.1, False, *panel))
         self.assertEqual(self.panelled(8.0 + PATIENCE, False, *panel), "b")
 
     def test_word_of_the_council_decides(self) -> None:
-        """When it has spoken, or somebody acts, nobody who is silent is waited for."""
+        """After the council's answer, or while an agent acts, no missing report is waited for."""
         panel = member("a", 2.0), member("b", 1.0), member("c", None)
         self.assertEqual(self.panelled(0.0, True, *panel), "b")
         self.assertEqual(self.panelled(0.0, False, member("a", 1.0, EXECUTING), *panel[1:]), "a")

@@ -1,4 +1,4 @@
-"""Tests of ``agents.division``: the tasks of one group, divided by each agent for itself."""
+"""Tests of ``agents.division``: each agent divides the tasks of a group by the same reports."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ Costs = dict[str, dict[str, float | None]]
 
 
 def task(name: str, **fields: Any) -> Task:
-    """A task of the group."""
+    """Return a task of the group."""
     return Task(name, "walk", name, strategy="group_optimal", group="g", waiting_period=8.0, **fields)
 
 
 def members(costs: dict[str, float | None], acting: str = "") -> list[Member]:
-    """What the participants of one task report."""
+    """Return the reports on one task."""
     statuses = {
         agent: EXECUTING if agent == acting else SEARCHING if c is None else WAITING for agent, c in costs.items()
     }
@@ -39,7 +39,7 @@ def members(costs: dict[str, float | None], acting: str = "") -> list[Member]:
 
 class DivisionTests(SynchronousTestCase):
     def division(self, costs: Costs, strategy: str = "group_optimal", **acting: str) -> Division:
-        """All tasks as they were known a while ago; ``acting`` says who acts on which."""
+        """Return the division of all tasks after the gathering period; ``acting`` maps a task to its acting agent."""
         division = Division(Guard(strategy_for(strategy)))
         for name, row in costs.items():
             here = members(row, acting.get(name, ""))
@@ -47,7 +47,7 @@ class DivisionTests(SynchronousTestCase):
         return division
 
     def decided(self, costs: Costs, now: float = 50.0, since: float = 40.0, **acting: Any) -> dict[str, Decision]:
-        """The decision on each task."""
+        """Return the decision on each task."""
         division = self.division(costs, **acting)
         found = {}
         for name, row in costs.items():
@@ -56,11 +56,11 @@ class DivisionTests(SynchronousTestCase):
         return found
 
     def assigned(self, costs: Costs, **acting: Any) -> dict[str, str | None]:
-        """Who is to act on each task."""
+        """Return the assigned agent of each task."""
         return {name: decision.assigned for name, decision in self.decided(costs, **acting).items()}
 
     def test_optimum_of_all_tasks(self) -> None:
-        """Every agent is given one task, and together they cost as little as any assignment of these reports does."""
+        """Each agent is assigned one task, and the total cost is the minimum over all assignments."""
         rng = random.Random(4)
         for _ in range(50):
             costs: Costs = {t: {a: round(rng.uniform(0.0, 9.0), 2) for a in AGENTS} for t in ("t1", "t2", "t3")}
@@ -73,7 +73,7 @@ class DivisionTests(SynchronousTestCase):
             self.assertAlmostEqual(total, best)
 
     def test_one_digest_of_all_reports(self) -> None:
-        """The decision on each task names the digest of the reports on all of them, and its reason says that."""
+        """The decisions on all tasks carry the same digest of all reports, and their reasons name the division."""
         costs: Costs = {"t1": {"a": 1.0, "b": 2.0}, "t2": {"a": 1.5, "b": 5.0}}
         first = self.decided(costs)
         self.assertEqual(first["t1"].digest, first["t2"].digest)
@@ -87,19 +87,19 @@ class DivisionTests(SynchronousTestCase):
         self.assertEqual(len({point.digest for point in shares}), 1)
 
     def test_more_tasks_than_agents(self) -> None:
-        """What nobody is left for waits, and the reason says so."""
+        """With more tasks than agents the remaining task waits, and its reason says so."""
         found = self.decided({"t1": {"a": 1.0}, "t2": {"a": 2.0}})
         self.assertEqual((found["t1"].assigned, found["t2"].assigned), ("a", None))
         self.assertEqual(found["t2"].why, "all bidders have reached their capacity")
 
     def test_who_acts_counts_for_its_task_alone(self) -> None:
-        """Whoever acts on a task is given no other, however near it is, and a free one takes what is left."""
+        """An acting agent is not assigned another task of the group, even if it is the nearest; a free agent is."""
         costs: Costs = {"t1": {"a": 1.0, "b": 9.0}, "t2": {"a": 0.1, "b": 9.0}}
         self.assertEqual(self.assigned(costs, t1="a"), {"t1": "a", "t2": "b"})
         self.assertEqual(self.assigned({"t1": costs["t1"], "t2": {"a": 0.1}}, t1="a"), {"t1": "a", "t2": None})
 
     def test_who_acts_keeps_it_within_the_hysteresis(self) -> None:
-        """A free agent takes a task over only where it is better by the hysteresis; else it is there for the others."""
+        """A free agent takes a task over only if it is better by the hysteresis; otherwise it gets another task."""
         for cost, given in ((0.95, "a"), (0.85, "b")):
             self.assertEqual(self.assigned({"t1": {"a": 1.0, "b": cost}}, t1="a"), {"t1": given})
         costs: Costs = {"t1": {"a": 1.0, "b": 0.95}, "t2": {"b": 9.0}}
@@ -108,7 +108,7 @@ class DivisionTests(SynchronousTestCase):
             self.assertEqual(points.assigned_agent, "b", strategy)
 
     def test_group_is_gathered_first(self) -> None:
-        """Until no task has come for a moment nobody is named; who acts already goes on meanwhile."""
+        """No agent is assigned before the gathering period ends; an agent that acts already continues."""
         costs: Costs = {"t1": {"a": 1.0, "b": 0.1}, "t2": {"a": 2.0, "b": 2.0}}
         for now, given, why in ((GATHERING - 0.1, None, "waiting for the rest of the group"), (GATHERING, "b", "")):
             decision = self.decided(costs, now)["t1"]
@@ -118,7 +118,7 @@ class DivisionTests(SynchronousTestCase):
         self.assertEqual((held.assigned, len(held.digest)), ("a", 8))
 
     def test_missing_reports_on_other_tasks_are_waited_for(self) -> None:
-        """Within the waiting period nobody is named while one has not told what another task of the group costs it."""
+        """During the waiting period no agent is assigned while one has not reported on another task of the group."""
         costs: Costs = {"t1": {"a": 1.0, "b": 2.0}, "t2": {"a": 1.0, "b": None}}
         found = self.decided(costs, since=7.9)
         self.assertEqual((found["t1"].assigned, found["t1"].why), (None, "waiting for dog-b"))
@@ -126,7 +126,7 @@ class DivisionTests(SynchronousTestCase):
         self.assertEqual(self.decided(costs, since=7.9, t2="a")["t1"].assigned, "b")
 
     def test_what_is_divided_together(self) -> None:
-        """Tasks of one group with one strategy and equal requirements are; a task without a group is by itself."""
+        """Tasks with the same group, strategy and requirements are divided together; a task without a group is not."""
         one = task("t1", requirements={"camera": {"width": 1, "colour": "rgb"}, "legs": {}})
         two = task("t2", requirements={"legs": {}, "camera": {"colour": "rgb", "width": 1}})
         self.assertEqual(group_of(one), group_of(two))
@@ -135,28 +135,28 @@ class DivisionTests(SynchronousTestCase):
         self.assertIsNone(group_of(replace(one, group="")))
 
     def test_schedules(self) -> None:
-        """Schedules of groups, faults and operators: each task ends once, no agent acts on two, all name the same."""
+        """In random schedules each task ends once, no agent acts on two tasks, and all agents agree."""
         broken = {seed: found for seed in range(6) if (found := Groups(seed).run())}
         self.assertEqual(broken, {})
 
 
 class DueTests(SynchronousTestCase):
-    """Which task of a group has the body."""
+    """The choice of the task of a group that uses the robot."""
 
     def part(self, cost: float | None = 1.0, assigned: str = "", is_acting: bool = False, is_free: bool = True) -> Any:
-        """A part as its agent sees it."""
+        """Return a task as its agent sees it."""
         me = Member("a", "dog", WAITING, cost, assigned)
         return SimpleNamespace(engagement=SimpleNamespace(me=me, is_acting=is_acting, may_be_put_aside=is_free))
 
     def test_given_task_has_it(self) -> None:
-        """The task that the agent was given has the body, unless it acts for another or writes down how that ended."""
+        """The robot works on its agent's assigned task, unless it acts on another one or records its outcome."""
         other, given = self.part(None), self.part(assigned="a")
         self.assertIs(due([other, given], other), given)
         for holder in (self.part(is_acting=True), self.part(is_free=False)):
             self.assertIs(due([given, holder], holder), holder)
 
     def test_else_what_it_cannot_tell_yet(self) -> None:
-        """Without a given task the body looks for what it has no cost of; where there is none it stays where it is."""
+        """Without an assigned task the robot measures a task of unknown cost; if there is none, it keeps its task."""
         told, blind, also = self.part(), self.part(None), self.part(None, assigned="b")
         self.assertIs(due([told, blind, also], told), blind)
         self.assertIs(due([told, blind, also], also), also)

@@ -1,4 +1,4 @@
-"""Tests of ``agents.docket``: which task has the body, and which never starts again."""
+"""Tests of ``agents.docket``: the task that uses the robot, and the tasks that have ended."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from middleware.tasks.task import MAX_LEASE_TTL, Task
 
 
 def task(name: str, created: float = 0.0, priority: int = 0) -> Task:
-    """A task."""
+    """Return a task."""
     return Task(name, "walk", name, created=created, priority=priority)
 
 
@@ -19,7 +19,7 @@ OLD, NEW, URGENT = task("old", 1.0), task("new", 2.0), task("urgent", 3.0, 5)
 
 class DocketTests(SynchronousTestCase):
     def test_order(self) -> None:
-        """The most urgent task is first, then the oldest; only so many are followed."""
+        """The task with the highest priority is first, then the oldest; the number of followed tasks is limited."""
         docket = Docket()
         for one in (NEW, URGENT, OLD):
             docket.add(one)
@@ -29,7 +29,7 @@ class DocketTests(SynchronousTestCase):
         self.assertEqual(len(docket.followed()), MOST)
 
     def test_ended_task_never_starts_again(self) -> None:
-        """A task that is over is not taken in again, for longer than any lease lives and any node may be away."""
+        """An ended task is not accepted again within the longest lease plus the longest absence of a node."""
         docket = Docket()
         docket.add(OLD)
         docket.bury("old", 0.0)
@@ -45,7 +45,7 @@ class DocketTests(SynchronousTestCase):
 
 class NextTaskTests(SynchronousTestCase):
     def test_who_gets_the_body(self) -> None:
-        """The first in order, unless another has it and cannot be put aside, or is as urgent and acts already."""
+        """The first task in order uses the robot, unless the present one must not stop or acts at equal priority."""
         every = [NEW, OLD, URGENT]
         self.assertIs(next_task(every, None, True), URGENT)
         self.assertIs(next_task(every, OLD, True), URGENT)

@@ -1,4 +1,4 @@
-"""Tests of ``agents.search`` over the drivers of real robots and their emulators, whose bodies are dogs of the yard."""
+"""Tests of ``agents.search`` with the drivers of real robots, connected to emulators of simulated dogs."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ TOUCH = 0.15
 
 
 class DogBody:
-    """A dog of a yard of its own, as an emulator moves it and feels with it."""
+    """A simulated dog in a separate world, moved and sensed by an emulator."""
 
     def __init__(self, clock: Clock, seed: int) -> None:
         self.world = World(Random(seed), loaded("three-dogs"))
@@ -50,19 +50,19 @@ class DogBody:
         self._loop.start(STEPS * SUBSTEP)
 
     def drive(self, vx: float, vy: float, wz: float) -> None:
-        """Walk like this."""
+        """Set the velocity."""
         self.world.drive("dog1", vx, vy, wz)
 
     def halt(self) -> None:
-        """Stand still."""
+        """Stop the dog."""
         self.world.halt("dog1")
 
     def sense(self) -> Mapping[str, Value]:
-        """What it feels; the chest's ranger looks at the floor, and a scanner does not."""
+        """Return the sensor values without the chest ranger, which points at the floor."""
         return {key: value for key, value in self._senses.values().items() if key != "range.chest"}
 
     def picture(self, is_halved: bool = False) -> bytes | None:
-        """What it sees."""
+        """Return a camera frame."""
         return self._camera.jpeg(self.dog, is_halved)
 
     def _turn(self) -> None:
@@ -72,7 +72,7 @@ class DogBody:
 
 
 def driven(kind: str, body: DogBody, clock: Clock) -> Driver:
-    """The driver of a robot of this kind, joined through memory to its emulator, which has this body."""
+    """Return a driver of this kind that is connected in memory to the emulator of this robot."""
     emulator: Any
     if kind == "aibo":
         emulator = AiboEmulator(clock, body, Random(1))
@@ -89,7 +89,7 @@ def driven(kind: str, body: DogBody, clock: Clock) -> Driver:
 
 class DriverTests(SynchronousTestCase):
     def reached(self, kind: str, seed: int) -> tuple[DogBody, float]:
-        """The yard after a robot of this kind has found and reached the target, and the seconds that it took."""
+        """Return the world after a robot of this kind has reached the target, and the seconds that it needed."""
         clock = Clock()
         body = DogBody(clock, seed)
         driver = driven(kind, body, clock)
@@ -124,7 +124,7 @@ class DriverTests(SynchronousTestCase):
         self.fail(f"{kind} never reached the target")
 
     def test_robots_reach_the_target_over_their_own_wire(self) -> None:
-        """Each kind of real robot, as its emulator plays it, finds the target and stops before it, touching nothing."""
+        """Each real kind of robot, connected to its emulator, finds the target and stops at it without a collision."""
         for kind in ("aibo", "create2", "bittle", "rosbridge"):
             for seed in (1, 4):
                 with self.subTest(kind=kind, seed=seed):

@@ -1,4 +1,4 @@
-"""Tests of ``agents.engagement``: one agent's part in one task, on a turned clock."""
+"""Tests of ``agents.engagement``: one agent's participation in one task, in virtual time."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ CONTACT = Contact(ME.public, Address("127.0.0.1", 7000))
 
 
 class Dog:
-    """A behaviour whose body tells the cost that the test says, and needs ``steps`` steps to be done."""
+    """A behaviour with a cost set by the test, which completes after ``steps`` steps."""
 
     def __init__(self) -> None:
         self.cost: float | None = None
@@ -47,27 +47,27 @@ class Dog:
         self.contexts: list[Context] = []
 
     def look(self, seen: Observation, now: float) -> None:
-        """Take the cost from the observation."""
+        """Read the cost from the observation."""
         value = seen.values["cost"]
         self.cost = None if isinstance(value, str) else float(value)
 
     def search(self, now: float) -> Action:
-        """Look around."""
+        """Return the search action."""
         return LOOK
 
     def hold(self, now: float) -> Action:
-        """Stand."""
+        """Return the hold action."""
         return HOLD
 
     def execute(self, context: Context) -> Action | None:
-        """Go on, from where it was."""
+        """Return the next action, or None when done."""
         self.executed += 1
         self.contexts.append(context)
         return None if self.executed > self.steps else GO
 
 
 class Council:
-    """The lessee's side of a council that grants when the test says so, and writes down what happens."""
+    """A lease client that gets the lease when the test grants it, and records events."""
 
     def __init__(self, clock: HeapClock, events: list[str]) -> None:
         self.is_wanted = False
@@ -81,23 +81,23 @@ class Council:
 
     @property
     def lease(self) -> Lease | None:
-        """The lease while it is valid."""
+        """Return the lease while it is valid."""
         held = self.token and self._clock.seconds() < self.deadline
         return Lease("t1", self.token, self.deadline) if held else None
 
     def want(self) -> None:
-        """Note the wish."""
+        """Record that the agent wants the lease."""
         self.is_wanted = True
 
     def learn(self, packed: bytes) -> None:
-        """It is the council."""
+        """Ignore the council's message."""
 
     def stand_by(self, rank: int = 1) -> None:
-        """Note the place in the line."""
+        """Record the rank among the standbys."""
         self.places.append(rank)
 
     def release(self, heirs: Sequence[Contact] = (), rest: float = 0.0) -> Deferred[object]:
-        """Give it back."""
+        """Return the lease."""
         self.heirs = heirs
         if self.token:
             self.rest = rest
@@ -107,22 +107,22 @@ class Council:
         return succeed(None)
 
     def suspect(self) -> None:
-        """Note that the holder may be gone."""
+        """Record that the holder may have failed."""
         self._events.append("suspected")
 
     def move(self, members: Sequence[Contact]) -> Deferred[None]:
-        """Note that there is to be another council; the lease goes back with it."""
+        """Record the change of the council, which ends the lease."""
         self._events.append(f"moved to {len(members)}")
         self.token = 0
         return succeed(None)
 
     def grant(self, token: int, ttl: float = 1.5) -> None:
-        """Let the agent have it."""
+        """Grant the lease."""
         self.token, self.deadline = token, self._clock.seconds() + ttl
 
 
 class Recorder:
-    """The ways out of an engagement, which write down what goes out."""
+    """The output ports of an engagement, which record all output."""
 
     def __init__(self, events: list[str]) -> None:
         self.told: list[Member] = []
@@ -134,28 +134,28 @@ class Recorder:
         self._events = events
 
     def tell(self, member: Member) -> None:
-        """Keep a report."""
+        """Record a report."""
         self.told.append(member)
 
     def conclude(self, result: Result) -> None:
-        """Keep an outcome."""
+        """Record an outcome."""
         self.results.append(result)
 
     def say(self, text: str) -> None:
-        """Keep a line."""
+        """Record a log line."""
         self.said.append(text)
 
     def justify(self, verdict: Verdict) -> None:
-        """Keep an account."""
+        """Record a decision record."""
         self.accounts.append(verdict)
 
     def halt(self) -> float:
-        """Stop the body, which may not hear it."""
+        """Stop the robot, which may not receive the message."""
         self._events.append("halted")
         return self.moves_for
 
     def reached(self, uuids: Sequence[str]) -> Sequence[Contact]:
-        """How agents are reached."""
+        """Return the contacts of these agents."""
         return [self.known[uuid] for uuid in uuids if uuid in self.known]
 
 
@@ -171,37 +171,37 @@ class EngagementTests(SynchronousTestCase):
         self.begin(TASK)
 
     def begin(self, task: Task, strategy: ConsensusAlgorithm | None = None) -> None:
-        """Take part in ``task``, with the body."""
+        """Take part in ``task`` with the robot."""
         uuid = ME.node_id.hex()
         me, panel, now = Member(uuid, "dog1", ""), Panel(uuid), self.clock.seconds()
         self.engagement = Engagement(task, me, self.dog, strategy or Nearest(), self.ports, panel, 4, now)
         self.engagement.take_body(self.council, 4)  # type: ignore[arg-type]
 
     def report(self, number: int, cost: float | None, status: str = WAITING) -> Member:
-        """What another dog reports."""
+        """Return a report of another dog."""
         return Member(self.others[number].node_id.hex(), f"dog{number}", status, cost)
 
     def hear(self, *members: Member) -> None:
-        """Let the group tell who is present, while the task is open."""
+        """Deliver the reports of the group for the open task."""
         self.engagement.heard(list(members), None, self.clock.seconds())
 
     def end(self, outcome: str, by: str) -> None:
-        """Let the group tell how the task ended."""
+        """Deliver the outcome of the task."""
         self.engagement.heard([], Result(outcome, by, 1.0, 5), self.clock.seconds())
 
     def see(self, cost: float | None) -> None:
-        """Let the body measure."""
+        """Deliver an observation with this cost."""
         seen = Observation(0.0, 0.0, {"cost": "none" if cost is None else cost})
         self.engagement.look(seen, self.clock.seconds())
 
     def step(self) -> Deed:
-        """One step that has to give a deed."""
+        """Run one step that must return an action."""
         deed = self.engagement.step(self.clock.seconds())
         assert deed is not None
         return deed
 
     def acting(self, token: int = 5) -> None:
-        """Bring the agent to where it acts: nearest of two, lease granted."""
+        """Make the agent act: it is the nearest of two and has the lease."""
         self.hear(self.report(2, 2.0))
         self.see(1.0)
         self.step()
@@ -209,7 +209,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.step().action, GO)
 
     def test_states_follow_the_thesis(self) -> None:
-        """An agent is ASSIGNED, SEARCHING until it can report, then WAITING, EXECUTING with the lease, DONE."""
+        """An agent's status is ASSIGNED, SEARCHING, WAITING after its report, EXECUTING with the lease, then DONE."""
         self.assertEqual(self.engagement.me.status, ASSIGNED)
         self.hear(self.report(2, None))
         self.assertEqual(self.step().action, LOOK)
@@ -224,7 +224,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(statuses, [SEARCHING, WAITING, EXECUTING, DONE])
 
     def test_nothing_is_executed_without_a_lease(self) -> None:
-        """The one that should act only stands by until the council grants, and again when the lease has run out."""
+        """The assigned agent holds its position until the council grants the lease, and again when it expires."""
         self.hear(self.report(2, 2.0))
         self.see(1.0)
         for _ in range(5):
@@ -240,12 +240,12 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.events, ["halted"])
 
     def test_looking_around_is_permitted_for_a_moment_only(self) -> None:
-        """A motion that needs no lease carries the highest token that the body obeyed, and a short deadline."""
+        """A motion without a lease carries the highest token that the robot has obeyed, and a short deadline."""
         permit = self.step().permit
         self.assertEqual((permit.token, permit.deadline), (4, self.clock.seconds() + SEARCH_TTL))
 
     def test_body_stops_before_the_lease_goes_back(self) -> None:
-        """When a better report takes the task away, the body is stopped first and the lease is given back after."""
+        """When a better report takes the task away, the agent stops the robot before it returns the lease."""
         self.acting()
         self.hear(self.report(2, 0.5))
         self.assertEqual(self.step().action, HOLD)
@@ -253,7 +253,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertIn("releases the task", self.said)
 
     def test_who_stands_by_keeps_its_place(self) -> None:
-        """Who only waits, and holds nothing, stays in the line from its first step on and never goes to its end."""
+        """A standby keeps its place in the order of standbys from its first step on."""
         self.hear(self.report(2, 0.5, EXECUTING))
         self.see(1.0)
         for _ in range(5):
@@ -262,7 +262,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.council.places, [1] * 5)
 
     def test_who_is_to_act_and_does_not_yet_is_in_the_line(self) -> None:
-        """Whom the first in line waits for acts already, or is the one before it: they never claim at one moment."""
+        """An assigned agent that does not act yet counts as the first standby, so two agents never claim at once."""
         self.hear(self.report(2, 0.5))
         self.see(1.0)
         self.step()
@@ -272,7 +272,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.council.places, [2, 1])
 
     def test_who_is_not_let_insists(self) -> None:
-        """Who is to act, and has no lease, says so again each second; nobody can take it for one that gave up."""
+        """An assigned agent without a lease repeats its report each second, so that others do not treat it as gone."""
         self.hear(self.report(2, 2.0))
         self.see(1.0)
         self.step()
@@ -285,7 +285,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual({(member.cost, member.assigned) for member in again}, {(1.0, ME.node_id.hex())})
 
     def test_who_was_passed_over_is_let_again(self) -> None:
-        """Who got the lease while it stood by gives way to the better one as soon as that says anything."""
+        """A standby that got the lease returns it when the better agent sends its next report."""
         better = self.report(2, 0.5)
         self.hear(better)
         self.see(1.0)
@@ -300,7 +300,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.events, ["halted", "released"])
 
     def test_member_that_left_is_decided_without(self) -> None:
-        """When the assigned agent disappears, the next one claims the lease at its next step."""
+        """When the assigned agent leaves the group, the next agent claims the lease in its next step."""
         self.hear(self.report(2, 0.5, EXECUTING), self.report(3, 3.0))
         self.see(1.0)
         self.step()
@@ -311,7 +311,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertTrue(self.council.is_wanted)
 
     def test_council_changes_under_who_acts(self) -> None:
-        """It stands still before the council changes, stays the one that acts, and goes on with its new lease."""
+        """At a safe point the agent stops, the council changes, and the agent resumes with a new lease."""
         self.acting()
         self.dog.is_safe = False
         self.engagement.hand_council([CONTACT] * 3)
@@ -327,7 +327,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.events, ["halted", "moved to 3"])
 
     def test_moved_target_is_reported_again(self) -> None:
-        """A distance that grew is reported anew by everybody; one that shrank only by those that do not walk."""
+        """A larger cost is reported again in each state; a smaller one only by an agent that does not act."""
         self.see(1.0)
         self.see(1.1)
         self.assertEqual([m.cost for m in self.told], [1.0])
@@ -344,7 +344,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.engagement.me.cost, 1.9)
 
     def test_lost_body_may_still_move(self) -> None:
-        """With the lease of a robot that does not hear that it is to stop goes back for how long it still moves."""
+        """An agent that cannot stop its robot returns the lease with the time for which the robot may still move."""
         for leave in (lambda: self.engagement.lose_body(), lambda: self.engagement.abandon(self.clock.seconds())):
             self.setUp()
             self.acting()
@@ -354,7 +354,7 @@ class EngagementTests(SynchronousTestCase):
             self.assertEqual(self.council.rest, 0.8)
 
     def test_lost_body_is_not_waited_for(self) -> None:
-        """Whose robot does not answer is not free, whether it had reported or not; at the next look it is again."""
+        """An agent without a connection to its robot is unavailable until the next observation."""
         for cost in (None, 1.0):
             self.see(cost)
             self.engagement.lose_body()
@@ -363,7 +363,7 @@ class EngagementTests(SynchronousTestCase):
             self.assertEqual((self.told[-1].cost, self.told[-1].available), (cost, True), str(cost))
 
     def test_done_is_recorded_and_the_lease_kept_until_it_is_known(self) -> None:
-        """The finished agent stops, records the outcome once, and gives the lease back when the outcome is known."""
+        """The agent stops, records the outcome once, and returns the lease when the outcome is confirmed."""
         self.dog.steps = 1
         self.acting()
         deed = self.step()
@@ -377,7 +377,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.events[-1], "released")
 
     def test_task_changes_hands_at_safe_points_only(self) -> None:
-        """A better report waits until the body may be stopped; a lost body, a cancellation and a pause do not."""
+        """A better report takes effect at the next safe point of the behaviour."""
         self.acting()
         self.dog.is_safe = False
         self.hear(self.report(2, 0.5))
@@ -387,7 +387,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.events, ["halted", "released"])
 
     def test_pause_and_resume(self) -> None:
-        """A paused task stops the body, gives the lease back and reports no body; resumed it goes on where it was."""
+        """A pause stops the robot and returns the lease; after the resume the behaviour continues from its state."""
         self.acting()
         self.engagement.ordered(Order(PAUSE, "vaio", 1.0))
         self.assertIsNone(self.engagement.step(self.clock.seconds()))
@@ -404,7 +404,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.said[-3:], ["resumed by vaio", "reports 0.90 m", "acts: dog1, 0.90, best of 2"])
 
     def test_lease_is_kept_while_the_outcome_is_on_its_way(self) -> None:
-        """A pause or another task that comes between the deed and its record does not give the lease to another."""
+        """Another task that arrives between completion and the outcome's record does not release the lease."""
         self.dog.steps = 1
         self.acting()
         self.step()
@@ -416,7 +416,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.events, ["halted", "released"])
 
     def test_deadline_fails_the_task_once(self) -> None:
-        """Past its deadline the task fails by whoever acts, or by the first of those present, and by nobody else."""
+        """After its deadline the acting agent records the task once as failed."""
         self.begin(replace(TASK, deadline=5.0))
         self.acting()
         self.clock.advance(5.1)
@@ -426,7 +426,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual([(r.outcome, r.why) for r in self.results], [(FAILED, "past its deadline of 5 s")])
 
     def test_deadline_falls_to_one(self) -> None:
-        """Who does not act leaves it to whoever does, or to the participant with the lowest uuid."""
+        """An agent that does not act records the missed deadline only if no other acts and its uuid is the lowest."""
         self.begin(replace(TASK, deadline=5.0))
         self.clock.advance(5.1)
         lowest = min([ME, *self.others.values()], key=lambda one: one.node_id.hex())
@@ -438,7 +438,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(len(self.results), int(lowest is ME))
 
     def test_deadline_is_told_by_who_holds_the_task(self) -> None:
-        """Who is to end a task that nobody acts on claims it first: its council lets no other end it."""
+        """An agent that ends a task on which no agent acts claims the lease first, as its outcome needs the token."""
         self.begin(replace(TASK, deadline=5.0))
         self.patch(self.engagement._conference, "is_first", lambda now: True)
         self.acting()
@@ -451,7 +451,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual([result.token for result in self.results], [6])
 
     def test_higher_token_reopens_the_task(self) -> None:
-        """An agent that learns at the end that another was granted a higher token takes part again."""
+        """An agent that learns of a higher token when it ends a task takes part in it again."""
         self.dog.steps = 1
         self.acting()
         self.step()
@@ -461,7 +461,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertIsNotNone(self.engagement.step(self.clock.seconds()))
 
     def test_no_progress_gives_the_task_to_another(self) -> None:
-        """Who comes no further within the stall limit gives the lease back and does not bid for as long."""
+        """An agent without progress within the stall limit returns the lease, and does not bid for the same time."""
         self.begin(replace(TASK, stall_limit=1.0))
         self.dog.progress = 0.5
         self.acting()
@@ -478,13 +478,13 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.engagement.me.cost, 0.5)
 
     def test_behaviour_that_bids_nonsense_bids_nothing(self) -> None:
-        """NaN, infinite, negative and enormous costs are never reported, whatever the behaviour says."""
+        """NaN, infinite, negative and too large costs are never reported."""
         for cost in (float("nan"), float("inf"), -1.0, 1e300):
             self.see(cost)
             self.assertIsNone(self.engagement.me.cost)
 
     def test_validity_is_renewed(self) -> None:
-        """A bid that counts for a while only is told again before it is void, with a new serial number."""
+        """A bid with a validity period is renewed with a new serial number before it expires."""
         self.dog.valid_for = 2.0
         self.see(1.0)
         self.clock.advance(1.1)
@@ -492,7 +492,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual([(m.cost, m.serial, m.valid_for) for m in self.told], [(1.0, 1, 2.0), (1.0, 2, 2.0)])
 
     def test_failing_strategy_falls_back_to_nearest(self) -> None:
-        """A strategy that raises is said once, and the nearest is assigned."""
+        """The error of a failing strategy is logged once, and the nearest agent is assigned."""
 
         class Broken(Nearest):
             name = "broken"
@@ -512,7 +512,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(len(self.flushLoggedErrors(ZeroDivisionError)), 1)
 
     def test_outcome_absorbs_what_follows(self) -> None:
-        """After the end nothing begins again; of two outcomes the one that holds everywhere is kept."""
+        """After the end of a task no event starts it again; of two outcomes, COMPLETED with a token wins."""
         self.end(CANCELLED, "vaio")
         self.hear(self.report(2, 2.0))
         self.see(1.0)
@@ -524,13 +524,13 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.engagement.result, Result(COMPLETED, "dog2", 1.0, 9))
 
     def test_older_life_is_counted_on(self) -> None:
-        """After a restart the agent counts its reports on from where the others know it, so that they are heard."""
+        """After a restart the agent continues the round and serial numbers that the others have seen."""
         self.hear(Member(ME.node_id.hex(), "dog1", WAITING, 9.0, epoch=4, serial=3))
         self.see(1.0)
         self.assertGreater((self.told[-1].epoch, self.told[-1].serial), (4, 3))
 
     def test_heirs_hear_of_a_leave_from_the_one_that_leaves(self) -> None:
-        """Who leaves the task names those that stand by, the next one first, and never itself."""
+        """An agent that leaves a task names its standbys in order, without itself."""
         contacts = {n: Contact(each.public, Address("10.0.0.1", n)) for n, each in self.others.items()}
         self.ports.known = {contact.node_id.hex(): contact for contact in contacts.values()}
         self.hear(self.report(2, 3.0), self.report(3, 2.0))
@@ -542,7 +542,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.council.heirs, [contacts[3], contacts[2]])
 
     def test_each_decision_is_accounted_for_once(self) -> None:
-        """A new decision is told why at once, moved reports at most once a second, and an unchanged one never again."""
+        """A new decision is recorded at once, changed reports at most once a second, an unchanged decision never."""
         accounts = self.ports.accounts
         self.step()
         self.assertEqual(accounts, [])

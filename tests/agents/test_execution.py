@@ -1,4 +1,4 @@
-"""Tests of ``agents.execution``: going on under one token, progress, and a limit to a stall."""
+"""Tests of ``agents.execution``: continuation under one token, progress, and the stall limit."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from middleware.consensus.strategy import Consensus
 
 
 class Digger:
-    """A behaviour that notes under which right it acts, and says how far it has come."""
+    """A behaviour that records its contexts and reports its progress."""
 
     def __init__(self, progress: object = 0.0) -> None:
         self.progress = progress
         self.contexts: list[Context] = []
 
     def execute(self, context: Context) -> Any:
-        """Note it."""
+        """Record the context."""
         self.contexts.append(context)
         return STAND
 
 
 class ExecutionTests(SynchronousTestCase):
     def execution(self, digger: Digger, limit: float = 0.0) -> Execution:
-        """The doing of it."""
+        """Return an execution of this behaviour."""
         return Execution(digger, limit)  # type: ignore[arg-type]
 
     def test_same_token_goes_on(self) -> None:
-        """Under the same token the behaviour is told to go on, under a new one that others may have acted."""
+        """Under an unchanged token the context has ``is_resumed`` set; under a new token it does not."""
         digger = Digger()
         execution = self.execution(digger)
         for now, token in ((1.0, 5), (2.0, 5), (3.0, 6), (4.0, 6)):
@@ -42,7 +42,7 @@ class ExecutionTests(SynchronousTestCase):
         self.assertEqual([row[3:] for row in told[2:]], [(3.0, False), (3.0, True)])
 
     def test_agreement_is_told(self) -> None:
-        """What was agreed on reaches who acts, and under one token it stays while it is open again."""
+        """The agreed value reaches the behaviour, and stays under one token while no new value is agreed."""
         digger = Digger()
         execution = self.execution(digger)
         for token, choice, value in ((5, "red", (1.0, 2.0)), (5, "", ()), (5, "blue", ()), (6, "", ())):
@@ -51,13 +51,13 @@ class ExecutionTests(SynchronousTestCase):
         self.assertEqual(told, [("red", (1.0, 2.0)), ("red", (1.0, 2.0)), ("blue", ()), ("", ())])
 
     def test_progress_is_told_in_quarters(self) -> None:
-        """What a behaviour says of its progress is told in steps; what is none is not."""
+        """Progress is rounded to quarters; an invalid value becomes None."""
         for said, told in ((0.0, 0.0), (0.3, 0.25), (0.75, 0.75), (7.0, 1.0), (-1, 0.0), ("much", None)):
             self.assertEqual(self.execution(Digger(said)).go_on(0.0, 1, 1.0).progress, told, said)
         self.assertIsNone(self.execution(Digger(float("nan"))).go_on(0.0, 1, 1.0).progress)
 
     def test_who_is_kept_from_it_does_not_stall(self) -> None:
-        """A minute in which nobody asks, because the team is stopped, does not count as one without progress."""
+        """Time without calls, because the team is stopped, does not count as time without progress."""
         execution = self.execution(Digger(), 2.0)
         for moment in (0.0, 0.5, 1.0, 61.0, 61.5):
             execution.go_on(moment, 1, 99.0)
@@ -66,7 +66,7 @@ class ExecutionTests(SynchronousTestCase):
         self.assertTrue(execution.has_stalled(62.2))
 
     def test_stall(self) -> None:
-        """Without progress for longer than the limit it has stalled, for as long as it tried; with progress never."""
+        """An execution without progress for the limit is stalled for the time of its attempt; otherwise it never is."""
         digger = Digger()
         execution = self.execution(digger, 2.0)
         for tenth in range(30):

@@ -1,4 +1,4 @@
-"""Tests of ``agents.exploration``: looking around and walking on."""
+"""Tests of ``agents.exploration``: looking around, walking on, and detours around obstacles."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ TICK = 0.05
 
 
 class Walker:
-    """A point in a square room that does at once what the exploration says."""
+    """A point in a square room that executes each action of the exploration at once."""
 
     def __init__(self, seed: int, side: float = 3.0) -> None:
         self.exploration = Exploration(random.Random(seed))
@@ -36,7 +36,7 @@ class Walker:
 
     @property
     def ahead(self) -> float:
-        """The range ahead; NaN beyond 1.5 m."""
+        """The range ahead in metres; NaN beyond 1.5 m."""
         x, y, yaw = self.pose
         cos, sin = math.cos(yaw), math.sin(yaw)
         walls = [(self.side - x) / cos if cos > 0 else -x / cos if cos < 0 else math.inf]
@@ -44,7 +44,7 @@ class Walker:
         return min(walls) if min(walls) < OPEN else math.nan
 
     def live(self) -> float:
-        """One tick; the speed ahead."""
+        """Run one tick and return the forward speed."""
         self.exploration.saw(self.pose, self.turned, self.ahead)
         action = self.exploration.step(self.pose, self.ahead)
         x, y, yaw = self.pose
@@ -60,7 +60,7 @@ class Walker:
 
 class ExplorationTests(SynchronousTestCase):
     def test_look_all_around_before_walking(self) -> None:
-        """No step is made before the whole circle was looked at, which takes no more than five seconds."""
+        """The robot turns a full circle before its first step, within eight seconds."""
         for seed in range(5):
             walker = Walker(seed)
             ticks, turned = 0, 0.0
@@ -71,7 +71,7 @@ class ExplorationTests(SynchronousTestCase):
             self.assertLess(ticks * TICK, 8.0, seed)
 
     def test_walk_stays_off_the_walls(self) -> None:
-        """In two minutes in a closed room the robot never comes nearer to a wall ahead than the clearance allows."""
+        """In two minutes in a closed room the robot keeps the clearance to each wall ahead."""
         for seed in range(5):
             walker = Walker(seed)
             for _ in range(2400):
@@ -81,7 +81,7 @@ class ExplorationTests(SynchronousTestCase):
                 self.assertTrue(0.0 < x < 3.0 and 0.0 < y < 3.0, (seed, walker.pose))
 
     def test_leg_ends_and_the_robot_looks_around_again(self) -> None:
-        """After a leg of its length the robot stands and turns."""
+        """After a leg of at most ``LEG`` metres the robot stops and turns."""
         walker = Walker(1, side=50.0)
         while walker.live() == 0.0:
             pass
@@ -92,7 +92,7 @@ class ExplorationTests(SynchronousTestCase):
         self.assertAlmostEqual(abs(walker.turned), TURN_SPEED * TICK)
 
     def test_most_open_way_is_taken(self) -> None:
-        """Of all headings looked at, one with the most room is walked."""
+        """The robot walks in the direction with the longest range."""
         exploration = Exploration(random.Random(1))
         pose: Pose = (0.0, 0.0, 0.0)
         turned = 0.0
@@ -107,7 +107,7 @@ class ExplorationTests(SynchronousTestCase):
         self.assertTrue(all(abs(yaw - 2.0) < 0.35 for yaw in walks), walks)
 
     def test_way_that_ended_in_a_bump_is_not_tried_again_at_once(self) -> None:
-        """Where nothing is ranged, the heading of a bump is shut for as long as the robot is near that place."""
+        """Without a ranger, the robot does not choose the heading of a recent bump while it is near that place."""
         for seed in range(20):
             exploration = Exploration(random.Random(seed))
             exploration.bumped((0.1, 0.0, 2.0))
@@ -118,13 +118,13 @@ class ExplorationTests(SynchronousTestCase):
         self.assertIn(2, far)
 
     def walks_at(self, exploration: Exploration, yaw: float) -> bool:
-        """Whether the robot would walk on when it looks this way."""
+        """Return whether the robot would walk forward at this heading."""
         return copy.deepcopy(exploration).step((0.0, 0.0, yaw), math.nan)["base.vx"] > 0.0
 
 
 class DetourTests(SynchronousTestCase):
     def gone(self, detour: Detour, ahead: float = math.nan, moves: bool = True) -> tuple[list[Pose], float]:
-        """Where a body that does what it is told (or does not move) comes by, and after how long it is round."""
+        """Return the poses of a robot on this detour, and the duration; ``moves`` is false for a stuck robot."""
         pose: Pose = (0.0, 0.0, 0.0)
         poses, now = [pose], 0.0
         while (action := detour.step(pose, ahead, now)) is not None:
@@ -137,7 +137,7 @@ class DetourTests(SynchronousTestCase):
         return poses, now
 
     def test_who_touched_backs_off_turns_away_and_walks(self) -> None:
-        """First straight back, then round to the side, then a leg in the new direction."""
+        """After a contact the robot backs off, turns away from the contact, and walks a leg in the new direction."""
         for side in (1.0, -1.0):
             detour = Detour(Means())
             detour.begin((0.0, 0.0, 0.0), side, 0.0, has_touched=True)
@@ -149,14 +149,14 @@ class DetourTests(SynchronousTestCase):
             self.assertGreater(side * y, 0.2)
 
     def test_leg_ends_before_the_next_thing(self) -> None:
-        """With something close ahead the leg is not walked."""
+        """With an obstacle close ahead the robot skips the leg."""
         detour = Detour(Means())
         detour.begin((0.0, 0.0, 0.0), 1.0, 0.0, has_touched=False)
         poses, _ = self.gone(detour, ahead=0.2)
         self.assertEqual(poses[-1][:2], (0.0, 0.0))
 
     def test_who_is_stuck_gives_up(self) -> None:
-        """A body that does not move is through after its patience for each of the three, and looks at things again."""
+        """A robot that does not move ends the detour after a timeout for each of its three phases."""
         detour = Detour(Means())
         detour.begin((0.0, 0.0, 0.0), 1.0, 0.0, has_touched=True)
         _, took = self.gone(detour, moves=False)
@@ -164,7 +164,7 @@ class DetourTests(SynchronousTestCase):
         self.assertFalse(detour.is_on(took))
 
     def test_detour_that_nobody_walks_is_none(self) -> None:
-        """Whoever is not asked for so long looks where it is now; and it can be ended at any time."""
+        """A detour without calls expires after its timeout, and ``end`` ends it at any time."""
         detour = Detour(Means())
         detour.begin((0.0, 0.0, 0.0), 1.0, 0.0, has_touched=True)
         self.assertTrue(detour.is_on(1.0))

@@ -1,4 +1,4 @@
-"""Tests of ``agents.formation`` and ``agents.formation``: where those stand who do not act, and how they get there."""
+"""Tests of ``agents.formation``: the positions of robots that do not act, and the paths to them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ANGLES = st.lists(st.floats(-math.pi, math.pi), min_size=1, max_size=6, unique=T
 
 
 def apart(one: float, other: float) -> float:
-    """Radians between two directions."""
+    """Return the angle between two directions in radians."""
     return abs(math.remainder(one - other, math.tau))
 
 
@@ -24,7 +24,7 @@ class PostTests(SynchronousTestCase):
     @settings(max_examples=80)
     @given(ANGLES, st.randoms(use_true_random=False))
     def test_even_and_the_same_for_all(self, angles: list[float], rng: Any) -> None:
-        """Posts lie evenly around the target, and every robot computes the same whatever the order of the reports."""
+        """The posts are evenly spaced around the target, and do not depend on the order of the reports."""
         named = [(f"{number}", angle) for number, angle in enumerate(angles)]
         placed = posts(named, None)
         rng.shuffle(named)
@@ -36,7 +36,7 @@ class PostTests(SynchronousTestCase):
     @settings(max_examples=80)
     @given(ANGLES)
     def test_no_way_crosses_another(self, angles: list[float]) -> None:
-        """The robots stand at their posts in the order in which they stood, and who is to act stays."""
+        """The robots keep their angular order, and the assigned robot stays."""
         named = sorted(((f"{number}", angle) for number, angle in enumerate(angles)), key=lambda one: one[1] % math.tau)
         placed = posts(named, named[0][0])
         self.assertAlmostEqual(apart(placed[named[0][0]], named[0][1]), 0.0, 6)
@@ -44,7 +44,7 @@ class PostTests(SynchronousTestCase):
         self.assertEqual(turns, sorted(turns))
 
     def test_at_their_posts_nobody_moves(self) -> None:
-        """Robots that stand evenly already are all at their posts."""
+        """Robots that are already evenly spaced keep their positions."""
         named = [(name, math.remainder(0.7 + n * math.tau / 3, math.tau)) for n, name in enumerate("abc")]
         for assigned in (None, "b"):
             placed = posts(named, assigned)
@@ -52,19 +52,19 @@ class PostTests(SynchronousTestCase):
                 self.assertAlmostEqual(apart(placed[name], angle), 0.0, 6)
 
     def test_sectors_share_the_circle(self) -> None:
-        """Three search a third each; when one has left the two search a half each."""
+        """Three robots search a third of the circle each; after one leaves, the other two search half each."""
         self.assertEqual(sector("b", {"a", "b", "c"}), (math.pi, math.tau / 3))
         self.assertEqual(sector("b", {"a", "b"}), (math.remainder(1.5 * math.pi, math.tau), math.pi))
 
 
 class Robot:
-    """A behaviour that notes where it is sent."""
+    """A behaviour that records its posts."""
 
     def __init__(self) -> None:
         self.sent: list[Post] = []
 
     def take_post(self, post: Post) -> None:
-        """Note it."""
+        """Record the post."""
         self.sent.append(post)
 
 
@@ -76,7 +76,7 @@ class FormationTests(SynchronousTestCase):
         self.others = [Member("b", "dog2", "WAITING", 1.0, angle=0.2), Member("c", "dog3", "WAITING", 1.0, angle=2.0)]
 
     def test_rests_until_somebody_leaves(self) -> None:
-        """With all there nobody moves; when one is gone the others are sent to even places, whoever joins later too."""
+        """While no robot leaves, none moves; after a departure the others, and later members, get even posts."""
         self.assertEqual(self.formation.hear(self.others), [])
         self.assertIsNone(self.formation.close_up(self.me, self.others, None))
         self.assertEqual(self.robot.sent, [])
@@ -88,14 +88,14 @@ class FormationTests(SynchronousTestCase):
         self.assertEqual(self.robot.sent[-1].sector[1], math.tau / 3)
 
     def test_who_is_to_act_has_no_post(self) -> None:
-        """The assigned robot is not sent anywhere: it is to act."""
+        """The assigned robot gets no post."""
         self.formation.hear(self.others)
         self.formation.hear([])
         self.assertIsNone(self.formation.close_up(self.me, self.others, "a"))
         self.assertIsNone(self.robot.sent[-1].angle)
 
     def test_post_does_not_follow_every_word(self) -> None:
-        """A post moves only when it would move far."""
+        """A post changes only if it would move far."""
         self.formation.hear(self.others)
         self.formation.hear([])
         first = self.formation.close_up(self.me, self.others[:1], "b")
@@ -107,7 +107,7 @@ class FormationTests(SynchronousTestCase):
 
 class CirclingTests(SynchronousTestCase):
     def walk(self, radius: float, post: float, ahead: float = math.nan, seconds: float = 60.0) -> tuple[float, float]:
-        """Let a robot go to its post around a target at (0, 0); its angle and its distance at the end."""
+        """Move a robot to its post around a target at (0, 0); return its final angle and distance."""
         x, y, yaw = radius, 0.0, math.pi
         circling = Circling()
         circling.send(post)
@@ -123,13 +123,13 @@ class CirclingTests(SynchronousTestCase):
         return math.atan2(y, x), math.hypot(x, y)
 
     def test_reaches_its_post_at_the_same_distance(self) -> None:
-        """Whichever way round, the robot ends near its post and as far from the target as before."""
+        """The robot ends near its post at its original distance from the target, on either side."""
         for post in (2.0, -1.0, 3.1):
             angle, distance = self.walk(1.2, post)
             self.assertLess(apart(angle, post), math.radians(21))
             self.assertLess(abs(distance - 1.2), 0.1)
 
     def test_stops_before_what_is_in_the_way(self) -> None:
-        """Where something is ahead the robot stays, and who stands close to the target stays, too."""
+        """The robot stays if an obstacle is ahead or if it is close to the target."""
         self.assertLess(apart(self.walk(1.2, 2.0, ahead=0.3)[0], 0.0), 0.05)
         self.assertLess(apart(self.walk(NEAREST - 0.05, 2.0)[0], 0.0), 0.01)

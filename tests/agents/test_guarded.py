@@ -1,4 +1,4 @@
-"""Tests of ``agents.guarded``: a behaviour in another process."""
+"""Tests of ``agents.guarded``: a behaviour that runs in another process."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SEEN = Observation(1.0, 2.0, {"range.near": 0.5, "bump.left": True}, {"imu.az": 
 
 
 class Spin:
-    """A behaviour that gets dizzy after ``turns`` turns."""
+    """A behaviour that raises an exception after ``turns`` turns."""
 
     def __init__(self, parameters: object = None, rng: object = None, turns: int = 2) -> None:
         self.cost: object = 1.5
@@ -31,30 +31,30 @@ class Spin:
         self.seen: list[tuple[Observation, float]] = []
 
     def look(self, seen: Observation, now: float) -> None:
-        """Keep what is seen."""
+        """Record the observation."""
         self.seen.append((seen, now))
 
     def search(self, now: float) -> Action:
-        """Go."""
+        """Return the action."""
         return GO
 
     hold = search
 
     def execute(self, context: Context) -> Action | None:
-        """Turn, or fall."""
+        """Return an action, or None at the end; raise KeyError in all other turns."""
         self.turns -= 1
         return {1: GO, 0: None}[self.turns]
 
 
 def guarded(spin: object) -> tuple[Any, Loopback]:
-    """A guarded behaviour, and the way to it."""
+    """Return a guarded behaviour and its connection."""
     way = Loopback(lambda parameters, rng: spin)
     return Guarded(way, STAND), way
 
 
 class GuardedTests(SynchronousTestCase):
     def test_asks_while_it_behaves(self) -> None:
-        """What the behaviour says is what is done, its end included; it sees what the body senses, as it is."""
+        """The guarded behaviour passes observations in and actions out unchanged, the end included."""
         spin = Spin()
         behaviour, _ = guarded(spin)
         behaviour.look(SEEN, 0.5)
@@ -63,7 +63,7 @@ class GuardedTests(SynchronousTestCase):
         self.assertEqual((behaviour.execute(Context(0.0)), behaviour.execute(Context(0.1))), (GO, None))
 
     def test_stands_after_it_raised(self) -> None:
-        """Once it has raised, the body stands, nothing is reported and it is not asked again."""
+        """After an exception the robot stands, reports no cost, and the behaviour is not called again."""
         behaviour, way = guarded(Spin(turns=9))
         self.assertEqual(behaviour.execute(Context(0.0)), STAND)
         self.assertTrue(behaviour.has_failed and way.is_closed)
@@ -72,7 +72,7 @@ class GuardedTests(SynchronousTestCase):
         self.assertEqual(way.asked, asked)
 
     def test_never_waits(self) -> None:
-        """While it has not answered the last answer counts for a moment, and then the body stands."""
+        """While no answer arrives the previous action is valid for ``FRESH_S`` seconds; then the robot stands."""
         behaviour, way = guarded(Spin())
         self.assertEqual(behaviour.search(1.0), GO)
         way.is_held = True
@@ -83,7 +83,7 @@ class GuardedTests(SynchronousTestCase):
         self.assertEqual(behaviour.search(1.1 + FRESH_S), GO)
 
     def test_action_of_another_lease_or_method(self) -> None:
-        """What was answered under another token, or to another question, moves nothing."""
+        """An answer to a call with another token or of another method moves nothing."""
         behaviour, way = guarded(Spin(turns=2))
         self.assertEqual(behaviour.execute(Context(0.0, token=4)), GO)
         way.is_held = True
@@ -91,7 +91,7 @@ class GuardedTests(SynchronousTestCase):
         self.assertEqual(behaviour.hold(0.06), STAND)
 
     def test_looks_are_left_out(self) -> None:
-        """A behaviour that is slow at looking is shown the next one only after it has answered."""
+        """A slow behaviour receives the next observation only after it has answered the previous one."""
         spin = Spin()
         behaviour, way = guarded(spin)
         way.is_held = True
@@ -105,7 +105,7 @@ class GuardedTests(SynchronousTestCase):
         self.assertEqual([now for _, now in spin.seen], [0.0, 0.3])
 
     def test_hostile_answers(self) -> None:
-        """An answer that is no action, no number or no list at all ends the behaviour, and raises nothing."""
+        """An answer with an invalid type or value ends the behaviour and raises no exception."""
         answers: list[object] = [
             None,
             7,
@@ -128,7 +128,7 @@ class GuardedTests(SynchronousTestCase):
             self.assertEqual((behaviour.search(0.0), behaviour.has_failed), (STAND, True), answer)
 
     def test_what_it_may_have_beside(self) -> None:
-        """What a behaviour has beside what it must is told, with the usual value where it has none or failed."""
+        """Optional attributes of a behaviour are passed on; a missing one, or a failure, gives the default."""
         spin = Spin()
         spin.value, spin.choice = (1.0,), "left"  # type: ignore[attr-defined]
         behaviour, way = guarded(spin)
@@ -140,7 +140,7 @@ class GuardedTests(SynchronousTestCase):
         self.assertEqual((behaviour.value, behaviour.choice), ((), ""))
 
     def test_means_follow(self) -> None:
-        """What the body learns of itself reaches the behaviour with the next look."""
+        """Changed motion capabilities reach the behaviour before the next observation."""
         told: list[Means] = []
         spin = Spin()
         spin.embody = told.append  # type: ignore[attr-defined]
@@ -154,14 +154,14 @@ class GuardedTests(SynchronousTestCase):
         self.assertEqual(way.asked, ["embody", "embody", "look", "look"])
 
     def test_cost_that_is_no_distance(self) -> None:
-        """A cost that is negative, infinite, not a number or none at all is no report."""
+        """A cost that is negative, infinite, NaN or not a number becomes None."""
         for cost in (-1.0, float("inf"), float("nan"), "near", None, True):
             spin = Spin()
             spin.cost = cost
             self.assertIsNone(guarded(spin)[0].cost)
 
     def test_behaviour_by_its_deployed_name(self) -> None:
-        """A task of the kind ``deployed:x`` gets the deployed behaviour; others are refused with those there are."""
+        """The kind ``deployed:x`` selects the deployed behaviour ``x``; another kind is refused with the known ones."""
         deployed: dict[tuple[str, str], Make] = {
             ("behaviour", "spin"): Loopback.of(Spin),
             ("strategy", "best"): Spin,

@@ -1,4 +1,4 @@
-"""Tests of ``agents.loop``: the agent between its node and its body, in a small team in memory."""
+"""Tests of ``agents.loop``: the agent between its node and its robot, in a small team in memory."""
 
 from __future__ import annotations
 
@@ -26,28 +26,28 @@ class LoopTests(SynchronousTestCase):
         self.agent = self.agent_of("dog1")
 
     def agent_of(self, name: str) -> Agent:
-        """The agent of a dog."""
+        """Return the agent of a dog."""
         agent = self.team.services[name].assembly.agent
         assert isinstance(agent, Agent)
         return agent
 
     def submit(self, **fields: Any) -> None:
-        """Publish a task of one's own making, past the desk and its catalogue."""
+        """Submit a task with these fields directly to the node, without the operator's page and its catalogue."""
         task = Task(**{"task_id": "t1", "kind": "turn-around", "title": "Odd", **fields})
         node = self.team.services["vaio"].assembly.node
         Deferred.fromCoroutine(node.submit(task))
         self.team.clock.advance(1.0)
 
     def device(self, name: str) -> dict[str, Any]:
-        """A device as the page shows it."""
+        """Return a device as the page shows it."""
         return next(dict(row) for row in self.team.state()["devices"] if row["name"] == name)
 
     def lines(self, name: str) -> list[str]:
-        """The messages of a device."""
+        """Return the messages of a device."""
         return [text for _, text in self.device(name)["messages"]]
 
     def test_age_of_a_picture(self) -> None:
-        """A picture is as old as its robot and its own clock say together, wherever it is looked at."""
+        """The age of a camera frame is the time in the robot plus the time since it arrived."""
         agent = self.team.services["dog1"].assembly.agent
         assert isinstance(agent, Agent)
         ages: list[float] = []
@@ -61,7 +61,7 @@ class LoopTests(SynchronousTestCase):
         self.assertLess(abs(age - 0.5), 0.01)
 
     def test_no_command_before_the_motors_are_on(self) -> None:
-        """An agent whose task comes while its robot wakes up waits: not one command is refused by the robot."""
+        """An agent with a task sends no command before its robot's motors are enabled."""
         self.submit()
         refused: list[str] = []
         self.team.add("dog3")
@@ -78,7 +78,7 @@ class LoopTests(SynchronousTestCase):
 
         enable = driver.enable
         driver.act = watched
-        driver.enable = lambda: deferLater(self.team.clock, 1.5, enable)  # a robot that is slow to wake up
+        driver.enable = lambda: deferLater(self.team.clock, 1.5, enable)  # a robot that starts slowly
         self.team.clock.advance(1.3)
         self.assertIsNot(self.agent_of("dog3").engagement, None)
         self.assertFalse(self.agent_of("dog3")._body.is_awake)
@@ -87,7 +87,7 @@ class LoopTests(SynchronousTestCase):
         self.assertEqual(refused, [])
 
     def test_motors_are_asked_for_until_they_are_on(self) -> None:
-        """A link that breaks while the motors are switched on is tried again until the robot is awake."""
+        """If the connection breaks while the motors start, the agent enables them again after it reconnects."""
         self.team.add("dog3")
         service = self.team.services["dog3"]
         connector = self.team.connectors["dog3"]
@@ -102,7 +102,7 @@ class LoopTests(SynchronousTestCase):
         self.assertIsNot(self.agent_of("dog3").engagement, None)
 
     def test_switched_off_robot_takes_no_part(self) -> None:
-        """Whose robot was switched off by hand still senses, and takes no part until it is on again."""
+        """A robot with disabled motors still sends observations, and is unavailable until they are enabled again."""
         self.submit(kind="find-target")
         self.team.clock.advance(3.0)
         driver = self.team.services["dog1"].assembly.driver
@@ -119,7 +119,7 @@ class LoopTests(SynchronousTestCase):
         self.assertTrue(said.me.available)
 
     def test_every_motion_of_the_task_is_under_a_lease(self) -> None:
-        """While a dog turns for its task each command carries token and deadline of a lease that is valid then."""
+        """Each motion command of a task carries the token and deadline of the agent's valid lease."""
         bad: list[object] = []
         count = 0
         for name in ("dog1", "dog2"):
@@ -145,7 +145,7 @@ class LoopTests(SynchronousTestCase):
         self.assertEqual(self.team.state()["tasks"][0]["status"], "COMPLETED")
 
     def test_only_who_did_it_is_done(self) -> None:
-        """At the end the device that did the task becomes DONE and the other IDLE, and never DONE for a moment."""
+        """After the task its assigned agent becomes DONE and the other IDLE, which is never DONE in between."""
         self.submit()
         ends: dict[str, list[str]] = {"dog1": [], "dog2": []}
         for name, statuses in ends.items():
@@ -165,7 +165,7 @@ class LoopTests(SynchronousTestCase):
         self.assertEqual((other[-1], other.count("DONE")), ("IDLE", 0))
 
     def test_task_without_a_behaviour_is_left_and_said(self) -> None:
-        """A task of an unknown kind, or with odd parameters, leaves a line on the device, and the next task is done."""
+        """A task with an unknown kind or invalid parameters adds a message to the device; the next task is done."""
         self.submit(kind="os:system")
         self.assertIn("no behaviour for tasks of kind 'os:system'", self.lines("dog1")[-1])
         self.submit(task_id="t2", created=1.0, kind="find-target", parameters={"target_radius": 0.0})
@@ -176,7 +176,7 @@ class LoopTests(SynchronousTestCase):
         self.assertEqual(states["t3"], "COMPLETED")
 
     def test_strategy_is_never_imported_from_a_task(self) -> None:
-        """A strategy as a module's path is refused where a task is submitted, and where a peer wrote it anyway."""
+        """A strategy with the form ``module:name`` is refused in a submission and in a record of another node."""
         node = self.team.services["vaio"].assembly.node
         task = Task("t0", "turn-around", "Odd", strategy="os:system")
         self.failureResultOf(Deferred.fromCoroutine(node.submit(task)), UnknownStrategy)
@@ -186,7 +186,7 @@ class LoopTests(SynchronousTestCase):
             self.assertIn(f"unknown strategy {odd.strategy!r}", self.lines("dog1")[-1])
 
     def test_old_task_that_is_done_is_not_begun_again(self) -> None:
-        """A dog that comes after the end of a task does not take it up."""
+        """A dog that joins after the end of a task does not start it."""
         self.submit()
         self.team.clock.advance(8.0)
         self.team.add("dog3")
@@ -195,7 +195,7 @@ class LoopTests(SynchronousTestCase):
         self.assertEqual(self.agent_of("dog3")._docket.open, set())
 
     def test_task_is_taken_up_when_nobody_could_tell_at_first(self) -> None:
-        """A task whose group nobody answers for is asked about again, without any other event."""
+        """If no node answers a query for the group of a task, the agent repeats the query until one does."""
         agent = self.agent_of("dog1")
         node = agent._node
         get, tries = node.entangled.get, []
@@ -215,7 +215,7 @@ class LoopTests(SynchronousTestCase):
         self.assertIsNot(agent.engagement, None)
 
     def test_robot_that_the_yard_does_not_have_is_said(self) -> None:
-        """A device whose robot does not exist says so, and the others do the task without it."""
+        """A device whose robot does not exist shows an error, and the other devices complete the task."""
         self.team.add("dog3", tables={"driver": {"kind": "sim", "options": {"robot": "ghost", "camera_fps": 0.0}}})
         self.team.clock.advance(2.0)
         self.assertIn("has no robot: no robot is named 'ghost'", self.lines("dog3")[-1])
@@ -225,7 +225,7 @@ class LoopTests(SynchronousTestCase):
         self.assertNotEqual(self.team.state()["tasks"][0]["result"]["by"], "dog3")
 
     def test_stopped_agent_stands_still(self) -> None:
-        """An agent that is stopped while its robot moves leaves it at rest."""
+        """An agent that stops while its robot moves stops the robot."""
         self.submit()
         self.team.clock.advance(1.0)
         moving = [dog.name for dog in self.team.yard.world.dogs.values() if dog.is_moving]

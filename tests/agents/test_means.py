@@ -1,4 +1,4 @@
-"""Tests of ``agents.means``: what a body can do, by its description and by what it did."""
+"""Tests of ``agents.means``: the motion capabilities of a robot, from its description and its executed actions."""
 
 from __future__ import annotations
 
@@ -15,31 +15,31 @@ WHEELS = Description("w", "", {"camera": {}}, {"base.vx": (-0.2, 0.2), "base.wz"
 
 
 def with_camera(**properties: float) -> Means:
-    """The means of a body on wheels with a camera of these properties."""
+    """Return the motion capabilities of a wheeled robot with this camera."""
     return Means(replace(WHEELS, capabilities={"camera": properties}))
 
 
 class DescriptionTests(SynchronousTestCase):
     def test_unknown_body_is_an_ers7(self) -> None:
-        """Who says nothing of itself has the means of the simulated dog, to the last bit."""
+        """Without a description the capabilities are exactly the simulated dog's."""
         for name in ("walk", "turn", "look_turn", "strafes", "ranges", "lens", "ahead", "stop_at", "fresh", "aim"):
             self.assertEqual(getattr(Means(), name), getattr(Means(described("sim")), name), name)
         self.assertEqual((Means().walk, Means().look_turn, Means().stop_at, Means().aim), (0.16, 1.6, STOP_AT, FACING))
 
     def test_lens_is_as_described(self) -> None:
-        """The lens in degrees becomes radians; without a word on its height the pixels are square."""
+        """The lens is converted from degrees to radians; without a vertical angle the pixels are square."""
         self.assertEqual(with_camera(fov_h_deg=90.0).lens, (math.pi / 2, None))
         self.assertEqual(with_camera(fov_h_deg=90.0, fov_v_deg=60.0).lens, (math.pi / 2, math.radians(60.0)))
         self.assertEqual(with_camera().lens, Means().lens)
 
     def test_slow_camera_slows_the_turn(self) -> None:
-        """With two pictures a second the body turns by no more than half a view between them, and waits longer."""
+        """At two frames per second the robot turns at most half a view between frames, and accepts older frames."""
         slow = Means(replace(WHEELS, rates={"camera": 2.0}))
         self.assertLess(slow.look_turn / 2.0, 0.51 * slow.lens[0])
         self.assertGreater(slow.fresh, 2 / 2.0)
 
     def test_broad_body_stops_earlier(self) -> None:
-        """Where the body is broader than the camera sits ahead, the camera stays farther away."""
+        """The camera of a wide robot stops farther from the target."""
         self.assertAlmostEqual(Means(described("create2")).stop_at, 0.174 - 0.10 + 0.08)
         middle = Means(replace(WHEELS, capabilities={"camera": {"ahead": 0.01}}, radius=0.3))
         self.assertAlmostEqual(middle.stop_at, 0.3 - 0.01 + 0.08)
@@ -47,7 +47,7 @@ class DescriptionTests(SynchronousTestCase):
 
 class FittedTests(SynchronousTestCase):
     def test_rest_on_an_axis_that_is_not_there_is_left_out(self) -> None:
-        """To stand is understood by every body; a motion that it cannot do is left to its driver to refuse."""
+        """Zero velocity on a missing axis is removed; other values are left for the driver to refuse."""
         self.assertEqual(Means(WHEELS).fitted(STAND), {"base.vx": 0.0, "base.wz": 0.0})
         self.assertEqual(Means().fitted(STAND), STAND)
         aside = {"base.vy": 0.1}
@@ -56,11 +56,11 @@ class FittedTests(SynchronousTestCase):
 
 class LearningTests(SynchronousTestCase):
     def turned(self, means: Means, wished: float, done: float) -> None:
-        """Tell that a turn on the spot was done so."""
+        """Record a turn on the spot that was executed at another velocity."""
         means.did({"base.vx": 0.0, "base.wz": wished}, {"base.vx": 0.0, "base.wz": done})
 
     def test_who_does_what_it_is_told_learns_nothing(self) -> None:
-        """Clipped or not, a body that does no more than it was told keeps its fine aim."""
+        """A robot that executes an action exactly, or clipped to its limits, keeps its fine aim."""
         means = Means(WHEELS)
         for wished, done in ((0.5, 0.5), (5.0, 2.0), (0.01, 0.0100001)):
             self.turned(means, wished, done)
@@ -70,7 +70,7 @@ class LearningTests(SynchronousTestCase):
         )
 
     def test_faster_turn_than_asked_for_is_a_coarse_aim(self) -> None:
-        """Who turns in steps aims the more coarsely the larger its smallest step is, and not endlessly so."""
+        """The larger a robot's smallest turn is, the coarser is its aim, up to a limit."""
         means = Means(replace(WHEELS, rates={"camera": 5.0}))
         self.turned(means, 0.1, 1.0)
         large = means.aim
@@ -79,14 +79,14 @@ class LearningTests(SynchronousTestCase):
         self.assertTrue(means.is_coarse)
 
     def test_turn_that_was_too_slow_is_tried_faster(self) -> None:
-        """A turn so slow that the body stood is asked for faster the next time, on either side."""
+        """If a turn was too slow to move the robot, the next one is faster, in both directions."""
         means = Means(WHEELS)
         self.turned(means, 0.1, 0.0)
         self.assertAlmostEqual(means.spin(-0.05)["base.wz"], -0.15)
         self.assertEqual(means.spin(0.0), STAND)
 
     def test_who_cannot_turn_on_the_spot_walks_on_arcs(self) -> None:
-        """A body that stands still at its fastest turn walks as it turns, and tells how narrowly it does."""
+        """A robot that does not turn on the spot at full speed walks while it turns, and learns its turning circle."""
         means = Means(WHEELS)
         self.turned(means, means.look_turn, 0.0)
         action = means.spin(1.0)
@@ -96,7 +96,7 @@ class LearningTests(SynchronousTestCase):
         self.assertEqual(means.spin(0.0), STAND)
 
     def test_creep_that_was_too_slow_is_tried_faster(self) -> None:
-        """A walk so slow that the body stood is asked for faster, and a stride too long makes it stop earlier."""
+        """If a walk was too slow to move the robot, the next one is faster; too long a stride makes it stop earlier."""
         means = Means(WHEELS)
         before = means.stop_at
         means.did({"base.vx": 0.04, "base.wz": 0.0}, {"base.vx": 0.0, "base.wz": 0.0})

@@ -11,17 +11,17 @@ from middleware.errors import UnknownAgent
 
 class RegistryTests(SynchronousTestCase):
     def test_agents_are_found_by_name_or_path(self) -> None:
-        """A built-in agent is found by its name, one's own by module and class."""
+        """A built-in agent is found by its name, any other by module and class."""
         self.assertIs(agent_named("search"), Agent)
         self.assertIs(agent_named("agents.loop:Agent"), Agent)
 
     def test_unknown_agent_is_refused_with_the_known(self) -> None:
-        """A name that is no agent is refused with those there are."""
+        """An unknown name is refused with the list of the known agents."""
         error = self.assertRaises(UnknownAgent, agent_named, "serch")
         self.assertEqual(str(error), "unknown agent 'serch'; use search, or module:Class")
 
     def test_agent_that_cannot_be_loaded_says_why(self) -> None:
-        """A module or class that is not there is named."""
+        """The error for a missing module or class names it."""
         for name in ("no_such_module:Mind", "agents.loop:Mind"):
             error = self.assertRaises(UnknownAgent, agent_named, name)
             self.assertIn("cannot be loaded", str(error))

@@ -1,4 +1,4 @@
-"""Tests of ``agents.report``: what one body tells of itself, for strategies that go by more than the cost."""
+"""Tests of ``agents.report``: the values that an agent reports in addition to its cost."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ ME = Member("a", "dog", "WAITING")
 
 
 class Minded:
-    """A behaviour that has an opinion."""
+    """A behaviour that reports a value, a choice and a weight."""
 
     cost: float | None = 2.0
     value: object = (1.0, 2)
@@ -34,11 +34,11 @@ class ReporterTests(SynchronousTestCase):
         self.me = ME
 
     def made(self) -> Any:
-        """A behaviour of which the test changes what it likes."""
+        """Return a behaviour for the test to change."""
         return Minded()
 
     def news(self, charge: float = 0.8, load: int = 2) -> dict[str, Any]:
-        """What is told, and known from then on."""
+        """Return the changed values, and store them as reported."""
         seen = Observation(0.0, 0.0, {"power.level": charge})
         self.reporter.load = load
         told = self.reporter.news(self.me, False, seen, self.clock.seconds()) or {}
@@ -46,19 +46,19 @@ class ReporterTests(SynchronousTestCase):
         return told
 
     def test_all_is_told_at_first(self) -> None:
-        """With its first cost a body tells its charge, its load and what its behaviour offers, and not again."""
+        """The first report with a cost contains battery, load and the behaviour's values; later ones only changes."""
         offer = {"value": (1.0, 2.0), "choice": "red", "weight": 3.0, "electorate": 9.0}
         self.assertEqual(self.news(), {"cost": 2.0, "available": True, "battery": 0.8, "load": 2, **offer})
         self.clock.advance(9.0)
         self.assertEqual(self.news(), {})
 
     def test_without_cost_nothing_is_offered(self) -> None:
-        """Who cannot tell what it would cost has no vote and no value."""
+        """An agent without a cost reports no vote and no value."""
         self.minded.cost = None
         self.assertEqual(self.news(), {})
 
     def test_battery_is_told_in_steps(self) -> None:
-        """A charge that runs down is told each twentieth, one outside of 0 to 1 as the nearest share."""
+        """The battery charge is reported in steps of a twentieth, clipped to the range 0 to 1."""
         self.news()
         self.assertEqual([self.news(charge) for charge in (0.79, 0.76)], [{}, {}])
         self.assertEqual(
@@ -67,7 +67,7 @@ class ReporterTests(SynchronousTestCase):
         self.assertEqual(self.news(float("nan")), {})
 
     def test_votes_at_once_and_numbers_at_leisure(self) -> None:
-        """A changed vote is told at once, a number that moves once a second, for it may move with each look."""
+        """A changed vote is reported at once, a changed number at most once a second."""
         self.news()
         self.minded.choice, self.minded.value = "blue", (1.1, 2.0)
         self.assertEqual(self.news(), {"choice": "blue"})
@@ -77,7 +77,7 @@ class ReporterTests(SynchronousTestCase):
         self.assertEqual(self.news(), {"value": ()})
 
     def test_offers_that_are_none(self) -> None:
-        """What a behaviour offers that is no place, option or weight is not told."""
+        """Invalid values, choices and weights of a behaviour are not reported."""
         bad: dict[str, list[object]] = {
             "value": [5, [1.0], ("x",), (float("nan"),), (1e12,), (0.0,) * 9],
             "choice": [None, 7, "x" * 65, "a\nb"],

@@ -1,4 +1,4 @@
-"""Tests of ``agents.search`` in the simulated yard, without nodes and links: body, pictures and behaviour alone."""
+"""Tests of ``agents.search`` with a simulated robot and its camera, without nodes and links."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ TICK = 8 * SUBSTEP
 
 
 class Walk:
-    """One dog of the yard and its behaviour; the other dogs stand far away."""
+    """A simulated dog and its behaviour; the other dogs stand far away."""
 
     def __init__(self, seed: int = 1, x: float = 0.4, y: float = 1.2, heading: float = 0.0) -> None:
         self.world = World(Random(seed), loaded("three-dogs"))
@@ -38,11 +38,11 @@ class Walk:
         self.replaced: dict[str, float] = {}
 
     def execute(self, now: float) -> Action | None:
-        """Act as under a lease."""
+        """Execute the task with an empty context."""
         return self.behaviour.execute(Context(now))
 
     def live(self, act: Any = None) -> Action | None:
-        """One tick: sense, look, act (``search`` where nothing else is said)."""
+        """Run one tick: sense, observe, and act with ``act`` (default: ``search``)."""
         for _ in range(8):
             self.world.step()
             self.senses.sample()
@@ -58,19 +58,19 @@ class Walk:
         return action
 
     def find(self, limit: float = 60.0) -> float | None:
-        """Search until the behaviour can tell the cost."""
+        """Search until the behaviour has a cost, or until ``limit``."""
         while self.behaviour.cost is None and self.now < limit:
             self.live()
         return self.behaviour.cost
 
     def distance(self) -> float:
-        """Metres from the lens to the target's axis, in truth."""
+        """Return the true distance in metres from the lens to the target's axis."""
         assert self.world.target is not None
         x, y = self.dog.x + NOSE * math.cos(self.dog.heading), self.dog.y + NOSE * math.sin(self.dog.heading)
         return math.hypot(self.world.target.x - x, self.world.target.y - y)
 
     def gap(self) -> float:
-        """Metres between footprint and target."""
+        """Return the distance in metres between the robot's footprint and the target."""
         target = self.world.target
         assert target is not None
         return math.hypot(target.x - self.dog.x, target.y - self.dog.y) - target.radius - FOOTPRINT
@@ -78,7 +78,7 @@ class Walk:
 
 class SearchTests(SynchronousTestCase):
     def test_target_is_found_wherever_it_is(self) -> None:
-        """From any heading the dog finds the target, faces it, and tells its distance to 8 %."""
+        """From any heading the dog finds the target, and its cost is within 8 % of the true distance."""
         for heading in (0.0, 1.5, -2.5, 3.1):
             walk = Walk(heading=heading)
             walk.world.place_target(1.6, 1.5)
@@ -89,7 +89,7 @@ class SearchTests(SynchronousTestCase):
 
 class RangerTests(SynchronousTestCase):
     def told(self, replaced: dict[str, float]) -> float:
-        """What is told of a target 0.9 m away with these ranges in place of the real ones, relative to the truth."""
+        """Return the reported distance, relative to the true one, of a target at 0.9 m with these ranger values."""
         walk = Walk()
         walk.world.place_target(0.4 + NOSE + 0.9, 1.2)
         walk.replaced = replaced
@@ -98,24 +98,24 @@ class RangerTests(SynchronousTestCase):
         return cost / walk.distance()
 
     def test_ranger_is_believed_where_the_picture_agrees(self) -> None:
-        """A range that fits the picture is what is told, for it is the better measure."""
+        """If range and camera agree, the cost is the range, which is more accurate."""
         self.assertLess(abs(self.told({"range.near": math.nan, "range.far": 0.86}) * 0.9 - 0.94), 0.02)
 
     def test_ranger_that_reads_something_else_is_not_believed(self) -> None:
-        """A dog in between (too near), a wall behind (too far) or no range leaves the distance of the picture."""
+        """If a dog in between, a wall behind or no echo disturbs the range, the cost is the camera's distance."""
         for wrong in (0.2, 0.45, 1.4, math.nan):
             self.assertLess(abs(self.told({"range.near": math.nan, "range.far": wrong}) - 1), 0.08, wrong)
 
 
 class ApproachTests(SynchronousTestCase):
     def reach(self, walk: Walk, limit: float = 60.0) -> None:
-        """Walk up to the target until the behaviour says that it is done."""
+        """Execute the task until it is done."""
         while walk.live(walk.execute) is not None:
             self.assertLess(walk.now, limit, "never done")
         walk.world.halt("dog1")
 
     def test_dog_stops_before_the_target(self) -> None:
-        """The dog stands at the target, faces it and has touched nothing."""
+        """The dog stops close to the target without a contact."""
         for seed, (x, y) in enumerate(((1.6, 1.5), (1.2, 0.5), (2.2, 1.2))):
             walk = Walk(seed)
             walk.world.place_target(x, y)
@@ -125,7 +125,7 @@ class ApproachTests(SynchronousTestCase):
             self.assertTrue(0.0 < walk.gap() <= STOP_AT + 0.03, (x, y, walk.gap()))
 
     def test_moved_target_is_followed(self) -> None:
-        """The target is moved while the dog walks: the dog goes where it is now."""
+        """If the target moves while the dog walks, the dog walks to its new position."""
         walk = Walk()
         walk.world.place_target(1.8, 1.2)
         walk.find()
@@ -136,7 +136,7 @@ class ApproachTests(SynchronousTestCase):
         self.assertLessEqual(walk.gap(), STOP_AT + 0.03)
 
     def test_target_that_is_taken_away_is_never_reached(self) -> None:
-        """Where the target was taken away the dog is not done: it forgets, and searches again."""
+        """If the target is removed, the task does not complete: the cost expires, and the dog searches again."""
         walk = Walk()
         walk.world.place_target(1.0, 1.2)
         walk.find()
@@ -148,14 +148,14 @@ class ApproachTests(SynchronousTestCase):
 
 class MemoryTests(SynchronousTestCase):
     def found(self) -> Walk:
-        """A dog that has found the target."""
+        """Return a dog that has found the target."""
         walk = Walk()
         walk.world.place_target(1.6, 1.4)
         self.assertIsNotNone(walk.find())
         return walk
 
     def test_target_out_of_sight_is_remembered_for_a_while(self) -> None:
-        """A target that is hidden for a moment keeps its report; after the memory's seconds the report is gone."""
+        """A hidden target keeps its cost for ``MEMORY`` seconds, then the cost is removed."""
         walk = self.found()
         walk.turned_off.add("camera")
         hidden = walk.now
@@ -167,7 +167,7 @@ class MemoryTests(SynchronousTestCase):
         self.assertIsNone(walk.behaviour.cost)
 
     def test_old_picture_is_not_a_new_sighting(self) -> None:
-        """The same picture shown again and again does not keep the memory fresh."""
+        """A repeated camera frame does not extend the memory of the target."""
         walk = self.found()
         observation = Observation(0.0, 0.0, walk.senses.values(), frame=Frame(walk.frames, 208, 160, b"", 0.0))
         walk.behaviour.look(observation, walk.now + MEMORY + 0.1)
@@ -175,10 +175,10 @@ class MemoryTests(SynchronousTestCase):
 
 
 class HiddenTests(SynchronousTestCase):
-    """Another robot stands before the target, as a dead one does that was on its way."""
+    """Another robot stands in front of the target, such as one that failed on its way."""
 
     def hidden(self, at: float = 0.55) -> Walk:
-        """A dog that has found the target, and then another stops that far before it on the straight line."""
+        """Return a dog that has found the target, then hidden by another dog ``at`` metres ahead."""
         walk = Walk()
         walk.world.place_target(1.9, 1.4)
         self.assertIsNotNone(walk.find())
@@ -188,7 +188,7 @@ class HiddenTests(SynchronousTestCase):
         return walk
 
     def test_report_stays_for_a_while(self) -> None:
-        """A target hidden by another robot keeps its report for as long as another may need to act, and no longer."""
+        """A target hidden by another robot keeps its cost for ``HIDDEN`` seconds, then the cost is removed."""
         walk = self.hidden()
         began = walk.now
         while walk.now - began < HIDDEN - 0.5:
@@ -199,7 +199,7 @@ class HiddenTests(SynchronousTestCase):
         self.assertIsNone(walk.behaviour.cost)
 
     def test_way_leads_round_it(self) -> None:
-        """Sent to the target, the dog goes round who hides it, does not push it away, and stands at the target."""
+        """The dog walks around another dog in front of the target without a push, and stops at the target."""
         walk = self.hidden()
         other = walk.world.dogs["dog2"]
         place = other.x, other.y
@@ -211,7 +211,7 @@ class HiddenTests(SynchronousTestCase):
 
 class ParameterTests(SynchronousTestCase):
     def test_sizes_that_cannot_be_are_refused(self) -> None:
-        """A target's size that is not finite, not positive, absurd or no number at all is refused when it is made."""
+        """A target size that is not a positive finite number in range is refused on creation."""
         for name in ("target_radius", "target_height"):
             for wrong in (0.0, -1.0, math.inf, math.nan, 1e9, "big"):
                 self.assertRaises(ValueError, SearchAndApproach, {name: wrong}, Random(1))

@@ -1,4 +1,4 @@
-"""Tests of ``agents.state``: the table, and what holds in each state that an agent can reach."""
+"""Tests of ``agents.state``: the transition table, and the invariants of each reachable state."""
 
 from __future__ import annotations
 
@@ -28,20 +28,20 @@ DEADLINE = 100.0
 
 class TableTests(SynchronousTestCase):
     def test_each_pair_has_one_row(self) -> None:
-        """Each event is answered in each state, once; without any one row it is not."""
+        """Each event has exactly one row in each state, and no row is redundant."""
         named = [(state, row.event) for row in ROWS for state in row.states]
         self.assertEqual((len(named), set(TABLE)), (len(set(named)), set(product(State, Event))))
         for row in ROWS:
             self.assertNotEqual(set(build_table(each for each in ROWS if each is not row)), set(TABLE))
 
     def test_only_a_grant_leads_to_execution(self) -> None:
-        """EXECUTING is entered by GRANTED alone, and the task is done in no other state."""
+        """Only the event GRANTED leads to EXECUTING, and the effect EXECUTE occurs in no other state."""
         entered = {event for (state, event), (target, _) in TABLE.items() if S.EXECUTING is target is not state}
         executed = {target for target, effects in TABLE.values() if Effect.EXECUTE in effects}
         self.assertEqual((entered, executed), ({Event.GRANTED}, {S.EXECUTING}))
 
     def test_execution_ends_with_a_stopped_body(self) -> None:
-        """EXECUTING is left with a stop of the body as the first effect, and no other state has a body to stop."""
+        """Each transition out of EXECUTING has STOP as its first effect; no other state has this effect."""
         for (state, event), (target, effects) in TABLE.items():
             is_acting = state is S.EXECUTING
             self.assertEqual(Effect.STOP in effects[:1], is_acting and bool(effects) and Effect.EXECUTE not in effects)
@@ -50,18 +50,18 @@ class TableTests(SynchronousTestCase):
                 self.assertIn(Effect.STOP, effects, event.name)
 
     def test_the_end_is_the_end(self) -> None:
-        """Nothing follows DONE but that the lease is handed over, and each state can end there."""
+        """DONE has no outgoing transition, its only effect is HAND_OVER, and OUTCOME leads to DONE from each state."""
         follow = {(target, effects) for (state, _), (target, effects) in TABLE.items() if state is S.DONE}
         self.assertEqual(follow, {(S.DONE, ()), (S.DONE, (Effect.HAND_OVER,))})
         self.assertEqual({TABLE[state, Event.OUTCOME][0] for state in State}, {S.DONE})
 
     def test_statuses_are_those_of_the_page(self) -> None:
-        """Each state shows as one of the coarse statuses, and only EXECUTING as that."""
+        """Each state maps to a known status, and only EXECUTING to the status EXECUTING."""
         self.assertTrue({state.status for state in S} <= set(STATUSES))
         self.assertEqual([state for state in S if state.status == EXECUTING], [S.EXECUTING])
 
     def test_rank_is_shown(self) -> None:
-        """An agent that waits shows its place in the line, and keeps it where nothing gives it another."""
+        """The text of a waiting agent contains its rank, which stays until an event changes it."""
         course = Course()
         course.state = S.OBSERVING
         for event, rank, shown in (
@@ -73,12 +73,12 @@ class TableTests(SynchronousTestCase):
             self.assertEqual(str(course), shown)
 
     def test_page_has_the_table(self) -> None:
-        """The states on the page are made from the table."""
+        """The documentation contains the states as generated from the table."""
         self.assertIn(write_states(), PAGE.read_text(encoding="utf-8"))
 
 
 class Rig:
-    """An agent in a task with a body, a council, another agent, and time; the invariants are checked at each input."""
+    """An agent in a task with fakes of robot, council, other agent and clock; each input checks the invariants."""
 
     def __init__(self) -> None:
         self.clock = HeapClock()
@@ -95,7 +95,7 @@ class Rig:
 
     @property
     def key(self) -> tuple[object, ...]:
-        """What decides which event an input leads to."""
+        """The part of the state that determines the event of an input."""
         one, council = self.engagement, self.council
         held = one.course.state, one.lessee is not None, council.lease is not None, self.has_left, self.is_moving
         if one.is_over or self.has_left:
@@ -105,7 +105,7 @@ class Rig:
         return (*held, *asked, moves, one.me.cost, *(other.cost for other in self.others))
 
     def feed(self, name: str) -> list[str]:
-        """Have one thing happen, and then a turn; what is wrong with it."""
+        """Apply one input, run a step, and return the faults that the invariants find."""
         for past in (self.events, self.ports.told, self.ports.said, self.ports.accounts, self.dog.contexts):
             past.clear()
         was_over = self.engagement.is_over
@@ -120,7 +120,7 @@ class Rig:
         return faults
 
     def faults(self, deed: Deed | None) -> list[str]:
-        """Which invariants the events and ``deed`` of a turn break."""
+        """Return the invariants that the events and ``deed`` of a step violate."""
         faults = []
         for event in self.events:
             if event == "halted":
@@ -140,37 +140,37 @@ class Rig:
 
 
 def hear(rig: Rig, one: Engagement, now: float, *others: Member) -> None:
-    """The other reports, or is gone."""
+    """The other agents report; without ``others``, they have left."""
     rig.others = list(others)
     one.heard(rig.others, None, now)
 
 
 def take(rig: Rig, one: Engagement, now: float) -> None:
-    """The agent gives its body to the task."""
+    """The agent gives its robot to the task."""
     if one.lessee is None and not rig.has_left:
         one.take_body(rig.lessee, one.claim.token)
 
 
 def lend(rig: Rig, one: Engagement, now: float) -> None:
-    """Another task of the group gets the body, as long as this one does not act."""
+    """Another task of the group gets the robot, unless this one acts."""
     if not one.is_acting and one.may_be_put_aside:
         one.lend_body(True, now)
 
 
 def finish(rig: Rig, one: Engagement, now: float) -> None:
-    """The behaviour has nothing left to do, if it acts now."""
+    """The behaviour completes its task, if the agent acts."""
     if one.course.state is S.EXECUTING:
         rig.dog.steps = 0
 
 
 def grant(rig: Rig, one: Engagement, now: float) -> None:
-    """The council grants the lease to an agent that asks for it."""
+    """The council grants the lease if the agent wants it."""
     if one.lessee is not None and (rig.council.is_wanted or rig.council.places[-1:] > [0]):
         rig.council.grant(one.claim.token + 1)
 
 
 def lose(rig: Rig, one: Engagement, now: float) -> None:
-    """The lease runs out, and the robot stops by itself."""
+    """The lease expires, and the robot stops at its deadline."""
     rig.council.token, rig.is_moving = 0, False
 
 
@@ -181,7 +181,7 @@ def leave(rig: Rig, one: Engagement, now: float) -> None:
 
 
 def expire(rig: Rig, one: Engagement, now: float) -> None:
-    """The task is past its deadline; a lease that is held is renewed."""
+    """The task passes its deadline; a held lease is renewed."""
     rig.is_late = True
     rig.council.deadline += DEADLINE
     rig.clock.advance(DEADLINE + 1.0)
@@ -217,7 +217,7 @@ INPUTS: dict[str, Callable[[Rig, Engagement, float], object]] = {
 
 class ReachableTests(SynchronousTestCase):
     def test_invariants_hold_in_each_state_that_is_reached(self) -> None:
-        """From the beginning everything happens in each state: no act without a lease, a stop before its return."""
+        """Each input in each reachable state keeps the invariants, such as no action without a lease."""
         first = Rig()
         shared = {id(each): each for each in (first.engagement.task, CONTACT)}
         known: dict[tuple[object, ...], tuple[str, ...]] = {first.key: ()}
@@ -232,5 +232,5 @@ class ReachableTests(SynchronousTestCase):
                     known[after.key] = (*way, name)
                     open_.append(after)
         self.assertEqual({key[0] for key in known}, set(State))
-        self.assertEqual({key[0] for key in known if key[4]}, {S.EXECUTING})  # where the body moves
+        self.assertEqual({key[0] for key in known if key[4]}, {S.EXECUTING})  # in these states the robot moves
         self.assertGreater(len(known), 400)

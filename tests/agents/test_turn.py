@@ -15,13 +15,13 @@ from drivers.reading import Description, Observation, Value
 
 
 def seen(**values: Value) -> Observation:
-    """An observation; ``odom_yaw`` stands for ``odom.yaw``."""
+    """Return an observation; ``odom_yaw`` stands for ``odom.yaw``."""
     return Observation(0.0, 0.0, {key.replace("_", "."): value for key, value in values.items()})
 
 
 class TurnTests(SynchronousTestCase):
     def test_cost_is_the_charge_used_up(self) -> None:
-        """The dog with the most charge left has the lowest cost; without a reading there is no report."""
+        """The cost is the used share of the battery; without a reading there is no cost."""
         turn = TurnAround({}, random.Random(1))
         self.assertIsNone(turn.cost)
         turn.look(seen(odom_yaw=0.0), 0.0)
@@ -30,7 +30,7 @@ class TurnTests(SynchronousTestCase):
         self.assertEqual(turn.cost, 0.25)
 
     def test_one_turn_and_no_more(self) -> None:
-        """The dog turns until it has turned once, across the seam of the angle, and not for what it turned before."""
+        """The dog turns exactly once, across the discontinuity of the angle; earlier turns do not count."""
         turn = TurnAround({}, random.Random(1))
         yaw = 2.0
         for _ in range(20):
@@ -44,7 +44,7 @@ class TurnTests(SynchronousTestCase):
         self.assertLess(abs(yaw - start - math.tau), 0.11)
 
     def test_turns_can_be_chosen(self) -> None:
-        """The task says how many turns; half a turn is done after half a circle, and unlawful numbers are refused."""
+        """The parameter ``turns`` sets the number of turns, and an invalid number is refused."""
         turn = TurnAround({"turns": 0.5}, random.Random(1))
         turn.execute(Context(0.0, is_resumed=True))
         for step in range(33):
@@ -54,7 +54,7 @@ class TurnTests(SynchronousTestCase):
             self.assertRaises(ValueError, TurnAround, {"turns": wrong}, random.Random(1))
 
     def test_body_turns_as_fast_as_it_can(self) -> None:
-        """A body that turns more slowly than a dog is asked for no more than it can."""
+        """A robot that turns more slowly than a dog gets its maximum turn velocity."""
         turn = TurnAround({}, random.Random(1))
         limits = {"base.vx": (-0.1, 0.1), "base.wz": (-0.5, 0.5)}
         turn.embody(Means(Description("slow", "", {}, limits, 0.1)))

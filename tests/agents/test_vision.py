@@ -1,4 +1,4 @@
-"""Tests of ``agents.vision`` against the pictures of the simulated yard."""
+"""Tests of ``agents.vision`` with camera frames of the simulator."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SIZE = Size(0.08, 0.22)
 
 
 class Studio:
-    """A dog at the left wall that looks along the yard, and a camera on its nose."""
+    """A dog at the left wall with a camera on its nose, which points along the map."""
 
     def __init__(self, seed: int = 1) -> None:
         self.world = World(Random(seed), loaded("three-dogs"))
@@ -29,24 +29,24 @@ class Studio:
         self.world.move_dog("dog1", 0.3, 1.2, 0.0)
 
     def target(self, distance: float, bearing: float = 0.0) -> None:
-        """Put the target ``distance`` metres from the lens."""
+        """Place the target ``distance`` metres from the lens."""
         reach = distance
         self.world.place_target(0.3 + NOSE + reach * math.cos(bearing), 1.2 + reach * math.sin(bearing))
 
     def look(self) -> Sighting | None:
-        """What is found in the next picture."""
+        """Return the sighting in the next camera frame."""
         return find_target(self.camera.jpeg(self.world.dogs["dog1"]), SIZE)
 
 
 class VisionTests(SynchronousTestCase):
     def seen(self, studio: Studio) -> Sighting:
-        """A sighting that has to be."""
+        """Return the next sighting, which must not be None."""
         sighting = studio.look()
         assert sighting is not None
         return sighting
 
     def test_distance_is_right_within_six_percent(self) -> None:
-        """Straight ahead, from 0.4 to 2.4 m, the median of five pictures is within 6 % and none is off by 12 %."""
+        """From 0.4 to 2.4 m ahead, the median error of five frames is below 6 % and the largest below 12 %."""
         studio = Studio()
         for distance in (0.4, 0.6, 0.9, 1.2, 1.6, 2.0, 2.4):
             studio.target(distance)
@@ -55,7 +55,7 @@ class VisionTests(SynchronousTestCase):
             self.assertLess(max(map(abs, errors)), 0.12, (distance, errors))
 
     def test_lens_is_reckoned_with(self) -> None:
-        """The same picture through a lens half as wide shows a target about twice as far, and less aside."""
+        """With a lens half as wide, the same frame gives about twice the distance and a smaller bearing."""
         studio = Studio()
         studio.target(0.9, 0.2)
         picture = studio.camera.jpeg(studio.world.dogs["dog1"])
@@ -66,7 +66,7 @@ class VisionTests(SynchronousTestCase):
         self.assertLess(narrow.bearing, 0.6 * wide.bearing)
 
     def test_picture_that_is_all_target_says_so(self) -> None:
-        """From edge to edge nobody can tell how near it is; a whole target, or none at one edge, is not filling."""
+        """A target that fills the frame from edge to edge has ``is_filling`` set; one at a single edge has not."""
         for width, is_filling in ((64, True), (40, False)):
             picture = np.full((48, 64, 3), 128, np.uint8)
             picture[:, 64 - width :] = (40, 30, 200)
@@ -75,7 +75,7 @@ class VisionTests(SynchronousTestCase):
             self.assertEqual(sighting.is_filling, is_filling)
 
     def test_bearing_is_right_within_a_degree_and_a_half(self) -> None:
-        """The bearing is right to 1.5 degrees anywhere in the picture, left being positive."""
+        """The error of the bearing is at most 1.5 degrees anywhere in the frame; left is positive."""
         studio = Studio()
         for distance in (0.6, 1.1):
             for degrees in (-18, -9, -3, 0, 3, 9, 18):
@@ -83,7 +83,7 @@ class VisionTests(SynchronousTestCase):
                 self.assertLess(abs(math.degrees(self.seen(studio).bearing) - degrees), 1.5, (distance, degrees))
 
     def test_half_hidden_target_is_known_to_be(self) -> None:
-        """A target that another dog hides in part is still seen, is not called whole, and looks at most 25 % off."""
+        """A target that another dog hides in part is not reported as whole, and its distance error is below 25 %."""
         studio = Studio()
         studio.target(1.4)
         self.assertTrue(self.seen(studio).is_whole)
@@ -98,7 +98,7 @@ class VisionTests(SynchronousTestCase):
             self.assertLess(abs(distance / 1.4 - 1), 0.25, halves)
 
     def test_yellow_stripes_and_walls_are_not_red(self) -> None:
-        """Without a target nothing is found, whichever dog and wall is looked at, near and far."""
+        """Without a target nothing is found on any dog or wall, near or far."""
         studio = Studio()
         for x in (0.7, 1.0, 1.6):
             for name, heading in (("dog2", 0.0), ("dog3", math.pi / 2), ("dog2", math.pi)):
@@ -109,7 +109,7 @@ class VisionTests(SynchronousTestCase):
                 studio.world.move_dog(name, 2.8, 0.2 if name == "dog2" else 2.2, 0.0)
 
     def test_bytes_that_are_no_picture_are_nothing_seen(self) -> None:
-        """Nothing, noise, a cut picture and a picture of one dot give no sighting and no error."""
+        """Empty data, noise, a truncated frame and a frame of one pixel give no sighting and no error."""
         studio = Studio()
         studio.target(1.0)
         whole = studio.camera.jpeg(studio.world.dogs["dog1"])
@@ -118,7 +118,7 @@ class VisionTests(SynchronousTestCase):
             self.assertIsNone(find_target(data, SIZE))
 
     def test_few_red_pixels_are_noise(self) -> None:
-        """A red speck is not a target."""
+        """A few red pixels are not a target."""
         picture = np.full((160, 208, 3), 190, np.uint8)
         picture[80:83, 100:103] = (30, 20, 190)
         self.assertIsNone(find_target(cv2.imencode(".jpg", picture)[1].tobytes(), SIZE))

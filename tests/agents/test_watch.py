@@ -1,4 +1,4 @@
-"""Tests of ``agents.watch``: a phone that tells what it sees, and a dog that has to look for itself."""
+"""Tests of ``agents.watch``: a phone that reports target positions, and a dog that detects the target itself."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ TICK = 0.1
 
 
 class Phone:
-    """A phone and its behaviour; whoever holds it moves it."""
+    """A phone and its behaviour; the test moves it."""
 
     def __init__(self, **parameters: float) -> None:
         self.behaviour = WatchTarget(parameters, random.Random(1))
         self.now = 0.0
 
     def live(self, distance: float = math.nan, ticks: int = 1) -> None:
-        """So many looks with the target at ``distance`` straight ahead, NaN: out of view."""
+        """Process ``ticks`` observations with the target ``distance`` metres ahead (NaN: out of view)."""
         for _ in range(ticks):
             self.now += TICK
             bearing = 0.0 if math.isfinite(distance) else math.nan
@@ -36,7 +36,7 @@ class Phone:
             self.behaviour.look(Observation(self.now, self.now, values), self.now)
 
     def execute(self, distance: float, ticks: int, token: int = 1, is_resumed: bool = True) -> bool:
-        """Look and act so many times; whether it was done at the end."""
+        """Observe and execute ``ticks`` times; return whether the task is done."""
         action = None
         for n in range(ticks):
             self.live(distance)
@@ -46,7 +46,7 @@ class Phone:
 
 class PhoneTests(SynchronousTestCase):
     def test_cost_is_the_distance_that_the_phone_tells(self) -> None:
-        """The cost is the median of the newest distances, and is not there before the phone has seen the target."""
+        """The cost is the median of the newest distances, and is None before the first ones."""
         phone = Phone()
         phone.live()
         self.assertIsNone(phone.behaviour.cost)
@@ -56,7 +56,7 @@ class PhoneTests(SynchronousTestCase):
         self.assertEqual(phone.behaviour.cost, 0.5)
 
     def test_cost_goes_with_the_target(self) -> None:
-        """A shaking hand loses nothing; who lost sight for longer has no cost, and begins anew with the next sight."""
+        """A short loss of sight keeps the cost; after a longer one it is None until enough new sightings arrive."""
         phone = Phone()
         phone.live(0.5, SETTLE)
         phone.live(ticks=round(MEMORY / TICK) - 1)
@@ -69,7 +69,7 @@ class PhoneTests(SynchronousTestCase):
         self.assertEqual(phone.behaviour.cost, 2.0)
 
     def test_done_when_it_was_in_view_for_long_enough(self) -> None:
-        """Only the time in view counts: with the target out of view for a while it takes as much longer."""
+        """The task is done after its time in view; time out of view does not count."""
         phone = Phone(seconds=2.0)
         self.assertFalse(phone.execute(0.5, 11, is_resumed=False))
         self.assertAlmostEqual(phone.behaviour.progress, 0.5)
@@ -82,7 +82,7 @@ class PhoneTests(SynchronousTestCase):
         self.assertEqual(phone.behaviour.progress, 1.0)
 
     def test_what_others_did_in_between_does_not_count(self) -> None:
-        """Under a new token it goes on from what it had, and the time between is not its own; nor is a long silence."""
+        """After a new token the progress continues, but the time between the two and long silences do not count."""
         phone = Phone(seconds=10.0)
         phone.execute(0.5, 11, is_resumed=False)
         phone.now += 5.0
@@ -93,7 +93,7 @@ class PhoneTests(SynchronousTestCase):
         self.assertLess(phone.behaviour.progress, 0.13)
 
     def test_asks_a_phone_for_no_motion(self) -> None:
-        """Searching, holding and executing, a body without motors is told to do nothing at all."""
+        """In search, hold and execution, a device without motors gets an empty action."""
         phone = Phone()
         self.assertEqual(phone.behaviour.search(0.0), {})
         phone.live(0.5, SETTLE)
@@ -101,12 +101,12 @@ class PhoneTests(SynchronousTestCase):
         self.assertEqual((*actions, phone.behaviour.execute(Context(phone.now))), ({}, {}, {}))
 
     def test_refuses_wrong_parameters(self) -> None:
-        """Seconds that cannot be watched are refused when the task comes."""
+        """An invalid duration is refused when the task is created."""
         for wrong in (0.0, -1.0, math.inf, math.nan, "long"):
             self.assertRaises(ValueError, WatchTarget, {"seconds": wrong}, random.Random(1))
 
     def test_a_phones_node_loads_no_vision(self) -> None:
-        """Where the phone sees for itself its gateway loads neither OpenCV nor NumPy: 34 MiB."""
+        """If the phone detects the target itself, its gateway loads neither OpenCV nor NumPy (34 MiB)."""
         script = (
             "import sys, random\nfrom agents.watch import WatchTarget\nfrom drivers.reading import Observation\n"
             "watch = WatchTarget({}, random.Random(1))\n"
@@ -120,7 +120,7 @@ class PhoneTests(SynchronousTestCase):
 
 class DogTests(SynchronousTestCase):
     def test_turns_to_the_target_and_keeps_it_in_view(self) -> None:
-        """A dog with the target behind it finds it, knows how far it is, and watches it without going there."""
+        """A dog with the target behind it turns to it, measures its distance, and watches it without approaching."""
         walk = Walk()
         watch = WatchTarget({"seconds": 3.0, "target_radius": 0.08}, random.Random(1))
         walk.behaviour = watch  # type: ignore[assignment]
@@ -143,7 +143,7 @@ class DogTests(SynchronousTestCase):
         self.assertGreater(walk.now, 3.0)
 
     def test_looks_through_the_lens_of_its_body(self) -> None:
-        """A body that told its lens, however late it sees its first picture, is believed."""
+        """The lens from the robot's description is used, even if the first frame arrives later."""
         watch = WatchTarget({}, random.Random(1))
         lens = {"camera": {"fov_h_deg": 28.4}}
         watch.embody(Means(Description("narrow", "", lens, {}, 0.1)))
@@ -157,7 +157,7 @@ class DogTests(SynchronousTestCase):
         self.assertTrue(1.8 < cost / walk.distance() < 2.5)
 
     def test_watches_with_a_camera_alone(self) -> None:
-        """A camera on a wall, which has no motors and says nothing of a target, sees it too, and is told no motion."""
+        """A fixed camera without motors and detections watches the target from its frames, with empty actions."""
         walk = Walk()
         watch = WatchTarget({}, random.Random(1))
         walk.world.place_target(1.2, 1.2)

@@ -1,4 +1,4 @@
-"""What ``benchmarks.nat`` makes of its trials: promises, table, document and picture; nothing is run."""
+"""Tests of the evaluation in ``benchmarks.nat``: criteria, table, document and figure; no trial runs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sim.namespaces.kind import Kind
 
 
 def good(part: str = PLAIN) -> list[Outcome]:
-    """A round in which all is as it should be."""
+    """Return the outcomes of a round that meets all criteria."""
     outcomes = []
     for pair in plain_pairs(part):
         is_direct = is_punchable(Kind(pair.a), Kind(pair.b))
@@ -22,14 +22,14 @@ def good(part: str = PLAIN) -> list[Outcome]:
 
 class OutcomeTests(SynchronousTestCase):
     def test_thirteen_of_fifteen_pairs_can_be_punched(self) -> None:
-        """All pairs but those of symmetric with port restricted or symmetric, and those without UDP."""
+        """All pairs can be punched, except symmetric with symmetric or port restricted, and those without UDP."""
         pairs = [(a, b) for n, a in enumerate(MATRIX) for b in MATRIX[n:] if Kind.NOUDP not in (a, b)]
         self.assertEqual(len(pairs), 15)
         closed = [(a.value, b.value) for a, b in pairs if not is_punchable(a, b)]
         self.assertEqual(closed, [("port", "sym"), ("sym", "sym")])
 
     def test_a_good_round_keeps_every_promise(self) -> None:
-        """With all as it should be nothing is broken; with what can be punched relayed, or slow, something is."""
+        """A good round meets all criteria; a relayed punchable pair, or slow pairs, miss one."""
         self.assertEqual([one for one in promises([*good(), *good(LOSS)]) if not one.is_kept], [])
         relayed = good()
         relayed[0].path = "relayed"
@@ -43,10 +43,10 @@ class OutcomeTests(SynchronousTestCase):
         self.assertEqual([one.is_kept for one in promises(late)], [True, True, True, False])
 
     def test_one_of_twenty_may_fail_under_loss(self) -> None:
-        """With losses 95 percent are promised, of all, of those with UDP and of those without: one of 21 is borne."""
+        """With packet loss 95 percent must succeed in each class: one failure of 21 is allowed."""
         lossy = good(LOSS)
         lossy[0].took_s = [None, None]
-        self.assertEqual([one.is_kept for one in promises(lossy)], [True, False, True])  # 14 of 15 are no 95 percent
+        self.assertEqual([one.is_kept for one in promises(lossy)], [True, False, True])  # 14 of 15: below 95 percent
         lossy[1].took_s = [5.1, 0.1]
         self.assertEqual([one.is_kept for one in promises(lossy)], [False, False, True])
         blocked = good(LOSS)
@@ -55,13 +55,13 @@ class OutcomeTests(SynchronousTestCase):
         self.assertEqual([one.is_kept for one in promises(blocked)], [False, True, False])
 
     def test_cell(self) -> None:
-        """A cell names ways, median, worst, and how many failed."""
+        """A cell contains path kinds, median, maximum, and the number of failures."""
         some = [Outcome(PLAIN, "port", "port", [took], "direct") for took in (0.1, 0.3, None)]
         self.assertEqual(cell(some), "direct 0.20 (0.30), 1 of 3 fail")
         self.assertEqual((cell(some[2:]), cell([])), ("fails", ""))
 
     def test_report_and_document(self) -> None:
-        """The table has each kind; the document is changed between its marks only, and refused without them."""
+        """The table has each kind; the document changes between its marks only, and is refused without them."""
         self.assertIn("noudp", table(good()))
         text = written(f"before\n{BEGIN}\nold\n{END}\nafter\n", good())
         self.assertTrue(text.startswith("before\n") and text.endswith("\nafter\n"))
@@ -71,7 +71,7 @@ class OutcomeTests(SynchronousTestCase):
         self.assertRaises(ValueError, written, "no marks", good())
 
     def test_picture_has_a_square_for_each_pair(self) -> None:
-        """21 squares, a frame and a key; what failed is said."""
+        """The figure has 21 squares, a frame and a legend, and marks a failed pair."""
         bad = good()
         bad[3].took_s = [None, None]
         picture = drawn(bad, "a < b")
@@ -80,7 +80,7 @@ class OutcomeTests(SynchronousTestCase):
         self.assertEqual(picture.count(">fails<"), 1)
 
     def test_every_host_of_a_pair_exists(self) -> None:
-        """The sites of a run have each host that a pair names."""
+        """The sites of a run contain each host that a pair names."""
         hosts = {f"{site.name}{number}" for site in sites() for number in range(1, site.hosts + 1)}
         pairs = [*plain_pairs(PLAIN), *special_pairs()]
         self.assertEqual({host for pair in pairs for host in (pair.host_a, pair.host_b)} - hosts, set())

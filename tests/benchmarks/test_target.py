@@ -1,4 +1,4 @@
-"""What ``benchmarks.dht.target`` promises; no library is run."""
+"""Tests of the targets in ``benchmarks.dht.target``; no library runs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from benchmarks.dht.target import OPENDHT, TORRENT, verdicts
 
 
 def measured() -> dict[str, Any]:
-    """Results of our node with which every target is reached."""
+    """Return results of our node that reach each target."""
     operation = {"p50": 0.5, "max": 9.0, "per_s": 9000.0, "cpu_ms": 0.1, "datagrams": 2.0, "tried": 200, "failed": 0}
     lost = {part: {"found_percent": 100.0, "p95": 9.0, "max": 30.0} for part in ("a quarter", "a half")}
     return {
@@ -33,7 +33,7 @@ def measured() -> dict[str, Any]:
 
 
 def row() -> dict[str, dict[str, Any]]:
-    """A whole run in which every target is reached."""
+    """Return a complete run that reaches each target."""
     peer = {"remote_get": {"p50": 1.0}, "put": {"p50": 1.0}, "watch": {"p50": 1.0}}
     peer |= {name: {"per_s": 6000.0, "cpu_ms": 1.0} for name in ("gets", "puts")}
     return {OURS: measured(), OURS_IN_MEMORY: measured(), TORRENT: peer, OPENDHT: peer | {"put": {"p50": 2.0}}}
@@ -41,15 +41,15 @@ def row() -> dict[str, dict[str, Any]]:
 
 class TargetTests(SynchronousTestCase):
     def reached(self, results: dict[str, Any], verdict: bool | None) -> list[int]:
-        """The numbers of the targets with that ``verdict``."""
+        """Return the numbers of the targets with this ``verdict``."""
         return [one.number for one in verdicts(results) if one.is_reached is verdict]
 
     def test_all_are_reached(self) -> None:
-        """Where every figure is good enough, all fourteen are reached."""
+        """If all figures are good enough, all fourteen targets are reached."""
         self.assertEqual(self.reached(row(), True), list(range(1, 15)))
 
     def test_what_was_not_measured_is_not_known(self) -> None:
-        """A target whose figure or whose peer's figure is missing is neither reached nor missed."""
+        """A target without its figure, or without the figure of the compared library, is unknown."""
         self.assertEqual(self.reached({}, None), list(range(1, 15)))
         alone = {OURS: measured()}
         self.assertEqual(self.reached(alone, None), [1, 2, 3, 4, 6, 10, 14])
@@ -58,7 +58,7 @@ class TargetTests(SynchronousTestCase):
         self.assertEqual(self.reached(results, None), [14])
 
     def test_each_figure_counts(self) -> None:
-        """One figure that is not good enough misses the targets that it stands in, and no other."""
+        """One insufficient figure misses exactly the targets that depend on it."""
         spoilt: list[tuple[tuple[str, ...], Any, list[int]]] = [
             (("remote_get", "p50"), 0.91, [1]),
             (("put", "p50"), 0.91, [2, 14]),
@@ -88,6 +88,6 @@ class TargetTests(SynchronousTestCase):
             self.assertEqual(self.reached(results, False), missed, path)
 
     def test_in_words(self) -> None:
-        """A limit says the figure, and what it should be."""
+        """The text of a limit contains the figure and the required value."""
         limits = [str(limit) for verdict in verdicts({OURS: measured()})[:3] for limit in verdict.limits]
         self.assertEqual(limits, ["p50 ms 0.50 (at most ?)"] * 2 + ["gets/s 9,000 (at least ?)"])

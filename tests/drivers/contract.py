@@ -1,4 +1,4 @@
-"""The robots of memory that the tests of drivers use; with ``Conformance`` a test case of them is the bench."""
+"""Test cases for robots in memory; combined with ``Conformance``, a case runs the conformance tests."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from sim.robots.emulator.body import MemoryBody
 
 
 class KeptLink:
-    """A link that keeps what is sent."""
+    """A link that records the sent bytes."""
 
     def __init__(self) -> None:
         self.said = b""
@@ -31,7 +31,7 @@ class KeptLink:
 
 
 class KeptLog:
-    """A log that keeps its warnings and errors."""
+    """A log that records warnings and errors."""
 
     def __init__(self) -> None:
         self.lines: list[str] = []
@@ -42,13 +42,13 @@ class KeptLog:
     error = warn
 
     def debug(self, form: str, **values: object) -> None:
-        """Leave it out."""
+        """Ignore the message."""
 
     info = debug
 
 
 class RobotCase(SynchronousTestCase):
-    """A robot of memory, its drivers, and a clock that is turned by hand; at the end nothing is left on the clock."""
+    """A robot in memory, its drivers, and virtual time; after each test no delayed calls may be left."""
 
     STEP_S = 0.005
     END_S = 0.1
@@ -59,17 +59,17 @@ class RobotCase(SynchronousTestCase):
     connector: Any = None
 
     def setUp(self) -> None:
-        """A body on an endless floor, and the robot that moves it."""
+        """Create a simulated base and the robot that moves it."""
         self.clock = Clock()
         self.body = MemoryBody()
         self.drivers: list[Any] = []
         self.build()
 
     def build(self) -> None:
-        """Make ``robot`` and ``connector``."""
+        """Create ``robot`` and ``connector``."""
 
     def tearDown(self) -> None:
-        """Let all drivers go, and switch the robot off."""
+        """Disconnect all drivers, and stop the robot."""
         for driver in self.drivers:
             driver.disconnect()
         self.pass_time(self.END_S)
@@ -79,7 +79,7 @@ class RobotCase(SynchronousTestCase):
         self.assertEqual(self.clock.getDelayedCalls(), [])
 
     def make_driver(self, **options: object) -> Any:
-        """A fresh driver that is not connected, as the registry makes it."""
+        """Return a new driver, not yet connected, created by the registry."""
         driver = driver_for(self.kind, {**self.options, **options}, "robot", self.clock, self.connector)
         self.drivers.append(driver)
         return driver
@@ -92,7 +92,7 @@ class RobotCase(SynchronousTestCase):
         return driver
 
     def ready(self, settle: float = 0.3, **options: object) -> Any:
-        """A driver that is connected and enabled."""
+        """Return a driver that is connected and enabled."""
         driver = self.connected(settle, **options)
         enabled = driver.enable()
         self.pass_time(settle)
@@ -100,11 +100,11 @@ class RobotCase(SynchronousTestCase):
         return driver
 
     def permit(self, token: int = 1, seconds: float = 0.5) -> Permit:
-        """A permit that holds for some seconds from now."""
+        """Return a permit that is valid for ``seconds``."""
         return Permit(token, self.now() + seconds)
 
     def pass_time(self, seconds: float) -> None:
-        """Turn the clock, and let the body move."""
+        """Advance the clock and the base."""
         for _ in range(round(seconds / self.STEP_S)):
             self.body.pass_time(self.STEP_S)
             self.clock.advance(self.STEP_S)
@@ -116,7 +116,7 @@ class RobotCase(SynchronousTestCase):
         return math.hypot(*self.body.motion[:2])
 
     def cut_link(self) -> None:
-        """Break the link; it can be opened again."""
+        """Break the link; a new one can be opened."""
         if self.connector is None:
             raise NotImplementedError
         self.connector.cut()
@@ -127,9 +127,9 @@ class RobotCase(SynchronousTestCase):
         return seen
 
     def value(self, driver: Any, key: str) -> Any:
-        """A value of the newest observation; None where it is not told."""
+        """Return a value of the newest observation, or None if it is missing."""
         return self.newest(driver).values.get(key)
 
     def near(self, value: Any, wanted: float, off: float = 0.01) -> None:
-        """Fail unless a value is as wanted, but for so much."""
+        """Fail if a value differs from the wanted one by more than ``off``."""
         self.assertLessEqual(abs(float(value) - wanted), off)

@@ -1,4 +1,4 @@
-"""Tests of what the dog's wire looks like: ``drivers.aibo.codec``, ``menu``, ``picture`` and ``sense``.
+"""Tests of the wire formats of the AIBO: ``drivers.aibo.codec``, ``menu``, ``picture`` and ``sense``.
 
 Golden vectors are from Tekkotsu 4.0 and 5.x (``WorldStateSerializerBehavior.cc``, ``WalkControllerBehavior.cc``,
 ``RawCamBehavior.cc``) and from two clients of Tekkotsu 2.x.
@@ -50,10 +50,10 @@ def felt(dialect: str = T4, t: int = 1000) -> WorldState:
 
 
 class CommandTests(SynchronousTestCase):
-    """Walk, head, joints."""
+    """Commands for walk, head and joints."""
 
     def test_golden_vectors(self) -> None:
-        """Walk and head commands are these five bytes."""
+        """Each walk and head command has exactly these five bytes."""
         for letter, value, golden in (
             ("f", 0.5, "66 00 00 00 3f"),
             ("r", -0.25, "72 00 00 80 be"),
@@ -64,7 +64,7 @@ class CommandTests(SynchronousTestCase):
             self.assertEqual(command(letter, value).hex(" "), golden)
 
     def test_reads_commands_cut_anyhow(self) -> None:
-        """Commands that arrive byte by byte are the commands that were sent."""
+        """The reader gives the same commands for single bytes as for the whole stream."""
         reader = CommandReader()
         stream = command("f", 0.5) + command("r", -0.25)
         seen = [one for at in range(len(stream)) for one in reader.read(stream[at : at + 1])]
@@ -75,7 +75,7 @@ class LineTests(SynchronousTestCase):
     """Lines of text."""
 
     def test_drops_a_line_that_never_ends(self) -> None:
-        """A line beyond all measure is counted and thrown away, ended or not; what follows is read."""
+        """A line above the maximum length is counted and dropped; the next line is read."""
         reader = LineReader()
         self.assertEqual(list(reader.read(b"on\r\noff")), ["on"])
         self.assertEqual(list(reader.read(b"x" * MAX_LINE)), [])
@@ -87,7 +87,7 @@ class StateTests(SynchronousTestCase):
     """World state and gains."""
 
     def test_sizes_and_places(self) -> None:
-        """The packets of an ERS-7 have 374, 244 and 224 bytes, and their fields lie where the dog puts them."""
+        """The packets of an ERS-7 have 374, 244 and 224 bytes, with each field at its documented offset."""
         new, old = encoded(felt()), encoded(felt(T2))
         self.assertEqual((len(new), len(old)), (374, 244))
         self.assertEqual(len(encoded_gains(1, ((1.0, 2.0, 3.0),) * 18)), 224)
@@ -99,7 +99,7 @@ class StateTests(SynchronousTestCase):
         self.assertEqual([struct.unpack_from("<I", old, at)[0] for at in (80, 128)], [11, 10])
 
     def test_reads_both_dialects_byte_by_byte(self) -> None:
-        """Either dialect is told by its first bytes and read back, however the stream is cut."""
+        """Both dialects are recognised by their first bytes and decoded, for each division of the stream."""
         for dialect in (T4, T2):
             stream = encoded(felt(dialect)) + encoded(felt(dialect, 1032))
             for step in (1, 7, len(stream)):
@@ -109,7 +109,7 @@ class StateTests(SynchronousTestCase):
                 self.assertEqual(encoded(seen[0]), stream[: len(stream) // 2])
 
     def test_takes_counts_from_the_stream(self) -> None:
-        """A model with other counts is read as it is."""
+        """A model with other element counts is decoded with these counts."""
         other = WorldState(T4, "ERS-210", 5, 6, (1.0,) * 40, (2.0,) * 8, (0.0,) * 8, (0.5,) * 18)
         reader, stream = StateReader(), encoded(replace(other, model="ERS-210 in red"))
         seen = [one for at in range(len(stream)) for one in reader.read(stream[at : at + 1])]
@@ -118,7 +118,7 @@ class StateTests(SynchronousTestCase):
         self.assertTrue(sense.is_known(felt()) and sense.is_known(felt(T2)))
 
     def test_refuses_what_is_neither_dialect(self) -> None:
-        """Wild counts, a model without an end, and bytes of neither dialect are bad frames."""
+        """Invalid counts, a model name without an end, and bytes of neither dialect raise BadFrame."""
         wild = bytearray(encoded(felt()))
         wild[14] = wild[15] = 0xFF
         for data in (bytes(wild), b"ERS-" * 20, bytes(40), struct.pack("<II", 5, 17)):
@@ -127,17 +127,17 @@ class StateTests(SynchronousTestCase):
     @settings(deadline=None, max_examples=200)
     @given(st.binary(max_size=600), st.integers(0, 374))
     def test_survives_any_bytes(self, noise: bytes, keep: int) -> None:
-        """Whatever follows a good beginning is a state or a bad frame."""
+        """Random bytes after a valid start give a state or BadFrame."""
         for start in (encoded(felt())[:keep], encoded(felt(T2))[:keep]):
             with contextlib.suppress(BadFrame):
                 list(StateReader().read(start + noise))
 
 
 class SenseTests(SynchronousTestCase):
-    """Numbers and what they mean."""
+    """Sensor values and their units."""
 
     def test_names_and_units(self) -> None:
-        """Ranges are metres, the accelerometer points up, currents are amperes, and all 18 joints have names."""
+        """Ranges are in metres, the accelerometer points up, currents are in amperes, and all 18 joints have names."""
         seen = sense.values(next(StateReader().read(encoded(felt()))))
         self.assertEqual(seen["range.near"], 0.25)
         self.assertTrue(math.isnan(float(seen["range.far"])))
@@ -147,7 +147,7 @@ class SenseTests(SynchronousTestCase):
         self.assertEqual(len([key for key in seen if key.startswith("button.")]), 10)
 
     def test_refuses_what_cannot_be(self) -> None:
-        """One NaN, infinite or absurd number spoils the packet, wherever it stands."""
+        """A single NaN, infinite or out-of-range number in any field raises BadFrame for the packet."""
         good = felt()
         for bad in (math.nan, math.inf, -math.inf, 1e9):
             for field in ("outputs", "sensors", "buttons", "duties"):
@@ -157,7 +157,7 @@ class SenseTests(SynchronousTestCase):
 
 
 class MenuTests(SynchronousTestCase):
-    """Main control."""
+    """The menu protocol of main control."""
 
     MESSAGES: tuple[menu.Message, ...] = (
         menu.Hello(3),
@@ -173,7 +173,7 @@ class MenuTests(SynchronousTestCase):
     )
 
     def test_golden_lines(self) -> None:
-        """Starting a server and an empty slot look like this on the wire."""
+        """The messages for a server start and an empty slot have exactly these bytes."""
         self.assertEqual(menu.encoded(self.MESSAGES[2]), b"load\norg.tekkotsu.mon.WalkGUI\nWalkGUI\n10050\n\n")
         self.assertEqual(
             menu.encoded(Refresh("Root", (Item(0, False, menu.EMPTY_SLOT),))),
@@ -181,7 +181,7 @@ class MenuTests(SynchronousTestCase):
         )
 
     def test_reads_every_message_byte_by_byte(self) -> None:
-        """Every message is read back as it was written."""
+        """Each message type survives encoding and decoding."""
         stream = b"".join(menu.encoded(one) for one in self.MESSAGES)
         for step in (1, len(stream)):
             reader = MenuReader()
@@ -190,7 +190,7 @@ class MenuTests(SynchronousTestCase):
             self.assertEqual(reader.bad_lines, 0)
 
     def test_reads_the_menu_of_old_tekkotsu(self) -> None:
-        """A menu of four fields an item shows in its first item, and is read to its end."""
+        """A menu with four fields per item (Tekkotsu 2) is recognised by its first item and read completely."""
         shown = Refresh(
             "Root", (Item(2, True, "Mon", "all servers"), Item(0, False, "7", ""), Item(0, False, "x", "5"))
         )
@@ -198,7 +198,7 @@ class MenuTests(SynchronousTestCase):
         self.assertEqual(list(MenuReader().read(stream)), [shown, menu.Word("pop")])
 
     def test_drops_what_is_no_message(self) -> None:
-        """Unknown words, wrong counts and endless lines are counted, and the next message is read."""
+        """Unknown words, wrong counts and overlong lines are counted, and the next message is read."""
         for bad in (
             "warp",
             "hello\nmany",
@@ -216,7 +216,7 @@ class MenuTests(SynchronousTestCase):
         self.assertEqual(reader.bad_lines, 1)
 
     def test_drops_a_menu_without_an_end(self) -> None:
-        """A menu that would fill the memory is dropped, and what follows is read again."""
+        """A menu that exceeds the size limit is dropped, and the next message is read."""
         item = "0\n0\nx\n200\n" + "y\n" * 201
         reader = MenuReader()
         list(reader.read(("refresh\nRoot\n200\n" + item * 30).encode()))
@@ -226,15 +226,15 @@ class MenuTests(SynchronousTestCase):
     @settings(deadline=None, max_examples=200)
     @given(st.lists(st.sampled_from(["refresh", "status", "load", "0", "1", "5", "", "pop", "x", "\x00"]), max_size=60))
     def test_survives_any_lines(self, lines: list[str]) -> None:
-        """Whatever the lines are, the reader goes on."""
+        """No sequence of lines raises an exception."""
         list(MenuReader().read("\n".join([*lines, ""]).encode()))
 
 
 class PictureTests(SynchronousTestCase):
-    """The camera."""
+    """Camera frames."""
 
     def test_golden_vectors(self) -> None:
-        """Names, header and block are these bytes; bare channels make a packet of 12648 bytes."""
+        """Names, header and block have exactly these bytes; a packet with raw channels has 12648 bytes."""
         name = "0d 00 00 00 54 65 6b 6b 6f 74 73 75 49 6d 61 67 65 00"
         self.assertEqual(string("TekkotsuImage").hex(" "), name)
         self.assertEqual(picture.CLOSING.hex(" "), "0f 00 00 00 43 6c 6f 73 65 43 6f 6e 6e 65 63 74 69 6f 6e 00")
@@ -251,7 +251,7 @@ class PictureTests(SynchronousTestCase):
         self.assertEqual(picture.REQUEST, b"connection request")
 
     def test_reads_every_kind_byte_by_byte(self) -> None:
-        """JPEGs, bare channels, one channel, blanks, text and the end are read, however the stream is cut."""
+        """JPEGs, raw, single and blank channels, text and the end are read for each division of the stream."""
         single = picture.header(1, 0, 4, 2, 9, 10) + picture.block(Block(4, 2, "RawImage", bytes(8)))
         jpegs = b"".join(picture.block(Block(4, 2, "JPEGGrayscale", JPEG, n)) for n in range(3))
         blank = picture.block(Block(0, 0, "blank", b"", 1, 0xFFFFFFFF))
@@ -273,7 +273,7 @@ class PictureTests(SynchronousTestCase):
             self.assertEqual(reader.bad_frames, 0)
 
     def test_grows_small_channels(self) -> None:
-        """Each pixel of a small channel covers the pixels of the large one that it stands for."""
+        """Each pixel of a subsampled channel is repeated for the pixels that it covers."""
         parts = (Block(4, 2, "RawImage", b"abcdefgh"), Block(2, 1, "RawImage", b"xy"), Block(2, 1, "RawImage", b"uv"))
         data = picture.header(0, 0, 4, 2, 0, 0) + b"".join(picture.block(one) for one in parts)
         seen = picture.decoded(data)
@@ -281,7 +281,7 @@ class PictureTests(SynchronousTestCase):
         self.assertEqual(seen.data, b"abcdefgh" + b"xxyyxxyy" + b"uuvvuuvv")
 
     def test_refuses_datagrams_that_are_no_packet(self) -> None:
-        """A datagram too short, too long, or wrong in any field is a bad frame."""
+        """A datagram of wrong length or with any invalid field raises BadFrame."""
         raw = Block(4, 2, "RawImage", bytes(8))
         head = picture.header(1, 0, 4, 2, 0, 0)
         for data in (
@@ -306,7 +306,7 @@ class PictureTests(SynchronousTestCase):
             self.assertRaises(BadFrame, picture.decoded, data)
 
     def test_finds_its_way_after_garbage(self) -> None:
-        """After bytes that are no packet the next whole packet is read, byte by byte as well."""
+        """After invalid bytes the next whole packet is read, also byte by byte."""
         broken = bytearray(COLOUR)
         broken[18] = 9
         stream = bytes(broken) + b"garbage garbage garbage" + COLOUR
@@ -319,7 +319,7 @@ class PictureTests(SynchronousTestCase):
     @settings(deadline=None, max_examples=200)
     @given(st.binary(max_size=300), st.integers(0, 200))
     def test_survives_any_bytes(self, noise: bytes, keep: int) -> None:
-        """Whatever follows a good beginning, a stream is read on, and a datagram is a packet or a bad frame."""
+        """Random bytes after a valid start raise nothing in a stream, and give a packet or BadFrame in a datagram."""
         list(PictureReader().read(COLOUR[:keep] + noise))
         with contextlib.suppress(BadFrame):
             picture.decoded(COLOUR[:keep] + noise)

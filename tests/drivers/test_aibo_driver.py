@@ -1,4 +1,4 @@
-"""Tests of ``drivers.aibo.driver`` against the emulated dog, joined through memory."""
+"""Tests of ``drivers.aibo.driver`` against the emulated dog, connected in memory."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ class AiboCase(RobotCase):
 
 
 class AiboDriverTests(Conformance, AiboCase):
-    """A dog of Tekkotsu 4 keeps the contract, and what is its own."""
+    """The driver of a Tekkotsu 4 dog passes the conformance tests and further tests of its functions."""
 
     def test_senses_what_an_ers7_has(self) -> None:
-        """Ranges, accelerations, power, buttons, joints, the switch, the dialect and reckoned odometry are observed."""
+        """Ranges, accelerations, power, buttons, joints, switch, dialect and estimated odometry are observed."""
         self.body.values = {"range.near": 0.25, "power.level": 0.5, "imu.ax": 1.0}
         driver = self.ready()
         values = self.newest(driver).values
@@ -51,7 +51,7 @@ class AiboDriverTests(Conformance, AiboCase):
         self.near(float(values["odom.yaw"]), self.body.yaw, 0.05)
 
     def test_says_a_live_walk_again_and_a_still_dog_nothing(self) -> None:
-        """A walk longer than the dog's own 3 s goes on, as it is said again; a dog at rest is not spoken to."""
+        """The driver repeats a walk before the dog's 3 s timer ends, and sends nothing to a dog at rest."""
         driver = self.ready()
         driver.act({"base.vx": 0.1}, self.permit(seconds=5.0))
         self.pass_time(4.5)
@@ -63,7 +63,7 @@ class AiboDriverTests(Conformance, AiboCase):
         self.assertEqual(self.dog.heard, [])
 
     def test_stops_by_the_dogs_own_timer(self) -> None:
-        """A dog that hears no more, though its links stand, stands still 3 s after the last command."""
+        """A dog that receives nothing over open links stops 3 s after the last command."""
         driver = self.ready()
         driver.act({"base.vx": 0.1}, self.permit(seconds=20.0))
         self.pass_time(0.1)
@@ -75,7 +75,7 @@ class AiboDriverTests(Conformance, AiboCase):
         self.assertEqual(self.true_speed(), 0.0)
 
     def test_shares_the_stride_with_the_turn(self) -> None:
-        """At full turn nothing is left for walking, and act says so."""
+        """A full turn leaves no speed for walking, and the result of ``act`` shows this."""
         driver = self.ready()
         done = driver.act({"base.vx": 0.16, "base.vy": -0.103, "base.wz": 2.03 / 2}, self.permit())
         self.assertAlmostEqual(done["base.vx"], 0.08)
@@ -83,7 +83,7 @@ class AiboDriverTests(Conformance, AiboCase):
         self.assertEqual(driver.act({"base.wz": 9.0}, self.permit())["base.vx"], 0.0)
 
     def test_recovers_from_silence(self) -> None:
-        """Half a second without a world state makes it stale; when the dog speaks again it is ready, at rest."""
+        """After half a second without a world state the driver is stale; it recovers to ready, with the dog at rest."""
         driver = self.ready()
         driver.act({"base.vx": 0.1}, self.permit(seconds=20.0))
         self.dog.faults.drop = 1.0
@@ -96,7 +96,7 @@ class AiboDriverTests(Conformance, AiboCase):
         self.assertEqual(self.true_speed(), 0.0)
 
     def test_names_rubbish_once(self) -> None:
-        """A port that says rubbish for a minute is one line in the log, and another one after it spoke well between."""
+        """Invalid data is logged once, and a second time if it starts again after valid data."""
         ear = Ear()
         self.addCleanup(ear.close)
         self.ready()
@@ -118,7 +118,7 @@ class AiboDriverTests(Conformance, AiboCase):
             client.link.send(random.randbytes(40))
 
     def test_recovers_from_a_reboot_that_nobody_told(self) -> None:
-        """A dog that fell silent and comes back without its servers is asked for them again."""
+        """After a reboot without notice the driver starts the dog's servers again."""
         driver = self.ready()
         self.dog.faults.half_open = True
         self.pass_time(0.4)
@@ -130,7 +130,7 @@ class AiboDriverTests(Conformance, AiboCase):
         self.assertEqual(driver.state, "ready")
 
     def test_opens_each_needed_link_again(self) -> None:
-        """Losing any one of the needed links stops the dog, and it is ready again soon."""
+        """The loss of a required link stops the dog, and the driver reconnects within seconds."""
         for service in ("state", "estop", "walk"):
             driver = self.ready()
             driver.act({"base.vx": 0.1}, self.permit(seconds=20.0))
@@ -146,7 +146,7 @@ class AiboDriverTests(Conformance, AiboCase):
             self.pass_time(0.1)
 
     def test_respects_the_switch_on_the_dog(self) -> None:
-        """Who presses the dog's back stops it, and only enable lifts that, not a link that comes back."""
+        """The dog's emergency stop button stops it, and only ``enable`` releases it, not a reconnect."""
         driver = self.ready()
         driver.act({"base.vx": 0.1}, self.permit(seconds=20.0))
         self.pass_time(0.1)
@@ -168,7 +168,7 @@ class AiboDriverTests(Conformance, AiboCase):
         self.assertIs(self.successResultOf(enabled), True)
 
     def test_stops_motors_that_another_left_on(self) -> None:
-        """A dog that somebody left with its motors on is stopped by connecting."""
+        """Connecting to a dog with running motors stops them."""
         self.dog.press()
         driver = self.make_driver()
         driver.connect()
@@ -176,7 +176,7 @@ class AiboDriverTests(Conformance, AiboCase):
         self.assertTrue(self.dog.is_engaged)
 
     def test_waits_for_a_port_that_another_client_holds(self) -> None:
-        """One client a port: a second driver waits, counts what does not answer, and follows when the first left."""
+        """Each port accepts one client: a second driver waits, counts refusals, and connects after the first leaves."""
         first = self.ready()
         second = self.make_driver()
         connected = second.connect()
@@ -188,7 +188,7 @@ class AiboDriverTests(Conformance, AiboCase):
         self.successResultOf(connected)
 
     def test_stands_noise_on_every_port(self) -> None:
-        """Whatever bytes come on whichever port, nothing is raised, and the dog is ready again when they end."""
+        """Random bytes on any port raise no exception, and the dog is ready again when they end."""
         self.ready()
         dice = random.Random(7)
         for _ in range(300):
@@ -200,7 +200,7 @@ class AiboDriverTests(Conformance, AiboCase):
         self.assertGreater(self.drivers[0].diagnostics()["bad_frames"], 0)
 
     def test_ages_where_readings_are_absurd(self) -> None:
-        """Readings that cannot be are dropped and counted, and the last good one ages."""
+        """Out-of-range readings are dropped and counted, and the age of the last valid one grows."""
         driver = self.ready()
         self.body.values = {"imu.ax": math.inf}
         self.pass_time(0.3)
@@ -211,7 +211,7 @@ class AiboDriverTests(Conformance, AiboCase):
         self.assertLess(driver.diagnostics()["age"], 0.1)
 
     def test_counts_time_past_its_wrap(self) -> None:
-        """The robot's clock goes on when its milliseconds begin anew."""
+        """The robot time continues when its millisecond counter wraps."""
         self.dog.start_ms = 2**32 - 1200
         driver = self.ready()
         before = self.newest(driver).t_robot
@@ -219,7 +219,7 @@ class AiboDriverTests(Conformance, AiboCase):
         self.near(self.newest(driver).t_robot - before, 1.0, 0.05)
 
     def test_looks_where_it_is_told(self) -> None:
-        """Look turns the head within its limits, as far as the motors are on; wrong words are refused."""
+        """``look`` moves the head within its limits if the motors are on; invalid arguments are refused."""
         driver = self.make_driver()
         self.failureResultOf(driver.invoke("look", pan=0.5), LinkLost)
         driver.connect()
@@ -237,7 +237,7 @@ class AiboDriverTests(Conformance, AiboCase):
         self.failureResultOf(driver.invoke("warp"), Unsupported)
 
     def test_makes_sounds(self) -> None:
-        """A sound of the dog is one command, and a file on the stick is selected by its name."""
+        """A built-in sound is one command, and a file on the memory stick is selected by its name."""
         driver = self.ready()
         self.successResultOf(driver.invoke("yap"))
         self.successResultOf(driver.invoke("play", sound="mew.wav"))
@@ -247,7 +247,7 @@ class AiboDriverTests(Conformance, AiboCase):
         self.failureResultOf(driver.invoke("play", sound='x"\n!reset'), Unsupported)
 
     def test_tries_the_ports_of_a_dog_whose_menu_is_silent(self) -> None:
-        """Main control that never answers keeps nobody from a dog whose servers run already."""
+        """A main control that does not answer does not prevent a connection to servers that run already."""
         self.dog.menu.running = {"estop", "state", "walk", "head"}
         self.dog.menu.answers = lambda data: b""  # type: ignore[method-assign]
         driver = self.make_driver()
@@ -258,7 +258,7 @@ class AiboDriverTests(Conformance, AiboCase):
         self.successResultOf(connected)
 
     def test_knows_no_sensors_of_another_model(self) -> None:
-        """A model that is not known is driven, with its switch, its motion and no sensor that could be misread."""
+        """An unknown model can be driven; only its emergency stop and motion are observed, no sensors."""
         driver = self.ready()
         stranger = WorldState(T4, "ERS-210", 5, 6, (1.0,) * 40, (2.0,) * 8, (0.0,) * 8, (0.5,) * 18)
         self.drivers[-1]._on_world(stranger)
@@ -267,7 +267,7 @@ class AiboDriverTests(Conformance, AiboCase):
         self.assertIs(values["estop.engaged"], False)
 
     def test_stops_the_servers_that_it_started(self) -> None:
-        """After disconnect the dog runs what it ran before, with its motors stopped."""
+        """``disconnect`` stops the motors and each server that the driver started."""
         driver = self.ready()
         self.assertIn("walk", self.dog.menu.running)
         driver.disconnect()
@@ -278,13 +278,13 @@ class AiboDriverTests(Conformance, AiboCase):
 
 
 class OldAiboDriverTests(AiboDriverTests):
-    """A dog of Tekkotsu 2: another world state, another menu, and the same contract."""
+    """The driver of a Tekkotsu 2 dog, with another world state and menu, passes the same tests."""
 
     dialect = T2
 
 
 class Way:
-    """A way for datagrams to the emulated dog, through memory."""
+    """A datagram path to the emulated dog, in memory."""
 
     is_busy = False
 
@@ -302,16 +302,16 @@ class Way:
         self._dog.datagram(data, self._received)
 
     def close(self) -> None:
-        """Nothing is left open."""
+        """Do nothing, as no resource is open."""
 
 
 class AiboCameraTests(AiboCase):
-    """Pictures over both transports."""
+    """Camera frames over both transports."""
 
     END_S = 0.04
 
     def film(self, transport: str, fps: float = 30.0) -> AiboDriver:
-        """A driver of a new dog that films, 2 s after it began."""
+        """Return a driver of a new dog after 2 s of camera frames."""
         self.tearDown()
         self.setUp()
         self.body.jpeg = jpeg()
@@ -335,7 +335,7 @@ class AiboCameraTests(AiboCase):
         self.assertEqual(self.way.sent, 1)
 
     def test_films_as_often_as_it_is_asked(self) -> None:
-        """The pace can be chosen and changed, down to none at all, and up again."""
+        """The frame rate can be changed, also to zero and back."""
         driver = self.film("tcp", 15.0)
         self.near(driver.diagnostics()["pictures"], 29, 2)
         driver.set_camera_fps(0.0)
@@ -350,7 +350,7 @@ class AiboCameraTests(AiboCase):
         self.assertEqual(driver.camera_fps, 30.0)
 
     def test_films_on_when_somebody_stopped_the_server(self) -> None:
-        """A camera server that says that it closes is started again, over either transport."""
+        """A camera server that announces its end is started again, over both transports."""
         for transport in ("tcp", "udp"):
             driver = self.film(transport)
             self.dog.menu.answers(b'!select "#Raw Cam Server"\n')
@@ -360,7 +360,7 @@ class AiboCameraTests(AiboCase):
             self.assertGreater(driver.diagnostics()["pictures"], before + 30, transport)
 
     def test_stamps_pictures_with_the_time_of_the_rest(self) -> None:
-        """A picture is as old as the observation that it comes with, within 0.1 s, after a reboot as well."""
+        """The robot time of a frame is within 0.1 s of its observation's, also after a reboot."""
         driver = self.film("tcp")
         for _ in range(2):
             newest = self.newest(driver)
@@ -370,7 +370,7 @@ class AiboCameraTests(AiboCase):
             self.pass_time(4)
 
     def test_asks_again_when_datagrams_cease(self) -> None:
-        """A dog that was switched off and on is asked for datagrams again, and spoilt ones are counted."""
+        """After a reboot the driver requests datagrams again; invalid ones are counted."""
         driver = self.film("udp")
         self.dog.faults.garbage = 1.0
         self.pass_time(0.4)

@@ -1,4 +1,4 @@
-"""Tests of ``drivers.aibo.option``, of its lines for main control, and of how its links are opened again."""
+"""Tests of ``drivers.aibo.option``, its commands for main control, and its reconnection delays."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from swarmnode.driver.ground import Ear
 
 
 class AiboOptionTests(SynchronousTestCase):
-    """What may stand in the configuration."""
+    """Options in the configuration."""
 
     def test_overrides_what_is_given(self) -> None:
-        """A port that is given replaces that one alone; without a camera none is described."""
+        """A port option replaces only that port; without a camera the description has none."""
         self.assertEqual(checked({"host": "10.0.0.1", "camera_transport": "udp"}).camera_transport, "udp")
         self.assertEqual(checked({"host": "dog1", "ports": {"walk": 5}}).ports, {**PORTS, "walk": 5})
         self.assertIn("camera", describe("aibo", {"host": "dog1"}).capabilities)
@@ -32,7 +32,7 @@ class AiboOptionTests(SynchronousTestCase):
 
 
 class RecipeTests(SynchronousTestCase):
-    """What main control is told."""
+    """Commands for main control."""
 
     def test_sends_every_name(self) -> None:
         """A server is started and stopped under each of its names, after the settings in both spellings."""
@@ -61,33 +61,33 @@ class RecipeTests(SynchronousTestCase):
         self.assertEqual(menu.greeting(), ["!hello", "!dump_stack", "!refresh"])
 
     def test_size(self) -> None:
-        """The width that is asked for is described, and is the layer that the dog is told to send."""
+        """The requested width appears in the description and selects the layer that the dog sends."""
         self.assertEqual(menu.sized(208)[:2], ["!set vision.rawcam.y_skip=1", "!set vision.rawcam.uv_skip=2"])
         camera = describe("aibo", {"host": "d", "camera_width": 208}).capabilities["camera"]
         self.assertEqual((camera["width"], camera["height"]), (208, 160))
 
     def test_waits_between_pictures(self) -> None:
-        """Fifteen pictures a second are a wait of 50 ms, as it is counted from the end of the one before."""
+        """Fifteen frames a second need a delay of 50 ms, counted from the end of the previous frame."""
         for fps, wait in ((30.0, 0), (0.0, 0), (15.0, 50), (10.0, 83)):
             self.assertEqual(menu.paced(fps)[0], f"!set vision.rawcam.interval={wait}")
 
 
 class _Caller:
     def link_up(self, link: Link) -> None:
-        """Nothing to say."""
+        """Do nothing."""
 
     def link_down(self) -> None:
-        """Nothing to do."""
+        """Do nothing."""
 
     def received(self, data: bytes) -> None:
-        """Nothing to hear."""
+        """Ignore the data."""
 
 
 class WaitTests(SynchronousTestCase):
-    """How long a port is left alone."""
+    """The delays between connection attempts."""
 
     def test_waits_as_the_dogs_own_clients_do(self) -> None:
-        """A port that refuses is called again after 0.5, 1, 2, 5 and 5 s, and after 0.5 s once it has answered."""
+        """Delays after refusals are 0.5, 1, 2, 5 and 5 s, and 0.5 s again after an answer."""
         reactor: Any = MemoryReactorClock()
         line = TcpConnector(reactor, WAITS).call("dog1", 10050, _Caller())
         for wait in (0.5, 1.0, 2.0, 5.0, 5.0):
@@ -102,7 +102,7 @@ class WaitTests(SynchronousTestCase):
         self.assertEqual(reactor.getDelayedCalls(), [])
 
     def test_does_not_pester_what_hangs_up_at_once(self) -> None:
-        """Who takes each call and hangs up is called ever less often, and named; a link that lasted ends that."""
+        """Delays grow for a peer that closes each connection at once; a connection that lasts resets them."""
         for waits, wanted in ((WAITS, [0.5, 1.0, 2.0, 5.0, 5.0]), ((), [0.1, 0.16, 0.256, 0.4096, 0.65536])):
             reactor: Any = MemoryReactorClock()
             line: Any = TcpConnector(reactor, waits).call("dog1", 10050, _Caller())
@@ -129,7 +129,7 @@ class WaitTests(SynchronousTestCase):
             self.assertEqual(reactor.getDelayedCalls(), [])
 
     def test_says_once_what_keeps_a_link_from_being_opened(self) -> None:
-        """Where nobody else says it, a robot that cannot be reached is one line in the log, after some calls."""
+        """An unreachable robot is logged once after several attempts, if ``says`` is set."""
         ear = Ear()
         self.addCleanup(ear.close)
         for says in (False, True):
@@ -152,7 +152,7 @@ class WaitTests(SynchronousTestCase):
 
 
 class _Dead:
-    """A line, and its link, of a network that is gone: what was said last never leaves."""
+    """A link of a failed network: sent data never leaves."""
 
     is_busy = False
 
@@ -164,10 +164,10 @@ class _Dead:
         return self
 
     def send(self, data: bytes) -> None:
-        """Keep it for ever."""
+        """Drop the data."""
 
     def hang_up(self) -> Deferred[None]:
-        """Wait for what was said to leave."""
+        """Return a Deferred that fires when all data is sent."""
         return self.hung_up
 
     def close(self) -> None:
@@ -175,10 +175,10 @@ class _Dead:
 
 
 class PortTests(SynchronousTestCase):
-    """One port of a dog."""
+    """The connection to one port of a dog."""
 
     def test_leaves_a_dead_link_after_a_second(self) -> None:
-        """Closing waits for what was said to leave, but no longer than a second."""
+        """``close`` waits for sent data, for at most a second."""
         clock = Clock()
         port = Port(_Dead(), clock, ("dog1", 10050), lambda: None, lambda: None, lambda _: None)  # type: ignore[arg-type]
         port.open()
@@ -192,12 +192,12 @@ class PortTests(SynchronousTestCase):
 
 
 class _Retried:
-    """What is called again."""
+    """A connector for repeated attempts."""
 
     state = "disconnected"
 
     def connect(self) -> None:
-        """Call again."""
+        """Do nothing."""
 
     def stopConnecting(self) -> None:  # noqa: N802 (Twisted's)
-        """Call no more."""
+        """Do nothing."""

@@ -20,7 +20,7 @@ INDICES = "\t".join(str(one) for one in range(16))
 
 
 class CommandTests(SynchronousTestCase):
-    """What is said to the robot."""
+    """Commands to the robot."""
 
     def test_golden_vectors(self) -> None:
         """Each command has the bytes that the firmware reads."""
@@ -31,17 +31,17 @@ class CommandTests(SynchronousTestCase):
         self.assertEqual(codec.text("i", 8, -20.4, 9, 130), b"i8 -20 9 130\n")
 
     def test_refuses_what_would_be_another_command(self) -> None:
-        """A name with a line feed in it, and an angle that is the end of a command, are refused."""
+        """A skill name with a line feed, or an angle equal to a command's end mark, is refused."""
         for name in ("", "wk\nd", "8", "a" * 17):
             self.assertRaises(ValueError, codec.skill, name)
         self.assertRaises(ValueError, codec.binary, "I", (0, 126))
 
 
 class LineTests(SynchronousTestCase):
-    """What the robot says."""
+    """Lines from the robot."""
 
     def test_reads_lines_however_they_are_cut(self) -> None:
-        """One byte at a time gives the same lines as all at once."""
+        """Lines that arrive byte by byte equal lines that arrive at once."""
         said = b"wkF\r\nk\r\n\r\n=\r\n0\t1\t\r\n"
         whole, pieces = LineReader(), LineReader()
         lines = list(whole.read(said))
@@ -49,7 +49,7 @@ class LineTests(SynchronousTestCase):
         self.assertEqual([one for at in range(len(said)) for one in pieces.read(said[at : at + 1])], lines)
 
     def test_drops_and_counts_what_is_no_text(self) -> None:
-        """Lines with other bytes, and lines that never end, are dropped, and cost no line after them."""
+        """Lines with invalid bytes and overlong lines are dropped and counted; the following lines are read."""
         reader = LineReader()
         self.assertEqual(list(reader.read(b"\xffk\r\nd\r\n")), ["d"])
         self.assertEqual(list(reader.read(b"x" * 600)), [])
@@ -60,7 +60,7 @@ class LineTests(SynchronousTestCase):
     @given(st.binary(max_size=300))
     @settings(max_examples=200, deadline=None)
     def test_takes_any_bytes(self, data: bytes) -> None:
-        """No bytes make a reader or a parser fail in another way than by ``BadFrame``."""
+        """For any bytes, readers and parsers raise nothing except ``BadFrame``."""
         lines = list(LineReader().read(data + b"\n"))
         for parse in (codec.joints, codec.attitude, codec.attitude_old, codec.volts, codec.distance):
             try:
@@ -72,19 +72,19 @@ class LineTests(SynchronousTestCase):
     @given(st.lists(st.integers(-125, 125), min_size=16, max_size=16))
     @settings(max_examples=50, deadline=None)
     def test_joints_of_both_boards(self, angles: list[int]) -> None:
-        """Any angles come back in radians, as either board writes them."""
+        """Joint angles survive the formats of both boards, as radians."""
         row = "".join(f"{angle},\t" for angle in angles)
         wanted = {joint: math.radians(angle) for joint, angle in enumerate(angles)}
         self.assertEqual(codec.joints(["=", INDICES, row]), wanted)
         self.assertEqual(codec.joints([f"={INDICES}", row]), wanted)
 
     def test_refuses_what_are_no_joints(self) -> None:
-        """Too few angles, other indices, and angles that no joint has, are no joints."""
+        """Too few angles, wrong indices and angles out of range are refused."""
         for lines in ([], ["=", "0\t1", "5,\t"], ["=", "1\t0", "5,\t6,"], ["=", "0", "271,"]):
             self.assertRaises(BadFrame, codec.joints, lines)
 
     def test_attitude_of_both_boards(self) -> None:
-        """Columns that touch are read; yaw, pitch, roll have their places; a NyBoard tells pitch first."""
+        """Columns without a space are separated; the order is yaw, pitch, roll, and pitch first on a NyBoard."""
         told = codec.attitude(["ICM:   0.1  -0.2   9.8-179.9 -10.0  20.0"])
         self.assertAlmostEqual(told["yaw"], math.radians(-179.9))
         self.assertAlmostEqual(told["pitch"], math.radians(-10.0))
@@ -98,7 +98,7 @@ class LineTests(SynchronousTestCase):
         self.assertRaises(BadFrame, codec.attitude_old, ["1.0"])
 
     def test_volts_and_distance(self) -> None:
-        """A voltage that two cells can have, centimetres as metres, 0 as nothing; all else is refused."""
+        """Voltages of two cells and distances in centimetres are converted, 0 is NaN; others are refused."""
         self.assertEqual(codec.volts(["Voltage: 7.95 V"]), 7.95)
         self.assertRaises(BadFrame, codec.volts, ["Voltage: 79.5 V"])
         self.assertRaises(BadFrame, codec.volts, ["7.95"])
@@ -108,7 +108,7 @@ class LineTests(SynchronousTestCase):
             self.assertRaises(BadFrame, codec.distance, lines)
 
     def test_says_who_it_is(self) -> None:
-        """Banner, board by version, unknown skills, and the token alone in either case are known."""
+        """The banner, the board's version, an unknown skill and the end token (in either case) are recognised."""
         self.assertTrue(codec.is_banner("* Start *"))
         self.assertEqual(codec.board_of(["Bittle", "Software version: B10_250712"]), "biboard")
         self.assertEqual(codec.board_of(["Bittle", "Software version: N_250224"]), "nyboard")
@@ -120,17 +120,17 @@ class LineTests(SynchronousTestCase):
 
 
 class HttpTests(SynchronousTestCase):
-    """Over Wi-Fi."""
+    """HTTP requests and responses over Wi-Fi."""
 
     def test_paths(self) -> None:
-        """Commands become paths of either board, bytes and all; the line feed stays away."""
+        """Commands become URL paths of either board, with escaped bytes and without the line feed."""
         self.assertEqual(codec.command_path("biboard", b"kwkF\n"), "/cmd?cmd=kwkF")
         self.assertEqual(codec.command_path("nyboard", b"I\x08\xec~"), "/action?name=I%08%EC~")
         self.assertEqual(codec.status_path("12"), "/status?taskId=12")
         self.assertTrue(codec.request("10.0.0.1", "/cmd").startswith(b"GET /cmd HTTP/1.1\r\nHost: 10.0.0.1\r\n"))
 
     def test_tasks(self) -> None:
-        """A task has a number; it runs, is done with text, or fails with the robot's words."""
+        """A task has a number; it is running, completed with a text, or failed with the robot's message."""
         self.assertEqual(codec.task_of(b"TASK_ID:17"), "17")
         self.assertRaises(BadFrame, codec.task_of, b"busy")
         self.assertIsNone(codec.result_of(b"pending"))
@@ -139,7 +139,7 @@ class HttpTests(SynchronousTestCase):
         self.assertIn("time", str(self.assertRaises(BadFrame, codec.result_of, b"error\nERROR: time out")))
 
     def test_reads_a_response_one_byte_at_a_time(self) -> None:
-        """A body is whole with its length, or with the end of the link; half of one is none."""
+        """A body ends at its length or at the end of the connection; an incomplete one is refused."""
         said = b"HTTP/1.1 200 OK\r\nContent-Length: 3\r\n\r\nabc"
         reader = ResponseReader()
         got = [reader.read(said[at : at + 1]) for at in range(len(said))]
@@ -155,7 +155,7 @@ class HttpTests(SynchronousTestCase):
     @given(st.binary(max_size=200))
     @settings(max_examples=100, deadline=None)
     def test_other_responses_are_refused(self, data: bytes) -> None:
-        """Another status, no HTTP, and more than a robot has to say, are refused; no bytes do worse than that."""
+        """Another status, data other than HTTP and too long responses are refused; random bytes raise only BadFrame."""
         self.assertRaises(BadFrame, ResponseReader().read, b"HTTP/1.1 404 Not Found\r\n\r\n" + data)
         self.assertRaises(BadFrame, ResponseReader().read, b"x" * 9000 + data)
         reader = ResponseReader()
@@ -167,10 +167,10 @@ class HttpTests(SynchronousTestCase):
 
 
 class GaitTests(SynchronousTestCase):
-    """Which gait comes nearest."""
+    """The choice of the nearest gait."""
 
     def test_chooses(self) -> None:
-        """Slow, fast, back, turns and arcs each have their gait, and almost nothing is standing."""
+        """Slow, fast, backward, turn and arc wishes each give their gait; a wish near zero gives STAND."""
         for wish, name in (
             ((0.0, 0.0), STAND),
             ((0.01, 0.05), STAND),
@@ -186,7 +186,7 @@ class GaitTests(SynchronousTestCase):
         self.assertEqual(chosen(0.0, 0.0, GAITS)[1], REST)
 
     def test_never_goes_where_it_shall_not(self) -> None:
-        """Where no gait goes that way, the dog stands; a gait that does nothing is none."""
+        """A gait never moves against the wish; if none fits, the dog stands; gaits without motion are ignored."""
         self.assertEqual(chosen(-1.0, 1.0, {"wkF": Velocity(0.1, 0.0), "hlw": REST}), (STAND, REST))
         for wish in ((0.1, 0.0), (-0.1, 0.0), (0.0, 0.15), (0.0, -1.0), (0.03, -0.4), (-0.05, 0.4)):
             _, real = chosen(*wish, GAITS)
@@ -197,7 +197,7 @@ class GaitTests(SynchronousTestCase):
 
 
 class DialogueTests(SynchronousTestCase):
-    """Answers find their questions."""
+    """The assignment of answers to requests."""
 
     def setUp(self) -> None:
         self.clock = Clock()
@@ -209,7 +209,7 @@ class DialogueTests(SynchronousTestCase):
             self.dialogue.heard(line)
 
     def test_answers_come_in_order(self) -> None:
-        """A stop leaves at once behind a question, and both get their own answers."""
+        """A stop is sent at once after an open request, and both get their answers."""
         asked = self.dialogue.ask(b"j\n", 1.0)
         stop = self.dialogue.ask(b"kup\n", 1.0)
         self.assertEqual(self.sent, [b"j\n", b"kup\n"])
@@ -219,7 +219,7 @@ class DialogueTests(SynchronousTestCase):
         self.assertEqual(self.clock.getDelayedCalls(), [])
 
     def test_a_command_too_long_has_failed(self) -> None:
-        """What the robot could not take whole is not done, though its token follows; what was asked next is."""
+        """A command that exceeds the robot's buffer fails, although its token follows; the next request succeeds."""
         long, next_one = self.dialogue.ask(b"i8 10 9 10\n", 1.0), self.dialogue.ask(b"j\n", 1.0)
         self.hear("OVF", "i", "=", "0", "5,", "j")
         self.failureResultOf(long, RobotError)
@@ -227,7 +227,7 @@ class DialogueTests(SynchronousTestCase):
         self.hear("OVF")
 
     def test_a_lost_answer_shifts_no_other(self) -> None:
-        """Where an answer is lost, the next one goes to its own question, also between skills."""
+        """If an answer is lost, the next answer still goes to its request, also between skills."""
         lost, got = self.dialogue.ask(b"gp\n", 1.0), self.dialogue.ask(b"j\n", 1.0)
         self.hear("j")
         self.failureResultOf(lost, NoReply)
@@ -238,7 +238,7 @@ class DialogueTests(SynchronousTestCase):
         self.successResultOf(got)
 
     def test_a_rest_says_that_the_gyroscope_is_off(self) -> None:
-        """The ``g`` before the ``d`` of a rest is no answer to a question about the attitude."""
+        """The ``g`` before the ``d`` of a rest is not the answer to an attitude request."""
         rest, attitude = self.dialogue.ask(b"d\n", 1.0), self.dialogue.ask(b"gp\n", 1.0)
         self.hear("g", "d")
         self.successResultOf(rest)
@@ -247,7 +247,7 @@ class DialogueTests(SynchronousTestCase):
         self.assertEqual(len(self.successResultOf(attitude)), 1)
 
     def test_may_be_ended_while_it_fails_a_question(self) -> None:
-        """Who is told of one failure may end the dialogue, and no question fails twice."""
+        """An errback may end the dialogue, and no request fails twice."""
         first, second = self.dialogue.ask(b"gp\n", 1.0), self.dialogue.ask(b"P~", 1.0)
         third = self.dialogue.ask(b"j\n", 1.0)
         first.addErrback(lambda _: self.dialogue.end(LinkLost("gone")))
@@ -258,7 +258,7 @@ class DialogueTests(SynchronousTestCase):
         self.assertEqual(self.clock.getDelayedCalls(), [])
 
     def test_late_unknown_and_ended(self) -> None:
-        """No answer in time, an unknown skill, and an end each fail the question; unasked lines are nothing."""
+        """A timeout, an unknown skill and the end each fail the request; lines without a request are ignored."""
         self.hear("k")
         late = self.dialogue.ask(b"j\n", 1.0)
         self.clock.advance(1.0)
@@ -277,7 +277,7 @@ class OptionTests(SynchronousTestCase):
     """Options of the kind."""
 
     def test_describes_what_the_gaits_can_do(self) -> None:
-        """Limits are those of the gaits; a dog that cannot turn has no key to turn; sensors only where they are."""
+        """The limits follow from the gaits, without a key for missing axes; the capabilities follow from the board."""
         told = describe("bittle", {"port": "/dev/ttyUSB0", "gaits": {"wkF": [0.1, 0]}, "board": "nyboard"})
         self.assertEqual(told.limits, {"base.vx": (0.0, 0.1)})
         self.assertNotIn("ranger", told.capabilities)

@@ -1,4 +1,4 @@
-"""Tests of ``drivers.bittle.driver`` against ``sim.robots.emulator.bittle``, on a cable and over Wi-Fi."""
+"""Tests of ``drivers.bittle.driver`` against ``sim.robots.emulator.bittle``, over a serial port and Wi-Fi."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ GAITS = {"wkF": [0.1, 0.0], "trF": [0.15, 0.0], "bk": [-0.05, 0.0], "vtL": [0.0,
 
 
 class BittleCase(RobotCase):
-    """A dog on a cable."""
+    """A dog on a serial port."""
 
     END_S = 2.0
     kind = "bittle"
@@ -34,16 +34,16 @@ class BittleCase(RobotCase):
         self.connector = MemoryConnector(self.clock, self.robot.accept)
 
     def tearDown(self) -> None:
-        """Nothing was said that changes the robot for good."""
+        """Check that no command was sent that changes the robot permanently."""
         super().tearDown()
         self.assertEqual([one for one in self.robot.heard if chr(one[0]) in NEVER], [])
 
 
 class BittleDriverTests(Conformance, BittleCase):
-    """A Bittle on a cable keeps the contract, and what is its own."""
+    """The driver of a Bittle on a serial port passes the conformance tests and further tests of its functions."""
 
     def test_returns_the_gait_that_it_really_has(self) -> None:
-        """Act tells the velocity of the nearest gait, and the dog walks as told."""
+        """``act`` returns the velocity of the nearest gait, and the dog moves at this velocity."""
         driver = self.ready()
         self.assertEqual(driver.act({"base.vx": 0.06, "base.wz": 0.05}, self.permit()), {"base.vx": 0.1, "base.wz": 0})
         self.pass_time(0.1)
@@ -54,7 +54,7 @@ class BittleDriverTests(Conformance, BittleCase):
         self.assertEqual(self.value(driver, "skill.running"), "vtL")
 
     def test_asks_for_a_gait_once(self) -> None:
-        """The same wish each tenth of a second is one command, so that the gait does not begin anew each time."""
+        """A repeated action sends its command once, as the firmware restarts a gait with each command."""
         driver = self.ready()
         for _ in range(10):
             driver.act({"base.vx": 0.1}, self.permit())
@@ -76,14 +76,14 @@ class BittleDriverTests(Conformance, BittleCase):
         self.assertEqual(self.value(driver, "mode"), "biboard")
 
     def test_reckons_where_it_is(self) -> None:
-        """The place is reckoned from the gaits that the dog took."""
+        """The pose is estimated from the executed gaits."""
         driver = self.ready()
         driver.act({"base.vx": 0.1}, self.permit(seconds=2.0))
         self.pass_time(2.5)
         self.near(self.value(driver, "odom.x"), self.body.x, 0.02)
 
     def test_does_skills(self) -> None:
-        """A behaviour fires when it is over; meanwhile the dog is busy and not stale; gaits are no skills."""
+        """A skill completes at its end; until then the dog refuses actions and stays ready; gaits are no skills."""
         driver = self.ready()
         driver.act({"base.vx": 0.1}, self.permit(seconds=5.0))
         self.pass_time(0.2)
@@ -103,7 +103,7 @@ class BittleDriverTests(Conformance, BittleCase):
         self.pass_time(1.0)
 
     def test_turns_joints(self) -> None:
-        """Joints go by their names, in radians, within their limits; others are refused."""
+        """Joints are set by name in radians, within their limits; invalid arguments are refused."""
         driver = self.ready()
         turned = driver.invoke("joint", head_pan=0.5, lf_knee=9.0)
         self.pass_time(0.1)
@@ -113,7 +113,7 @@ class BittleDriverTests(Conformance, BittleCase):
             self.failureResultOf(driver.invoke("joint", **arguments), Unsupported)
 
     def test_refuses_skills_of_a_dog_that_lies(self) -> None:
-        """Without a link, and with its servos off, it does nothing."""
+        """Without a link, or with its servos off, the dog refuses skills."""
         driver = self.make_driver()
         self.failureResultOf(driver.invoke("sit"), LinkLost)
         driver.connect()
@@ -124,7 +124,7 @@ class BittleDriverTests(Conformance, BittleCase):
         self.assertTrue(self.robot.is_limp)
 
     def test_asks_again_for_a_gait_whose_answer_was_lost(self) -> None:
-        """A stop that the dog has not confirmed within a second is sent again."""
+        """A stop that the dog has not confirmed within a second is repeated."""
         driver = self.ready()
         self.faults.half_open = True
         driver.stop()
@@ -132,7 +132,7 @@ class BittleDriverTests(Conformance, BittleCase):
         self.assertGreaterEqual(self.robot.heard.count(b"kup"), 3)
 
     def test_takes_up_a_rebooted_dog(self) -> None:
-        """A dog that starts anew while it walks is greeted by its banner, at rest, and stands again."""
+        """After a reboot during a walk the driver reads the banner, and the dog stands up, ready and at rest."""
         driver = self.ready()
         driver.act({"base.vx": 0.1}, self.permit(seconds=9.0))
         self.pass_time(0.5)
@@ -148,7 +148,7 @@ class BittleDriverTests(Conformance, BittleCase):
         self.assertGreater(self.true_speed(), 0.05)
 
     def test_walks_on_with_a_dog_whose_banner_was_lost(self) -> None:
-        """A dog that starts anew unnoticed is told its gait again, though nobody wishes for another."""
+        """After an unnoticed reboot the driver sends the unchanged gait again."""
         driver = self.ready()
         driver.act({"base.vx": 0.1}, self.permit(seconds=9.0))
         self.pass_time(0.5)
@@ -162,7 +162,7 @@ class BittleDriverTests(Conformance, BittleCase):
         self.assertGreater(self.true_speed(), 0.05)
 
     def test_takes_up_a_dog_that_was_silent(self) -> None:
-        """Silence has a name, and ends as soon as the dog answers again; it was stopped meanwhile."""
+        """A silent dog is stale and stopped; the problem has a text, and clears with the next answer."""
         driver = self.ready()
         driver.act({"base.vx": 0.1}, self.permit(seconds=2.0))
         self.faults.half_open = True
@@ -174,7 +174,7 @@ class BittleDriverTests(Conformance, BittleCase):
         self.assertEqual((driver.state, driver.problem), ("ready", ""))
 
     def test_lives_with_a_foul_wire(self) -> None:
-        """With a tenth of the lines lost and a tenth spoilt, cut anyhow and late, it walks, stops, and counts."""
+        """With a tenth of the lines lost and a tenth invalid, split and delayed, the dog walks, stops, and counts."""
         driver = self.ready()
         self.faults.drop = self.faults.garbage = 0.1
         self.faults.split, self.faults.delay = True, 0.01
@@ -188,12 +188,12 @@ class BittleDriverTests(Conformance, BittleCase):
         self.assertGreater(driver.diagnostics()["bad_frames"], 3)
 
     def test_says_that_the_board_is_another(self) -> None:
-        """An option that names the wrong board is told from what the robot says of itself."""
+        """If the option ``board`` is wrong, the problem names the board that the robot reports."""
         driver = self.connected(board="nyboard")
         self.assertIn("biboard", driver.problem)
 
     def test_complains_of_a_gait_that_the_dog_does_not_know(self) -> None:
-        """A gait of the options that the firmware lacks is logged and counted, and not asked for again and again."""
+        """A gait in the options that the firmware lacks is counted as refused and not sent again."""
         driver = self.ready(gaits={"moonF": [0.1, 0.0]})
         driver.act({"base.vx": 0.1}, self.permit(seconds=3.0))
         self.pass_time(2.0)
@@ -202,12 +202,12 @@ class BittleDriverTests(Conformance, BittleCase):
 
 
 class ResettingTests(BittleCase):
-    """A board that starts anew when its port is opened."""
+    """A board that resets when its port is opened."""
 
     resets = True
 
     def test_waits_until_it_has_booted(self) -> None:
-        """The first question goes unheard; the driver asks again, and connects."""
+        """The first request is lost; the driver repeats it and connects."""
         driver = self.make_driver()
         connected = driver.connect()
         self.pass_time(0.5)
@@ -217,12 +217,12 @@ class ResettingTests(BittleCase):
 
 
 class NyBoardTests(BittleCase):
-    """An older board on a cable."""
+    """An older board on a serial port."""
 
     board = "nyboard"
 
     def test_is_found_by_its_version(self) -> None:
-        """It is known by its version, tells roll and pitch, and is not asked for its battery."""
+        """The board is recognised by its version, reports roll and pitch, and is not asked for its battery."""
         self.body.values["imu.pitch"] = -0.3
         driver = self.connected(3.0)
         self.assertEqual(self.value(driver, "mode"), "nyboard")
@@ -232,7 +232,7 @@ class NyBoardTests(BittleCase):
 
 
 class WifiTests(BittleCase):
-    """A BiBoard behind its web server."""
+    """A BiBoard with a web server."""
 
     def build(self) -> None:
         super().build()
@@ -247,7 +247,7 @@ class WifiTests(BittleCase):
         return driver
 
     def test_walks_and_stops(self) -> None:
-        """Over Wi-Fi it connects, stands, walks, feels, and stops at its deadline."""
+        """Over Wi-Fi the driver connects, the dog stands and walks, is observed, and stops at its deadline."""
         driver = self.walking()
         self.pass_time(1.5)
         self.assertLess(self.true_speed(), 0.01)
@@ -261,7 +261,7 @@ class WifiTests(BittleCase):
         self.assertTrue(self.robot.is_limp)
 
     def test_is_let_go_once_it_was_told_to_lie_down(self) -> None:
-        """Disconnect fires when the last word has reached the dog, so that a process may end then; a dead one too."""
+        """``disconnect`` fires after the last command has reached the dog, or after a timeout if it has failed."""
         for is_dead in (False, True):
             driver = self.walking()
             self.robot.heard.clear()
@@ -277,7 +277,7 @@ class WifiTests(BittleCase):
             self.pass_time(3.0)
 
     def test_outlives_a_lost_network(self) -> None:
-        """Without the network the driver is stale and says why; with it, it is ready again and the dog stands."""
+        """Without the network the driver is stale with a problem; with it, the driver is ready and the dog stands."""
         driver = self.walking()
         self.connector.is_open = False
         self.pass_time(12.0)
@@ -289,12 +289,12 @@ class WifiTests(BittleCase):
         self.assertLess(self.true_speed(), 0.01)
 
     def test_lives_with_a_foul_network(self) -> None:
-        """Responses that are lost, spoilt and cut cost time, never an exception; the dog still stops."""
+        """Lost, invalid and split responses cause delays but no exception, and the dog still stops."""
         driver = self.walking()
         self.faults.drop = self.faults.garbage = 0.1
         self.faults.split = True
         for _ in range(60):
-            with contextlib.suppress(NotEnabled):  # where the link was lost, it lies down first, and stands up again
+            with contextlib.suppress(NotEnabled):  # after a lost connection the dog lies down, then stands up
                 driver.act({"base.vx": 0.1}, self.permit())
             self.pass_time(0.2)
         self.faults.drop = self.faults.garbage = 0.0
@@ -303,7 +303,7 @@ class WifiTests(BittleCase):
         driver.act({"base.vx": 0.1}, self.permit())
 
     def test_web_server_outlives_rubbish(self) -> None:
-        """What is no request is answered or hung up on, and hours of commands are not all remembered."""
+        """An invalid request gets status 400 or a closed connection; the number of stored tasks is limited."""
         for data in (b"\r\n\r\n", b"RUBBISH\r\n\r\n", b"GET http://[ HTTP/1.1\r\n\r\n"):
             link = KeptLink()
             self.robot.accept_http(link).received(data)
@@ -320,7 +320,7 @@ class WifiTests(BittleCase):
         self.assertLessEqual(len(self.robot.tasks) + len(self.robot.said), 50)
 
     def test_names_the_wrong_board(self) -> None:
-        """A web server that knows no such page is named by what it answers."""
+        """If the option ``board`` is wrong, the problem contains the HTTP status."""
         other = "nyboard" if self.board == "biboard" else "biboard"
         driver = self.make_driver(board=other)
         connected = driver.connect()
@@ -330,7 +330,7 @@ class WifiTests(BittleCase):
         self.assertIn("404", driver.problem)
 
     def test_may_be_given_up_at_any_moment(self) -> None:
-        """Disconnecting before, while and after it connects leaves nothing behind."""
+        """A ``disconnect`` at any moment of the connection leaves no state behind."""
         for steps in range(0, 60, 3):
             driver = self.make_driver()
             driver.connect().addErrback(lambda _: None)
@@ -340,6 +340,6 @@ class WifiTests(BittleCase):
 
 
 class NyBoardWifiTests(WifiTests):
-    """A NyBoard behind its dongle."""
+    """A NyBoard with a Wi-Fi dongle."""
 
     board = "nyboard"

@@ -1,4 +1,4 @@
-"""Tests of ``drivers.camera.codec``: streams as cameras send them, whole, byte by byte, spoilt, and anything at all."""
+"""Tests of ``drivers.camera.codec`` with streams of real cameras, whole and split, with errors, and random bytes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from drivers.errors import BadFrame
 
 FIRST, SECOND = b"\xff\xd8one\r\n--fram\xff\xd9", b"\xff\xd8two--\n\xff\xd9"
 
-# As the camera server of Espressif's examples writes them: each piece is a chunk of its own.
+# The format of the camera server in Espressif's examples: each piece is a separate chunk.
 ESP32 = (
     b"HTTP/1.1 200 OK\r\nContent-Type: multipart/x-mixed-replace;boundary=123456789000000000000987654321\r\n"
     b"Transfer-Encoding: chunked\r\nAccess-Control-Allow-Origin: *\r\n\r\n"
@@ -29,17 +29,17 @@ ESP32 = (
     )
     + b"0\r\n\r\n"
 )
-# As mjpg-streamer does: HTTP/1.0, and lengths.
+# The format of mjpg-streamer: HTTP/1.0 with lengths.
 STREAMER = b"HTTP/1.0 200 OK\r\nContent-Type: multipart/x-mixed-replace;boundary=boundarydonotcross\r\n\r\n" + b"".join(
     b"--boundarydonotcross\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n" % len(picture) + picture + b"\r\n"
     for picture in (FIRST, SECOND)
 )
-# The boundary told with its dashes, in quotes, lines ended by LF alone, no lengths, and an end.
+# A quoted boundary that includes its dashes, lines that end with LF, no lengths, and an end.
 PLAIN = (
     b'HTTP/1.1 200 Fine\nServer: x\ncontent-type: Multipart/X-Mixed-Replace; a=b; Boundary="--cut"\n\n'
     b"\n--cut\ncontent-type: image/jpeg\n\n" + FIRST + b"\n--cut \n\n" + SECOND + b"\n--cut--\n"
 )
-# The same as RFC 2046 wants it: the dashes are there twice.
+# The same by RFC 2046: with dashes in front of the boundary's dashes.
 DOUBLE = (
     b"HTTP/1.1 200 OK\r\nContent-Type: multipart/x-mixed-replace; boundary=--cut\r\n\r\npreamble\r\n"
     b"----cut\r\n\r\n" + FIRST + b"\r\n----cut\r\n\r\n" + SECOND + b"\r\n----cut--\r\n"
@@ -48,7 +48,7 @@ STREAMS = {"esp32": ESP32, "streamer": STREAMER, "plain": PLAIN, "double": DOUBL
 
 
 def read(data: bytes, size: int = 0) -> tuple[list[bytes], StreamReader]:
-    """What a fresh reader finds in ``data``, given in pieces of ``size``."""
+    """Return the pictures in ``data`` and the new reader that read it in pieces of ``size``."""
     reader, found = StreamReader(), list[bytes]()
     for place in range(0, len(data), size or len(data)):
         found += reader.read(data[place : place + (size or len(data))])
@@ -57,7 +57,7 @@ def read(data: bytes, size: int = 0) -> tuple[list[bytes], StreamReader]:
 
 class StreamReaderTests(SynchronousTestCase):
     def test_reads_what_cameras_send(self) -> None:
-        """The pictures of each way to write a stream come out as they went in, however the bytes are cut."""
+        """The pictures in each stream format are read for each division of the bytes."""
         for name, data in STREAMS.items():
             for size in (0, 1, 2, 3, 7, 64):
                 found, reader = read(data, size)
@@ -66,16 +66,16 @@ class StreamReaderTests(SynchronousTestCase):
                 self.assertEqual(read(data + b"anything", size)[0], [FIRST, SECOND])
 
     def test_reads_what_the_emulator_says(self) -> None:
-        """What is written here is read here: with lengths and without, in chunks and without."""
+        """Streams written by the emulator are read, with and without lengths and chunks."""
         for is_chunked in (False, True):
             for has_length in (False, True):
                 said = [part(picture, has_length) for picture in (FIRST, SECOND, FIRST)]
                 data = answer(is_chunked=is_chunked) + b"".join(map(chunk, said) if is_chunked else said)
-                # Without a length a picture is whole when the next one begins.
+                # Without a length a picture ends at the start of the next one.
                 self.assertEqual(read(data, 5)[0], [FIRST, SECOND, FIRST][: 3 if has_length else 2])
 
     def test_finds_its_way_back(self) -> None:
-        """A wrong length, and a boundary inside of a line, spoil a picture or two, and not those behind them."""
+        """A wrong length and a false boundary damage at most two pictures, and the following ones are read."""
         short = b"--frame\r\nContent-Length: 3\r\n\r\n" + FIRST
         strange = b"--frames of a film\r\n--frame" + bytes(90) + b"\r\nContent-Length: x\r\n"
         found, _ = read(answer() + short + b"\r\n" + strange + part(SECOND) + part(FIRST), 1)
@@ -85,7 +85,7 @@ class StreamReaderTests(SynchronousTestCase):
         )
 
     def test_names_what_is_no_stream(self) -> None:
-        """Each answer that is no stream of pictures is refused in one plain line with what it was, or what to do."""
+        """Each answer without a picture stream is refused with one line that names the cause or the remedy."""
         ok = b"HTTP/1.1 200 OK\r\n"
         for data, word in (
             (b"HTTP/1.1 401 Unauthorized\r\n\r\n", "NAME:PASSWORD"),
@@ -124,14 +124,14 @@ class StreamReaderTests(SynchronousTestCase):
                 self.assertTrue(line.isprintable() and len(line) < 200, line)
 
     def test_takes_the_largest(self) -> None:
-        """A picture of exactly 1 MiB is taken, with its length and without."""
+        """A picture of exactly 1 MiB is accepted, with and without its length."""
         large = bytes(codec.MOST_BYTES)
         for has_length in (True, False):
             data = answer() + part(large, has_length) + b"--frame"
             self.assertEqual(read(data, 40_000)[0], [large])
 
     def test_keeps_no_more_than_it_needs(self) -> None:
-        """What stands between pictures is thrown away as it comes."""
+        """Data between pictures is dropped on arrival."""
         reader = StreamReader()
         reader.read(answer())
         for _ in range(100):
@@ -142,7 +142,7 @@ class StreamReaderTests(SynchronousTestCase):
     @settings(max_examples=300)
     @given(st.lists(st.binary(max_size=60), max_size=6), st.booleans(), st.integers(1, 80))
     def test_any_bytes_as_a_stream(self, pieces: list[bytes], is_chunked: bool, size: int) -> None:
-        """Whatever stands behind a head, there are pictures in it, or none, or it is refused; nothing else happens."""
+        """Random bytes after a head give pictures, nothing or BadFrame, and no other error."""
         data = answer(is_chunked=is_chunked) + b"\r\n--frame\r\n".join(pieces)
         try:
             found, _ = read(data, size)
@@ -153,7 +153,7 @@ class StreamReaderTests(SynchronousTestCase):
     @settings(max_examples=300)
     @given(st.sampled_from(sorted(STREAMS)), st.data())
     def test_spoilt_streams(self, name: str, data: st.DataObject) -> None:
-        """A stream with some bytes changed or lost is read or refused, the same whether it comes whole or in bytes."""
+        """A stream with changed or missing bytes gives the same result whole and byte by byte."""
         stream = bytearray(STREAMS[name])
         for _ in range(data.draw(st.integers(1, 4))):
             place = data.draw(st.integers(0, len(stream) - 1))
@@ -169,7 +169,7 @@ class StreamReaderTests(SynchronousTestCase):
 
 class RequestTests(SynchronousTestCase):
     def test_asks(self) -> None:
-        """The request names host and path, and the login only where there is one."""
+        """The request contains host and path, and the credentials only if there are any."""
         plain = codec.request("cam:81", "/stream?a=1")
         self.assertTrue(plain.startswith(b"GET /stream?a=1 HTTP/1.1\r\nHost: cam:81\r\n"))
         self.assertTrue(plain.endswith(b"\r\n\r\n"))

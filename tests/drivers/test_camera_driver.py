@@ -1,4 +1,4 @@
-"""Tests of ``drivers.camera``: pictures of a folder on a turned clock, OpenCV's part by a stand-in, and faults."""
+"""Tests of ``drivers.camera``: pictures from a folder in virtual time, a fake of OpenCV, and faults."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ HEAD = b"\xff\xd8\xff\xe0\x00\x04ab\xff\xc0\x00\x0b\x08\x00\x60\x00\x80\x01\x11\
 
 
 def jpeg(mark: int) -> bytes:
-    """One of 128 x 96, as far as its head goes."""
+    """Return the head of a JPEG of 128 x 96 pixels."""
     return HEAD + bytes([mark]) + b"\xff\xd9"
 
 
 class CameraDriverTests(Conformance, RobotCase):
-    """A camera keeps the contract of what senses, and what is its own."""
+    """The camera driver passes the conformance tests for sensors and further tests of its functions."""
 
     STEP_S = 0.01
     kind = "camera"
@@ -40,7 +40,7 @@ class CameraDriverTests(Conformance, RobotCase):
         self.options = {"source": str(self.folder), "fps": 20}
 
     def test_shows_a_folder_by_the_clock(self) -> None:
-        """The pictures come in the order of their names at their rate, over and over, the same in each run."""
+        """The pictures repeat in the order of their names at the given rate, equal in each run."""
         runs = []
         for _ in range(2):
             driver, seen = self.make_driver(fps=10), list[int]()
@@ -56,7 +56,7 @@ class CameraDriverTests(Conformance, RobotCase):
         self.assertEqual((frame.width, frame.height, frame.seq), (128, 96, 10))
 
     def test_takes_as_many_pictures_as_are_wanted(self) -> None:
-        """Another rate holds at once; with none wanted no picture is taken, and the device stays ready."""
+        """A new frame rate applies at once; at zero no picture is taken, and the device stays ready."""
         driver = self.ready()
         driver.set_camera_fps(0)
         before = driver.diagnostics()["pictures"]
@@ -74,7 +74,7 @@ class CameraDriverTests(Conformance, RobotCase):
         self.assertEqual(resting.state, "ready")
 
     def test_drops_what_is_no_picture(self) -> None:
-        """A spoilt file is counted and passed over; the others go on."""
+        """An invalid file is counted and skipped; the other files are shown."""
         (self.folder / "2.jpg").write_bytes(jpeg(2)[:-1])
         driver = self.make_driver()
         driver.connect()
@@ -85,7 +85,7 @@ class CameraDriverTests(Conformance, RobotCase):
         self.assertEqual(driver.state, "ready")
 
     def test_comes_back_with_its_pictures(self) -> None:
-        """Without pictures the driver is stale and tries again, ever more slowly; then it is ready as before."""
+        """Without pictures the driver is stale and retries with growing delays; then it is ready again."""
         driver = self.ready()
         for mark in (1, 2, 3):
             (self.folder / f"{mark}.jpg").unlink()
@@ -102,7 +102,7 @@ class CameraDriverTests(Conformance, RobotCase):
         self.assertRaises(Unsupported, driver.act, {"base.vx": 0.1}, self.permit())
 
     def test_waits_for_a_camera_that_is_not_there(self) -> None:
-        """A video that does not exist is no error of the node: connect waits, and leaving says why."""
+        """A missing video is no error of the node: ``connect`` waits, and ``disconnect`` fails it."""
         driver = self.make_driver(source=str(self.folder / "none.avi"))
         connected = driver.connect()
         self.pass_time(10.0)
@@ -112,7 +112,7 @@ class CameraDriverTests(Conformance, RobotCase):
         self.failureResultOf(connected, LinkLost)
 
     def test_asks_a_device_in_a_thread(self) -> None:
-        """Cameras get a thread of their own, by number and by device file; files are read by the clock."""
+        """A camera, by number or device file, is read in a thread; a file is read by the clock."""
 
         class Reactor(Clock):
             def callFromThread(self, call: Any) -> None:  # noqa: N802 (Twisted's)
@@ -124,7 +124,7 @@ class CameraDriverTests(Conformance, RobotCase):
 
 
 class Picture:
-    """What OpenCV would give."""
+    """A fake of OpenCV's image."""
 
     def __init__(self, width: int, height: int) -> None:
         self.shape = (height, width, 3)
@@ -134,7 +134,7 @@ class Picture:
 
 
 class Lens:
-    """A stand-in for the module cv2, with one camera."""
+    """A fake of the module cv2, with one camera."""
 
     CAP_PROP_FRAME_WIDTH, CAP_PROP_FRAME_HEIGHT, CAP_PROP_BUFFERSIZE, CAP_PROP_POS_FRAMES = range(4)
     INTER_AREA = IMWRITE_JPEG_QUALITY = 0
@@ -176,7 +176,7 @@ class ShotsTests(SynchronousTestCase):
         return CaptureShots(Options(file.name, **options), lambda: lens)
 
     def test_reduces_large_pictures(self) -> None:
-        """A picture that is larger than wanted is reduced with its shape kept; a smaller one stays."""
+        """A picture larger than requested is scaled with its aspect ratio; a smaller one is kept."""
         shots = self.capture(Lens(Picture(1280, 720), Picture(100, 50)), width=320, height=240)
         shots.open()
         first, second = shots.shoot(), shots.shoot()
@@ -184,7 +184,7 @@ class ShotsTests(SynchronousTestCase):
         self.assertEqual((second.width, second.height), (100, 50))
 
     def test_begins_a_video_anew(self) -> None:
-        """At its end a video begins again; one that shows nothing even so is lost, and closed once."""
+        """A video repeats after its end; one without any frame raises LinkLost, and is released once."""
         lens = Lens(Picture(10, 10), None, Picture(20, 20))
         shots = self.capture(lens)
         shots.open()
@@ -197,7 +197,7 @@ class ShotsTests(SynchronousTestCase):
         self.assertRaises(LinkLost, shots.shoot)
 
     def test_names_why_there_are_no_pictures(self) -> None:
-        """No OpenCV, no such camera or file, one in use and a picture that is none: each in its words."""
+        """A missing OpenCV, camera or file, a busy camera and an invalid picture each raise an error with its cause."""
 
         def missing() -> Any:
             raise ImportError("cv2")
@@ -217,7 +217,7 @@ class ShotsTests(SynchronousTestCase):
         self.assertRaises(LinkLost, FolderShots("/nowhere").shoot)
 
     def test_reel_outlives_what_opencv_throws(self) -> None:
-        """An exception of OpenCV's own closes the camera, is told with its name, and the next round opens it again."""
+        """An exception of OpenCV closes the camera and is reported by name; the next round opens it again."""
 
         class Moody(Shots):
             rounds = 0

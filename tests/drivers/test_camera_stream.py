@@ -1,4 +1,4 @@
-"""Tests of ``drivers.camera.stream`` against ``sim.robots.emulator.camera``, joined through memory."""
+"""Tests of ``drivers.camera.stream`` against ``sim.robots.emulator.camera``, connected in memory."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ URL = "http://10.0.0.7:81/stream"
 
 
 class StreamTests(Conformance, RobotCase):
-    """A camera on the network keeps the contract of what senses, and what is its own."""
+    """The driver of a network camera passes the conformance tests for sensors and further tests of its functions."""
 
     END_S = 1.0
     kind = "camera"
@@ -37,7 +37,7 @@ class StreamTests(Conformance, RobotCase):
         self.connector = MemoryConnector(self.clock, self.camera.accept)
 
     def test_shows_what_the_camera_sees(self) -> None:
-        """The newest picture is the camera's, with its size; its numbers leave no gap; each way to write works."""
+        """The newest frame has the camera's size and data, without a gap in its numbers, in each stream format."""
         for has_length in (True, False):
             for is_chunked in (True, False):
                 self.camera.has_length, self.camera.is_chunked = has_length, is_chunked
@@ -56,7 +56,7 @@ class StreamTests(Conformance, RobotCase):
                 driver.disconnect()
 
     def test_takes_as_many_pictures_as_are_wanted(self) -> None:
-        """What comes above the wanted rate is dropped; with none wanted the camera is hung up on, and called again."""
+        """Frames above the wanted rate are dropped; at rate zero the driver disconnects, then connects again."""
         driver = self.ready()
         self.assertIsInstance(driver, Filming)
         driver.set_camera_fps(10)
@@ -75,7 +75,7 @@ class StreamTests(Conformance, RobotCase):
         self.assertEqual((driver.diagnostics()["refused"], len(self.camera.clients)), (0, 1))
 
     def test_takes_every_picture_of_an_uneven_camera(self) -> None:
-        """Pictures that come a little early or late at the wanted rate are not dropped."""
+        """Frames with jitter at the wanted rate are not dropped."""
         driver = self.make_driver(fps=10)
         driver.connect()
         self.camera.stop()
@@ -88,7 +88,7 @@ class StreamTests(Conformance, RobotCase):
         self.assertEqual((film.dropped, driver.diagnostics()["pictures"]), (0, 6))
 
     def test_comes_back_with_the_camera(self) -> None:
-        """A link that is lost is named once and tried again, ever more slowly; then the camera is ready as before."""
+        """A lost link is logged once and retried with growing delays; then the camera is ready again."""
         driver = self.ready()
         driver.log = log = KeptLog()
         self.connector.is_open = False
@@ -113,7 +113,7 @@ class StreamTests(Conformance, RobotCase):
         self.assertEqual((driver.state, driver.diagnostics()["reconnects"]), ("ready", 2.0))
 
     def test_comes_back_while_no_pictures_are_wanted(self) -> None:
-        """Of a camera that was lost one picture is wanted in any case, which says that it is there again."""
+        """At rate zero a lost camera is reconnected for one frame, which shows that it works again."""
         driver = self.ready()
         self.connector.is_open = False
         self.connector.cut()
@@ -126,7 +126,7 @@ class StreamTests(Conformance, RobotCase):
         self.assertEqual((driver.state, len(self.camera.clients)), ("ready", 0))
 
     def test_notices_a_camera_that_fell_silent(self) -> None:
-        """A camera that is connected and sends nothing is hung up on and called again, until it sends."""
+        """A connection without data is closed and opened again, until the camera sends frames."""
         driver = self.ready()
         self.faults.half_open = True
         self.pass_time(1.0)
@@ -138,7 +138,7 @@ class StreamTests(Conformance, RobotCase):
         self.assertEqual(driver.state, "ready")
 
     def test_names_what_is_no_camera(self) -> None:
-        """What answers otherwise is named with the remedy and asked again with back-off; a node lives on with it."""
+        """An invalid answer is reported with a remedy and retried with back-off, until frames arrive."""
         self.camera.status = "401 Unauthorized"
         driver = self.make_driver()
         connected = driver.connect()
@@ -160,7 +160,7 @@ class StreamTests(Conformance, RobotCase):
         self.assertEqual(driver.state, "ready")
 
     def test_survives_a_foul_network(self) -> None:
-        """Lost, spoilt, late and cut pieces cost pictures, and are over when the network is well again."""
+        """Lost, invalid, delayed and split data cost frames; after the faults all frames arrive."""
         driver = self.make_driver()
         driver.connect()
         self.faults.drop, self.faults.garbage, self.faults.split, self.faults.delay = 0.1, 0.2, True, 0.03
@@ -175,7 +175,7 @@ class StreamTests(Conformance, RobotCase):
         self.assertEqual(after["bad_frames"], before["bad_frames"])
 
     def test_says_that_the_pictures_have_another_size(self) -> None:
-        """Pictures of another size than described are shown as they are, and what to write is logged once."""
+        """Frames of another size than configured are shown, and the correct settings are logged once."""
         driver = self.make_driver(width=320, height=240)
         driver._film.log = log = KeptLog()
         driver.connect()
@@ -184,7 +184,7 @@ class StreamTests(Conformance, RobotCase):
         self.assertEqual(driver.description.capabilities["camera"]["width"], 320)
 
     def test_hears_no_more_of_a_call_that_is_over(self) -> None:
-        """What an earlier connection still brings while it closes is no word of the new one."""
+        """Data and the end of a previous connection have no effect on the new one."""
         driver = self.ready()
         film = driver._film
         old = film._attempt
@@ -196,7 +196,7 @@ class StreamTests(Conformance, RobotCase):
         self.assertEqual((driver.diagnostics()["pictures"], driver.problem, driver.state), (count, "", "ready"))
 
     def test_is_told_where_it_is(self) -> None:
-        """A url says host, port, path and login; one that cannot be is refused, and never shown: it may be secret."""
+        """A URL contains host, port, path and credentials; an invalid URL is refused without showing it."""
         place = place_of("http://anna:s%20p@cam.lan/a/b?c=1")
         self.assertEqual((place.host, place.port, place.path, place.login), ("cam.lan", 80, "/a/b?c=1", "anna:s p"))
         self.assertEqual((place.name, place_of("http://[::1]:81").name), ("cam.lan:80", "[::1]:81"))
@@ -217,7 +217,7 @@ class StreamTests(Conformance, RobotCase):
         self.assertIn("exclude", str(self.assertRaises(UsageError, describe, "camera", both)))
 
     def test_needs_no_opencv(self) -> None:
-        """A camera on the network is driven without OpenCV, NumPy and pyserial, and without a thread."""
+        """The driver of a network camera loads neither OpenCV, NumPy nor pyserial, and starts no thread."""
         script = (
             "import sys, threading; from twisted.internet.task import Clock\n"
             "from drivers.registry import driver_for; from drivers.link import MemoryConnector\n"

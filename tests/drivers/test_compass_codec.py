@@ -1,4 +1,4 @@
-"""Tests of ``drivers.compass.codec``: sentences as compasses send them, byte by byte, spoilt, and anything at all."""
+"""Tests of ``drivers.compass.codec`` with sentences of real compasses, split and with errors, and random bytes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from drivers.errors import BadFrame
 
 class HeadingTests(SynchronousTestCase):
     def test_reads_what_compasses_send(self) -> None:
-        """Sentences of real compasses and talkers tell their heading; east is added, and what is true is known."""
+        """Sentences of real compasses give their heading, corrected to east, and whether it is true or magnetic."""
         for line, degrees, is_true in (
             (b"$HCHDG,98.3,0.0,E,12.6,W*57", 85.7, True),
             (b"$HCHDG,101.1,,,7.1,W*3C", 94.0, True),
@@ -32,12 +32,12 @@ class HeadingTests(SynchronousTestCase):
         self.assertEqual(heading_in(b"$HEHDT,1,T"), Heading(1.0, True, 3))
 
     def test_passes_over_other_sentences(self) -> None:
-        """What tells of other things is a sentence, and no heading."""
+        """A valid sentence of another type gives None."""
         for line in (b"$GPVTG,45.0,T,40.0,M,5.5,N,10.2,K", b"!AIVDM,1,1,,A,x,0", b"$PHDG,1.0", b"$HCHDGX,1", b"$"):
             self.assertIsNone(heading_in(line))
 
     def test_refuses_what_tells_nothing(self) -> None:
-        """Noise, wrong checksums, empty fields, and degrees that cannot be are no headings."""
+        """Noise, wrong checksums, empty fields and angles out of range are refused."""
         for line in (
             *(b"", b"HCHDM,1,M", b"$HCHDM,\xb0,M", b"$HCHDM,1,M,%s" % (b"x" * 120)),
             *(b"$GPHDT,274.07,T*04", b"$GPHDT,274.07,T*", b"$GPHDT,274.07,T*031", b"$GPHDT,274.07,T*0\xff"),
@@ -54,14 +54,14 @@ class HeadingTests(SynchronousTestCase):
             self.assertRaises(BadFrame, heading_in, line)
 
     def test_writes_what_it_reads(self) -> None:
-        """A sentence that is written here is read here."""
+        """The encoder produces the same sentences as real compasses."""
         self.assertEqual(sentence("HCHDG", "98.3", "0.0", "E", *eastward(-12.6)), b"$HCHDG,98.3,0.0,E,12.6,W*57\r\n")
         self.assertEqual(sentence("GPHDT", "274.07", "T"), b"$GPHDT,274.07,T*03\r\n")
 
 
 class SentenceReaderTests(SynchronousTestCase):
     def test_reads_however_it_is_cut(self) -> None:
-        """Headings come out whole or in bytes; the end of a sentence heard first is no fault, noise is counted."""
+        """Headings are read for each division of the bytes; a partial first sentence is no error, noise is counted."""
         stream = (
             *(b"01.1,M*00\r\n", sentence("HCHDM", "10.0", "M"), b"\r\n", sentence("GPVTG", "45.0", "T")),
             *(sentence("HCHDM", "20.0", "M").strip() + b"\n", b"$HCHDM,3.0,M\r\n", b"$HCHDM,40.0,M*00\r"),
@@ -73,17 +73,17 @@ class SentenceReaderTests(SynchronousTestCase):
             for place in range(0, len(data), size):
                 found += reader.read(data[place : place + size])
             self.assertEqual([heading.degrees for heading in found], [10.0, 20.0, 50.0])
-            # One without its checksum, as the others have theirs, and one with a wrong checksum.
+            # One sentence without its checksum after others with theirs, and one with a wrong checksum.
             self.assertEqual((reader.bad_frames, reader.sentences), (2, 4))
 
     def test_takes_sentences_without_checksums(self) -> None:
-        """A compass that never sends checksums is believed."""
+        """Sentences of a compass that never sends checksums are accepted."""
         reader = SentenceReader()
         self.assertEqual(len(reader.read(b"$HCHDM,10.0,M\n$HCHDM,11.0,M\n")), 2)
         self.assertEqual(reader.bad_frames, 0)
 
     def test_keeps_no_endless_line(self) -> None:
-        """Bytes without an end are thrown away and counted, and what comes behind them is heard."""
+        """A line above the maximum length is dropped and counted, and the next one is read."""
         reader = SentenceReader()
         for _ in range(10):
             self.assertEqual(reader.read(bytes(100)), [])
@@ -93,7 +93,7 @@ class SentenceReaderTests(SynchronousTestCase):
     @settings(max_examples=200)
     @given(st.lists(st.binary(max_size=30) | st.sampled_from([b"$HCHDG,", b"\r\n", b"1.0,E", b"*57", b"$HEHDT,1,T"])))
     def test_any_bytes(self, pieces: list[bytes]) -> None:
-        """Whatever comes, headings are angles of the circle, and the same whether they come whole or in bytes."""
+        """Random bytes give valid headings only, and the same ones byte by byte as at once."""
         data = b"".join(pieces)
         whole, cut = SentenceReader(), SentenceReader()
         found = whole.read(data)

@@ -1,4 +1,4 @@
-"""Tests of ``drivers.compass`` against ``sim.robots.emulator.compass``, joined through memory."""
+"""Tests of ``drivers.compass`` against ``sim.robots.emulator.compass``, connected in memory."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from tests.drivers.contract import KeptLink, KeptLog, RobotCase
 
 
 class CompassDriverTests(Conformance, RobotCase):
-    """A compass keeps the contract of what senses, and what is its own."""
+    """The compass driver passes the conformance tests for sensors and further tests of its functions."""
 
     kind = "compass"
     options = {"rate": 20, "host": "10.0.0.8"}
 
     def build(self) -> None:
-        """A compass that looks along the x axis."""
+        """Create a compass that points along the x axis."""
         self.body.values = {HEADING: 0.0}
         self.compass = self.robot = NmeaCompass(self.clock, self.body, 20.0)
         self.compass.start()
@@ -31,22 +31,22 @@ class CompassDriverTests(Conformance, RobotCase):
         self.connector = MemoryConnector(self.clock, self.compass.accept)
 
     def heading(self, driver: Driver) -> float:
-        """Degrees of what the newest observation says."""
+        """Return the newest heading in degrees."""
         return math.degrees(self.value(driver, HEADING))
 
     def test_turns_as_the_yard_does(self) -> None:
-        """The heading is the body's own, counter-clockwise from the x axis: as a dog of the yard tells it."""
+        """The heading equals a simulated dog's: counter-clockwise from the x axis."""
         driver = self.make_driver()
         driver.connect()
         for degrees in (0.0, 45.0, 90.0, 179.9, -179.9, -90.0, -0.04):
-            # What a dog of the yard calls its heading is what its compass tells (sim.robots.sensor).
+            # The heading of a simulated dog is the value of its compass (sim.robots.sensor).
             dog = Dog(Kennel("dog1", 0.0, 0.0, math.radians(degrees), 1), 1)
             self.body.values[HEADING] = dog.heading
             self.pass_time(0.2)
             self.assertTrue(abs(math.remainder(self.heading(driver) - degrees, 360.0)) < 0.06, degrees)
 
     def test_counts_from_the_yards_axis(self) -> None:
-        """Degrees clockwise from north become radians from the x axis, which lies east unless it is said."""
+        """Degrees clockwise from north become radians from the x axis, which by default points east."""
         north = self.make_driver()
         turned = self.make_driver(mounted_deg=30)
         other = self.make_driver(x_axis_deg=0)
@@ -58,7 +58,7 @@ class CompassDriverTests(Conformance, RobotCase):
             self.assertAlmostEqual(self.heading(driver), degrees, 6)
 
     def test_allows_for_the_place(self) -> None:
-        """Deviation and variation are allowed for where they are told; else the variation of the options is."""
+        """Deviation and variation in a sentence are applied; without them, the variation in the options is."""
         self.compass.deviation, self.compass.variation = 3.0, -12.0
         self.body.values[HEADING] = math.radians(20.0)
         for kinds, options in (
@@ -73,7 +73,7 @@ class CompassDriverTests(Conformance, RobotCase):
             self.assertAlmostEqual(self.heading(driver), 20.0, 6)
 
     def test_believes_the_best_sentence(self) -> None:
-        """Of a compass that sends several sentences the best is believed; when it ceases, the next best."""
+        """If a compass sends several sentence types, the most accurate one is used; if it stops, the next one is."""
         self.compass.variation = 10.0
         self.compass.kinds = ("HDM", "HDT")
         driver, seen = self.make_driver(), set[float]()
@@ -89,7 +89,7 @@ class CompassDriverTests(Conformance, RobotCase):
         self.assertEqual((driver.state, seen), ("ready", {0, 10}))
 
     def test_names_why_there_is_no_heading(self) -> None:
-        """No answer, silence, noise and other sentences are each named once; what was heard again is forgotten."""
+        """Refusal, silence, noise and other sentences each set a problem and are logged once; a heading clears it."""
         self.connector.is_open = False
         driver = self.make_driver()
         driver.log = log = KeptLog()
@@ -115,7 +115,7 @@ class CompassDriverTests(Conformance, RobotCase):
         self.assertEqual((driver.problem, len(log.lines), len(set(log.lines))), ("", 4, 4))
 
     def test_hangs_up_on_silence(self) -> None:
-        """A link on which nothing comes any more is closed and opened anew, for the other end may be long gone."""
+        """A link without data is closed and opened again, as the other end may have failed."""
         driver = self.ready()
         silent = self.compass.clients[0]
         self.faults.half_open = True
@@ -126,7 +126,7 @@ class CompassDriverTests(Conformance, RobotCase):
         self.assertEqual((driver.state, driver.diagnostics()["reconnects"]), ("ready", 1.0))
 
     def test_asks_for_the_baud_rate(self) -> None:
-        """On a cable, noise is a matter of the baud rate, and a device that is not open is named."""
+        """On a serial port, noise is reported with the baud rate, and a closed device with its name."""
         self.compass.kinds = ()
         self.options = {"rate": 20, "device": "/dev/ttyUSB1", "baud": 9600}
         driver = self.make_driver()
@@ -145,7 +145,7 @@ class CompassDriverTests(Conformance, RobotCase):
         self.failureResultOf(connected, LinkLost)
 
     def test_drops_what_is_spoilt(self) -> None:
-        """No spoilt sentence becomes a heading, however the bytes are cut, and headings flow on between them."""
+        """An invalid sentence never gives a heading, and the valid ones in between are read."""
         driver, seen = self.make_driver(), set[float]()
         driver.connect()
         self.faults.garbage, self.faults.split, self.faults.drop = 0.3, True, 0.1
@@ -157,7 +157,7 @@ class CompassDriverTests(Conformance, RobotCase):
         self.assertTrue(counts["bad_frames"] > 200 and counts["frames"] > 600, counts)
 
     def test_serves_whoever_listens(self) -> None:
-        """The emulated compass tells all its clients, but one that does not listen; what they say it does not hear."""
+        """The emulated compass sends to each client, except one with a full buffer, and ignores received data."""
         slow, quick = KeptLink(), KeptLink()
         one, _ = self.compass.accept(slow), self.compass.accept(quick)
         one.received(b"$PXYZ,1\r\n")

@@ -1,4 +1,4 @@
-"""The conformance kit sees what does not conform: for each rule a driver that breaks this very rule."""
+"""Tests of the conformance tests: each rule detects a driver that violates it."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from drivers.base import BaseDriver
 
     class Rover(BaseDriver):
-        """What the examples have of it."""
+        """The attributes that the type checker needs."""
 
         _line: Any
         _newest: Any
@@ -41,7 +41,7 @@ else:
 
 
 class Shy(Rover):
-    """Describes itself once it is connected."""
+    """Changes its description when it is connected."""
 
     @property
     def description(self) -> Description:
@@ -49,7 +49,7 @@ class Shy(Rover):
 
 
 class Boundless(Rover):
-    """Has a limit on one side."""
+    """Has an infinite limit."""
 
     @property
     def description(self) -> Description:
@@ -57,7 +57,7 @@ class Boundless(Rover):
 
 
 class Hasty(Rover):
-    """Counts as connected as soon as there is a link."""
+    """Is connected when its link opens."""
 
     def link_up(self, link: Any) -> None:
         super().link_up(link)
@@ -67,7 +67,7 @@ class Hasty(Rover):
 
 
 class Eager(Rover):
-    """Moves with its motors off."""
+    """Moves while its motors are disabled."""
 
     def act(self, action: Action, permit: Permit) -> Action:
         try:
@@ -77,7 +77,7 @@ class Eager(Rover):
 
 
 class Restless(Rover):
-    """Goes on moving when it is disabled."""
+    """Moves on when it is disabled."""
 
     def disable(self) -> Deferred[bool]:
         self._wants_motors = False
@@ -85,7 +85,7 @@ class Restless(Rover):
 
 
 class Boastful(Rover):
-    """Says that it does what it was asked for, not what it does."""
+    """Returns the requested instead of the executed action."""
 
     def act(self, action: Action, permit: Permit) -> Action:
         super().act(action, permit)
@@ -93,14 +93,14 @@ class Boastful(Rover):
 
 
 class Forgetful(Rover):
-    """Takes what an action leaves out for zero."""
+    """Sets missing values of an action to zero."""
 
     def act(self, action: Action, permit: Permit) -> Action:
         return dict(super().act({**dict.fromkeys(self.description.limits, 0.0), **action}, permit))
 
 
 class Nostalgic(Rover):
-    """Remembers a motion beyond its stop."""
+    """Keeps its motion after a stop."""
 
     def _rest(self) -> None:
         self._end.cancel()
@@ -112,7 +112,7 @@ class Nostalgic(Rover):
 
 
 class Credulous(Rover):
-    """Takes any number, and passes over what it does not know."""
+    """Accepts invalid numbers and ignores unknown keys."""
 
     def act(self, action: Action, permit: Permit) -> Action:
         known = {key: value for key, value in action.items() if key in self._motion and value is not None}
@@ -129,7 +129,7 @@ class Endless(Rover):
 
 
 class Abrupt(Rover):
-    """Keeps the deadline of the first command though a later one renews it."""
+    """Keeps the deadline of the first command although a later one extends it."""
 
     def act(self, action: Action, permit: Permit) -> Action:
         self._first = getattr(self, "_first", None) or permit.deadline
@@ -137,7 +137,7 @@ class Abrupt(Rover):
 
 
 class Lawless(Rover):
-    """Obeys any token."""
+    """Accepts any token."""
 
     def act(self, action: Action, permit: Permit) -> Action:
         self._gate._token = None
@@ -153,7 +153,7 @@ class Amnesic(Rover):
 
 
 class Stubborn(Rover):
-    """Refuses to stop what does not move."""
+    """Refuses to stop a robot at rest."""
 
     def stop(self) -> Action:
         if self.state != "ready":
@@ -162,7 +162,7 @@ class Stubborn(Rover):
 
 
 class Deaf(Rover):
-    """Says that it stopped, and goes on."""
+    """Reports a stop and moves on."""
 
     def stop(self) -> Action:
         self._rest()
@@ -170,7 +170,7 @@ class Deaf(Rover):
 
 
 class Undying(Rover):
-    """Can be connected again after it was disconnected."""
+    """Connects again after it was disconnected."""
 
     def connect(self) -> Deferred[Description]:
         self._is_closed = self._is_open = False
@@ -179,7 +179,7 @@ class Undying(Rover):
 
 
 class Clumsy(Rover):
-    """Cannot be disconnected twice."""
+    """Fails if it is disconnected twice."""
 
     def disconnect(self) -> Deferred[None]:
         if self._is_closed:
@@ -189,7 +189,7 @@ class Clumsy(Rover):
 
 
 class Haunting(Rover):
-    """Leaves a timer behind."""
+    """Leaves a delayed call."""
 
     def _open(self) -> None:
         super()._open()
@@ -197,7 +197,7 @@ class Haunting(Rover):
 
 
 class Faithless(Rover):
-    """Does not come back after a lost link."""
+    """Does not reconnect after a lost link."""
 
     def link_down(self) -> None:
         super().link_down()
@@ -205,7 +205,7 @@ class Faithless(Rover):
 
 
 class Rash(Rover):
-    """Takes up its motion again when the link is back."""
+    """Resumes its motion after a reconnect."""
 
     def link_up(self, link: Any) -> None:
         super().link_up(link)
@@ -214,7 +214,7 @@ class Rash(Rover):
 
 
 class Unmoved(Rover):
-    """Takes itself for ready though the link is gone."""
+    """Reports ready after its link is lost."""
 
     def link_down(self) -> None:
         self._is_up = True
@@ -222,14 +222,14 @@ class Unmoved(Rover):
 
 
 class Backward(Rover):
-    """Lets the robot's clock run backwards."""
+    """Reports a robot time that decreases."""
 
     def _observed(self, values: Mapping[str, Value], t_robot: float, *rest: Any) -> None:
         super()._observed(values, -t_robot, *rest)
 
 
 class Prophetic(Rover):
-    """Observes what is to come."""
+    """Reports observations with a future time."""
 
     def _observed(self, values: Mapping[str, Value], t_robot: float, *rest: Any) -> None:
         super()._observed(values, t_robot, *rest)
@@ -237,14 +237,14 @@ class Prophetic(Rover):
 
 
 class Infinite(Rover):
-    """Tells of an infinite range where it sees nothing."""
+    """Reports an infinite range instead of NaN."""
 
     def _observed(self, values: Mapping[str, Value], t_robot: float, *rest: Any) -> None:
         super()._observed({**values, "range.front": math.inf}, t_robot, *rest)
 
 
 class Clinging(Rover):
-    """Goes on telling who has left."""
+    """Keeps a subscriber that has unsubscribed."""
 
     def subscribe(self, seen: Callable[[Observation], None]) -> Callable[[], None]:
         super().subscribe(seen)
@@ -252,7 +252,7 @@ class Clinging(Rover):
 
 
 class Frail(Subscribers[Observation]):
-    """Tells nobody any more once one subscriber has raised."""
+    """Drops all subscribers if one raises an exception."""
 
     def tell(self, newest: Observation) -> None:
         try:
@@ -271,35 +271,35 @@ class Fragile(Rover):
 
 
 class Silent(Rover):
-    """Counts nothing of what it refuses, under no name that others know."""
+    """Reports no counter of refused commands, and one unknown counter."""
 
     def diagnostics(self) -> dict[str, float]:
         return {"frames": 1.0, "age": super().diagnostics()["age"]}
 
 
 class Ageless(Rover):
-    """Is always young."""
+    """Reports an age of zero."""
 
     def diagnostics(self) -> dict[str, float]:
         return {**super().diagnostics(), "age": 0.0}
 
 
 class Obliging(Rover):
-    """Does any skill."""
+    """Accepts any skill."""
 
     def invoke(self, name: str, **arguments: float | str) -> Deferred[Mapping[str, Value]]:
         return succeed({})
 
 
 class Rude(Rover):
-    """Raises where a Deferred should fail."""
+    """Raises an exception instead of a failing Deferred."""
 
     def invoke(self, name: str, **arguments: float | str) -> Deferred[Mapping[str, Value]]:
         raise KeyError(name)
 
 
 class Abandoned(Rover):
-    """Does not close its link when its connect is cancelled."""
+    """Does not close its link when ``connect`` is cancelled."""
 
     def _on_cancelled_connecting(self, _connecting: object) -> None:
         self._mark_closed()
@@ -326,7 +326,7 @@ BREACHES: dict[str, list[Any]] = {
 
 
 def bench(driver: Callable[..., Driver]) -> Callable[[], MemoryBench]:
-    """A bench with that driver and an honest robot."""
+    """Return a test rig with this driver and a correct robot."""
     return partial(MemoryBench, driver, EMULATOR, {"host": "rover"})
 
 
@@ -344,29 +344,29 @@ class KitTests(SynchronousTestCase):
         self.flushLoggedErrors(Faulty)
 
     def test_every_rule_sees_its_breach(self) -> None:
-        """A driver that breaks a rule fails the check of this very rule."""
+        """A driver that violates a rule fails the check for this rule."""
         self.assertEqual(set(BREACHES), set(CHECKS))
         found = {each.__name__: broken(bench(each)) for _, each in _pairs()}
         self.assertEqual([(rule, each.__name__) for rule, each in _pairs() if rule not in found[each.__name__]], [])
 
     def test_only_what_is_broken(self) -> None:
-        """A breach of one rule is not told as one of all."""
+        """A driver that violates one rule passes the other checks."""
         for rule, driver in (("clips", Boastful), ("refuses", Credulous), ("leaves", Haunting), ("times", Backward)):
             self.assertEqual(list(broken(bench(driver))), [rule], driver.__name__)
 
     def test_template_conforms(self) -> None:
-        """The robot of one's own to be copied passes as it is, and has fewer than 50 lines of code."""
+        """The example driver passes all checks, and has fewer than 50 lines of code."""
         self.assertEqual(broken(bench(Rover)), {})
         lines = (FOLDER / "robot.py").read_text(encoding="utf-8").splitlines()
         self.assertLess(len([line for line in lines if line.strip()]), 50)
 
     def test_document_names_every_rule(self) -> None:
-        """The table of rules in the document is the suite's, in its order."""
+        """The table of rules in the documentation lists the checks in order."""
         text = (FOLDER.parents[1] / "docs" / "how-to" / "write-a-driver.md").read_text(encoding="utf-8")
         table = text.partition("| rule | ")[2].partition("\n\n")[0]
         self.assertEqual(re.findall(r"^\| (\w+) \|", table, re.MULTILINE), list(CHECKS))
 
     def test_tells_what_is_wrong(self) -> None:
-        """A breach says what was asked and what came; a driver that raises breaks the rule by its error."""
+        """A violation names the expected and the actual behaviour; an exception is a violation with its name."""
         self.assertIn("after its deadline the robot moves at 0.15", broken(bench(Endless))["deadline"])
         self.assertIn("KeyError", broken(bench(Rude))["invoke"])

@@ -22,13 +22,13 @@ SPECIFIED = bytes((19, 5, 29, 2, 25, 13, 0, 163))
 
 
 def values_of(ids: tuple[int, ...]) -> st.SearchStrategy[dict[str, int]]:
-    """Any values that a robot can mean by these packets."""
+    """Generate valid values for these packets."""
     packets = [PACKETS[one] for one in ids]
     return st.fixed_dictionaries({packet.name: st.integers(packet.low, packet.high) for packet in packets})
 
 
 class CommandTests(SynchronousTestCase):
-    """What is said to the robot."""
+    """Commands to the robot."""
 
     def test_golden_vectors(self) -> None:
         """Each command has the bytes of the Open Interface specification."""
@@ -43,7 +43,7 @@ class CommandTests(SynchronousTestCase):
         self.assertEqual(codec.song(0, [(69, 32)]) + codec.play(0), bytes((140, 0, 1, 69, 32, 141, 0)))
 
     def test_robot_hears_each_command_however_it_is_cut(self) -> None:
-        """A reader fed one byte at a time gives the same commands as one fed all at once."""
+        """A reader that gets one byte at a time reads the same commands as one that gets all at once."""
         said = bytes((128, 131)) + codec.drive(-300, 1000) + codec.song(1, [(60, 8), (62, 8)]) + codec.stream(IDS)
         said += codec.query((100,)) + bytes((142, 7, 139, 1, 2, 3, 255, 173))
         whole = CommandReader()
@@ -56,7 +56,7 @@ class CommandTests(SynchronousTestCase):
         self.assertEqual((whole.unknown, pieces.unknown), (1, 1))
 
     def test_robot_waits_for_missing_data(self) -> None:
-        """A command cut short swallows what follows, as the real robot does; five starts get it out of that."""
+        """An incomplete command takes its data from the next one, as in the real robot; five start bytes end this."""
         reader = CommandReader()
         self.assertEqual(list(reader.read(codec.drive_direct(100, 100)[:1])), [])
         self.assertEqual([one.opcode for one in reader.read(bytes((128,)) * 5)], [145, 128])
@@ -64,24 +64,24 @@ class CommandTests(SynchronousTestCase):
     @given(st.binary(max_size=200))
     @settings(max_examples=200, deadline=None)
     def test_robot_takes_any_bytes(self, data: bytes) -> None:
-        """No bytes make the robot's reader fail, and no byte is lost or taken twice."""
+        """For any bytes the robot's reader raises nothing, and uses each byte at most once."""
         reader = CommandReader()
         heard = sum(1 + len(one.data) for one in reader.read(data))
         self.assertLessEqual(heard + reader.unknown, len(data))
 
 
 class StreamTests(SynchronousTestCase):
-    """What the robot says."""
+    """Frames from the robot."""
 
     def test_golden_frame_of_the_specification(self) -> None:
-        """The specification's own frame reads as 2 * 256 + 25 = 537 and is written byte for byte."""
+        """The example frame of the specification decodes to 2 * 256 + 25 = 537 and encodes to the same bytes."""
         reader = StreamReader((29, 13))
         self.assertEqual(list(reader.read(SPECIFIED)), [{"cliff_front_left_signal": 537, "virtual_wall": 0}])
         self.assertEqual(stream_frame((29, 13), {"cliff_front_left_signal": 537}), SPECIFIED)
         self.assertEqual((reader.frames, reader.bad_frames), (1, 0))
 
     def test_sizes_of_packets_and_groups(self) -> None:
-        """Groups have the lengths that the specification tells, so every packet has the right size at its place."""
+        """Groups have the lengths in the specification, so each packet has its size and offset."""
         sizes = {0: 26, 1: 10, 2: 6, 3: 10, 4: 14, 5: 12, 6: 52, 100: 80, 101: 28, 106: 12, 107: 9}
         self.assertEqual({one: len(packed(one, {})) for one in GROUPS}, sizes)
         offsets = {7: 0, 17: 10, 19: 12, 22: 17, 27: 26, 34: 39, 35: 40, 43: 52, 46: 57, 52: 69, 58: 79}
@@ -91,7 +91,7 @@ class StreamTests(SynchronousTestCase):
     @given(values_of(IDS), st.integers(1, 90))
     @settings(max_examples=100, deadline=None)
     def test_reads_what_is_written(self, values: dict[str, int], size: int) -> None:
-        """Any frame comes back as it was, also in pieces, and where a 19 stands within it."""
+        """Each frame survives encoding and decoding, also in pieces and with a byte 19 in its data."""
         data = stream_frame(IDS, values) * 2
         reader = StreamReader(IDS)
         got = [frame for at in range(0, len(data), size) for frame in reader.read(data[at : at + size])]
@@ -99,7 +99,7 @@ class StreamTests(SynchronousTestCase):
         self.assertEqual(reader.bad_frames, 0)
 
     def test_fed_one_byte_at_a_time_with_heads_within(self) -> None:
-        """Frames whose data is full of the head's bytes are found one byte at a time, begun in their middle."""
+        """Frames with header bytes in their data are found byte by byte from the middle of a frame."""
         values = {"left_encoder": 19 * 256 + 78, "right_encoder": 19 * 256 + 78, "charge": 19 * 256 + 78}
         data = stream_frame(IDS, values)
         reader = StreamReader(IDS)
@@ -109,7 +109,7 @@ class StreamTests(SynchronousTestCase):
         self.assertEqual(reader.bad_frames, 1)
 
     def test_counts_and_skips_what_is_no_frame(self) -> None:
-        """A spoilt byte costs one frame, text of a reboot none; frames after it are read."""
+        """An invalid byte costs one frame, the text of a reboot none; the following frames are read."""
         data = stream_frame((29, 13), {"virtual_wall": 1})
         reader = StreamReader((29, 13))
         spoilt = data[:3] + bytes((data[3] ^ 8,)) + data[4:]
@@ -119,13 +119,13 @@ class StreamTests(SynchronousTestCase):
         self.assertEqual((reader.frames, reader.bad_frames), (3, 2))
 
     def test_refuses_other_packets_with_a_right_checksum(self) -> None:
-        """A frame as long as expected, and whole, but of other packets, is none."""
+        """A frame of equal length with other packets is refused despite a valid checksum."""
         reader = StreamReader((29, 13))
         self.assertEqual(list(reader.read(stream_frame((28, 13), {}))), [])
         self.assertEqual(reader.bad_frames, 1)
 
     def test_refuses_what_no_robot_can_mean(self) -> None:
-        """A whole frame that tells mode 9, or a battery of 60 V, is dropped and counted."""
+        """A frame with mode 9 or a battery of 60 V is dropped and counted."""
         reader = StreamReader((35, 22))
         for values in ({"mode": 9}, {"voltage": 60_000}):
             self.assertEqual(list(reader.read(stream_frame((35, 22), values))), [])
@@ -135,7 +135,7 @@ class StreamTests(SynchronousTestCase):
     @given(st.lists(st.one_of(st.binary(max_size=40), st.just(SPECIFIED), st.just(SPECIFIED[:5])), max_size=12))
     @settings(max_examples=200, deadline=None)
     def test_takes_any_bytes(self, pieces: list[bytes]) -> None:
-        """No bytes make the reader fail, and two whole frames after them are never both lost."""
+        """For any bytes the reader raises nothing, and reads at least one of two following frames."""
         reader = StreamReader((29, 13))
         for piece in pieces:
             list(reader.read(piece))
@@ -143,13 +143,13 @@ class StreamTests(SynchronousTestCase):
 
 
 class SenseTests(SynchronousTestCase):
-    """What a frame means."""
+    """The meaning of a frame."""
 
     def frame(self, **values: int) -> dict[str, int]:
         return next(StreamReader(IDS).read(stream_frame(IDS, {"capacity": 2000, **values})))
 
     def test_each_bit_has_its_side(self) -> None:
-        """Bits of bumpers, drops, lights and buttons are those of the specification: right before left."""
+        """The bits of bumpers, wheel drops, light and buttons are in the specified order: right before left."""
         felt = seen(self.frame(bumps=0b0101, light_bumper=0b100001, buttons=0b00000100))
         self.assertEqual((felt["bump.right"], felt["bump.left"]), (True, False))
         self.assertEqual((felt["wheeldrop.right"], felt["wheeldrop.left"]), (True, False))
@@ -158,14 +158,14 @@ class SenseTests(SynchronousTestCase):
         self.assertEqual((felt["button.dock"], felt["button.clean"]), (1.0, 0.0))
 
     def test_power_in_si_units(self) -> None:
-        """Volts, amperes (negative: draining), degrees and a level; no level without a capacity."""
+        """Power values are in SI units, a negative current discharges; without a capacity there is no level."""
         felt = seen(self.frame(voltage=14400, current=-250, temperature=-5, charge=500, charging_state=2))
         self.assertEqual((felt["power.volts"], felt["power.amps"], felt["power.celsius"]), (14.4, -0.25, -5.0))
         self.assertEqual((felt["power.level"], felt["power.charging"]), (0.25, True))
         self.assertNotIn("power.level", seen(self.frame(capacity=0)))
 
     def test_names_the_causes_of_a_safety_event(self) -> None:
-        """What made it leave safe mode is named by the keys of the observation."""
+        """The causes of a safety event are named by the keys of the observation."""
         felt = seen(self.frame(bumps=8, cliff_left=1))
         self.assertEqual(event_of(felt), "cliff.left, wheeldrop.left")
         self.assertEqual(event_of(seen(self.frame(charger=2))), "charger")
@@ -173,10 +173,10 @@ class SenseTests(SynchronousTestCase):
 
 
 class OdometryTests(SynchronousTestCase):
-    """Where the wheels say that the robot is."""
+    """The pose from the wheel encoders."""
 
     def test_goes_straight_and_turns(self) -> None:
-        """A metre of counts on both wheels is a metre ahead; opposite counts turn to the left on the spot."""
+        """Equal counts on both wheels move the pose straight ahead; opposite counts turn it left on the spot."""
         where = Odometry()
         metre = round(1000.0 / MM_PER_COUNT)
         for step in range(101):
@@ -191,7 +191,7 @@ class OdometryTests(SynchronousTestCase):
         self.assertGreater(where.wz, 0.4)
 
     def test_counters_wrap(self) -> None:
-        """Over the end of 16 bits, in both directions, is a small step and no jump."""
+        """A counter that wraps, in either direction, gives a small step and no jump."""
         where = Odometry()
         where.count(65530, 65530, 0.0)
         where.count(4, 4, 0.1)
@@ -201,7 +201,7 @@ class OdometryTests(SynchronousTestCase):
         self.assertEqual(where.jumps, 0)
 
     def test_draws_arcs(self) -> None:
-        """A half circle of a metre's radius ends two metres to the left, in few steps as in many."""
+        """A half circle with a radius of one metre ends two metres to the left."""
         where = Odometry()
         for step in range(33):
             left, right = (math.pi * (1.0 + side * 0.1175) * step / 32 / MM_PER_COUNT * 1000.0 for side in (-1, 1))
@@ -211,7 +211,7 @@ class OdometryTests(SynchronousTestCase):
         self.assertAlmostEqual(abs(where.yaw), math.pi, places=2)
 
     def test_jumps_move_nothing(self) -> None:
-        """Counters that leap further than a wheel can roll, as after a reboot, are counted and begun from anew."""
+        """A counter step beyond the wheel's speed, as after a reboot, is counted as a jump and moves nothing."""
         where = Odometry()
         where.count(20_000, 20_000, 0.0)
         where.count(0, 0, 0.015)
@@ -224,7 +224,7 @@ class OptionTests(SynchronousTestCase):
     """Options of the kind."""
 
     def test_every_baud_carries_the_stream(self) -> None:
-        """At each rate that can be chosen a frame, 10 bits a byte, has left before the robot sends the next."""
+        """At each permitted baud rate (10 bits per byte) a frame fits into the stream's interval."""
         size = len(stream_frame(IDS, {}))
         self.assertEqual(size, 81)
         for baud in get_args(Baud):

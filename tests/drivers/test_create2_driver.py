@@ -1,4 +1,4 @@
-"""Tests of ``drivers.create2.driver`` against ``sim.robots.emulator.create2``, joined through memory."""
+"""Tests of ``drivers.create2.driver`` against ``sim.robots.emulator.create2``, connected in memory."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.drivers.contract import RobotCase
 
 
 class Create2Case(RobotCase):
-    """A Create 2 with a cable of memory."""
+    """A Create 2 on a serial port in memory."""
 
     kind = "create2"
     options = {"port": "memory"}
@@ -30,10 +30,10 @@ class Create2Case(RobotCase):
 
 
 class Create2DriverTests(Conformance, Create2Case):
-    """A Create 2 keeps the contract, and what is its own."""
+    """The Create 2 driver passes the conformance tests and further tests of its functions."""
 
     def test_tells_what_it_feels(self) -> None:
-        """Bumpers, ledges, drops, light, battery and mode arrive under the keys of their capabilities."""
+        """Bumpers, cliffs, wheel drops, light, battery and mode arrive under the keys of their capabilities."""
         self.body.values |= {"bump.left": True, "cliff.front_right": True, "power.level": 0.5, "range.near": 0.1}
         driver = self.connected()
         self.assertEqual((self.value(driver, "bump.left"), self.value(driver, "bump.right")), (True, False))
@@ -44,7 +44,7 @@ class Create2DriverTests(Conformance, Create2Case):
         self.assertEqual(self.value(driver, "lightbump.left"), 0.0)
 
     def test_counts_its_way_over_the_end_of_the_counters(self) -> None:
-        """Odometry from the counters follows the body, though they wrap on the way."""
+        """The odometry follows the robot while the encoders wrap."""
         self.robot.left = self.robot.right = 65_500.0
         driver = self.ready()
         driver.act({"base.vx": 0.2, "base.wz": 0.5}, self.permit(seconds=3.0))
@@ -57,7 +57,7 @@ class Create2DriverTests(Conformance, Create2Case):
         self.assertEqual(driver.diagnostics()["jumps"], 0)
 
     def test_slows_both_wheels_where_one_would_be_too_fast(self) -> None:
-        """A curve at top speed keeps its shape: both wheels are slowed, and act says so."""
+        """A curve above the maximum wheel speed keeps its radius: both wheels slow down, and ``act`` shows it."""
         driver = self.ready()
         done = driver.act({"base.vx": 0.5, "base.wz": 2.0}, self.permit())
         self.assertLess(done["base.vx"], 0.4)
@@ -67,7 +67,7 @@ class Create2DriverTests(Conformance, Create2Case):
         self.assertAlmostEqual(self.body.motion[2], done["base.wz"])
 
     def test_stays_off_after_a_safety_event(self) -> None:
-        """A lifted wheel stops it, is named, and leaves the motors off until they are enabled again."""
+        """A lifted wheel stops the robot, is named, and leaves the motors off until ``enable``."""
         driver = self.ready()
         driver.act({"base.vx": 0.2}, self.permit(seconds=5.0))
         self.pass_time(0.2)
@@ -90,7 +90,7 @@ class Create2DriverTests(Conformance, Create2Case):
         driver.act({"base.vx": 0.1}, self.permit())
 
     def test_full_mode_has_no_guards(self) -> None:
-        """In full mode, asked for by an option, a ledge does not stop it."""
+        """In full mode, set by an option, a cliff does not stop the robot."""
         self.body.values["cliff.left"] = True
         driver = self.ready(mode="full")
         self.assertEqual(self.value(driver, "mode"), "full")
@@ -99,7 +99,7 @@ class Create2DriverTests(Conformance, Create2Case):
         self.assertGreater(self.true_speed(), 0.05)
 
     def test_says_when_it_cannot_be_enabled(self) -> None:
-        """With a wheel in the air the robot does not go to safe mode: enable fails with NoReply."""
+        """With a lifted wheel the robot does not enter safe mode, and ``enable`` fails with NoReply."""
         self.body.values["wheeldrop.right"] = True
         driver = self.connected()
         enabled = driver.enable()
@@ -107,7 +107,7 @@ class Create2DriverTests(Conformance, Create2Case):
         self.failureResultOf(enabled, NoReply)
 
     def test_docks(self) -> None:
-        """The skill dock fires when the robot charges at its base; it is off then, which is no safety event."""
+        """The skill ``dock`` completes when the robot charges; the motors are off then, without a safety event."""
         driver = self.ready()
         docked = driver.invoke("dock")
         self.pass_time(0.5)
@@ -123,7 +123,7 @@ class Create2DriverTests(Conformance, Create2Case):
         self.assertIs(self.value(driver, "power.charging"), True)
 
     def test_docking_can_be_stopped(self) -> None:
-        """Stop ends the search for the dock, and so do cancelling it, a lost link and its own time."""
+        """A stop, a cancellation, a lost link and a timeout each end the search for the dock."""
         driver = self.ready()
         docking = driver.invoke("dock")
         self.pass_time(0.2)
@@ -150,7 +150,7 @@ class Create2DriverTests(Conformance, Create2Case):
         self.assertLess(self.true_speed(), 0.01)
 
     def test_beeps(self) -> None:
-        """It plays the nearest note and says which; wrong arguments and unknown skills are refused."""
+        """``beep`` plays the nearest note and returns it; invalid arguments and unknown skills are refused."""
         driver = self.make_driver()
         self.failureResultOf(driver.invoke("beep"), LinkLost)
         driver.connect()
@@ -168,7 +168,7 @@ class Create2DriverTests(Conformance, Create2Case):
         self.failureResultOf(driver.invoke("fly"), Unsupported)
 
     def test_starts_a_rebooted_robot_again(self) -> None:
-        """A robot that loses its power while it drives is started again, at rest, and its counters cause no leap."""
+        """After a reboot during a drive the robot is started again, at rest, without a jump of its odometry."""
         driver = self.ready()
         driver.act({"base.vx": 0.2}, self.permit(seconds=9.0))
         self.pass_time(1.0)
@@ -183,7 +183,7 @@ class Create2DriverTests(Conformance, Create2Case):
         driver.act({"base.vx": 0.1}, self.permit())
 
     def test_takes_nothing_from_before_its_start(self) -> None:
-        """What the robot said before it heard the driver again is no safety event: the motors come back on."""
+        """Frames sent before the start command arrives cause no safety event, and the motors are enabled again."""
         self.connector = MemoryConnector(self.clock, self.robot.accept, delay=0.02)
         driver = self.ready()
         self.cut_link()
@@ -191,7 +191,7 @@ class Create2DriverTests(Conformance, Create2Case):
         self.assertEqual((driver.state, self.robot.mode, driver.diagnostics()["safety_events"]), ("ready", 2, 0))
 
     def test_stops_a_robot_that_it_no_longer_hears(self) -> None:
-        """Where the robot hears and says nothing, it is stopped within a second, and the silence has a name."""
+        """A robot that receives but does not send is stopped within a second, and the problem names its silence."""
         driver = self.ready()
         driver.act({"base.vx": 0.2}, self.permit(seconds=9.0))
         self.pass_time(0.2)
@@ -205,7 +205,7 @@ class Create2DriverTests(Conformance, Create2Case):
         self.assertEqual(driver.state, "ready")
 
     def test_names_a_wrong_baud_rate(self) -> None:
-        """Bytes that never are a frame are named as what they are probably caused by."""
+        """Bytes without a valid frame are reported as a probable wrong baud rate."""
         self.faults.garbage = 1.0
         driver = self.make_driver()
         connected = driver.connect()
@@ -218,7 +218,7 @@ class Create2DriverTests(Conformance, Create2Case):
         self.assertGreater(driver.diagnostics()["bad_frames"], 2)
 
     def test_lives_with_a_foul_wire(self) -> None:
-        """With a tenth of the frames lost, a tenth spoilt, all late and cut anyhow, it goes on and counts them."""
+        """With a tenth of the frames lost and a tenth invalid, delayed and split, the driver works and counts them."""
         driver = self.ready()
         self.faults.drop = self.faults.garbage = 0.1
         self.faults.split, self.faults.delay = True, 0.02
@@ -233,7 +233,7 @@ class Create2DriverTests(Conformance, Create2Case):
 
 
 class EmulatorTests(SynchronousTestCase):
-    """What the emulator does that this driver never asks for."""
+    """Functions of the emulator that this driver does not use."""
 
     def setUp(self) -> None:
         self.clock = Clock()
@@ -248,10 +248,10 @@ class EmulatorTests(SynchronousTestCase):
         self.said += data
 
     def link_down(self) -> None:
-        """Nothing."""
+        """Do nothing."""
 
     def tell(self, data: bytes) -> bytes:
-        """What the robot answers within 10 ms."""
+        """Send ``data`` and return the robot's answer within 10 ms."""
         assert self.link is not None
         self.said = b""
         self.link.send(data)
@@ -259,7 +259,7 @@ class EmulatorTests(SynchronousTestCase):
         return self.said
 
     def test_is_off_until_it_is_started(self) -> None:
-        """Before a start it hears nothing; after one it is in passive mode and its wheels do not obey."""
+        """Before a start command the robot ignores all data; after it, it is in passive mode and does not drive."""
         self.assertEqual(self.tell(bytes((142, 35))), b"")
         self.assertEqual(self.tell(bytes((128, 142, 35))), b"\x01")
         self.tell(codec.drive_direct(100, 100))
@@ -269,12 +269,12 @@ class EmulatorTests(SynchronousTestCase):
         self.assertEqual(self.tell(bytes((135, 142, 35))), b"\x01")
 
     def test_answers_groups_and_lists(self) -> None:
-        """Group 100 is 80 bytes, a list comes without ids, unknown packets are left out."""
+        """Group 100 has 80 bytes, a list is answered without ids, and unknown packets are omitted."""
         self.assertEqual(len(self.tell(bytes((128, 142, 100)))), 80)
         self.assertEqual(len(self.tell(codec.query((35, 22, 200, 43)))), 5)
 
     def test_drives_on_arcs(self) -> None:
-        """Straight, spin and arc move the body as the specification says."""
+        """Straight, spin and arc commands move the robot as specified."""
         self.tell(bytes((128, 131)) + codec.drive(200, codec.STRAIGHT))
         self.assertEqual(self.body.motion, (0.2, 0.0, 0.0))
         self.tell(codec.drive(235, 1))
@@ -285,7 +285,7 @@ class EmulatorTests(SynchronousTestCase):
         self.assertTrue(math.isclose(self.body.motion[2], 0.1, abs_tol=0.01))
 
     def test_a_ledge_stops_it_ahead_only(self) -> None:
-        """In safe mode a ledge ends driving ahead, and lets it back off."""
+        """In safe mode a cliff stops forward motion, and permits backward motion."""
         self.body.values["cliff.left"] = True
         self.tell(bytes((128, 131)) + codec.drive_direct(-100, -100))
         self.assertEqual(self.body.motion[0], -0.1)
@@ -293,7 +293,7 @@ class EmulatorTests(SynchronousTestCase):
         self.assertEqual((self.body.motion[0], self.robot.mode), (0.0, 1))
 
     def test_reset_says_its_firmware(self) -> None:
-        """After a reset it says its boot text, is off, and streams no more."""
+        """After a reset the robot sends its boot text, is off, and sends no stream."""
         self.tell(bytes((128,)) + codec.stream((35,)))
         self.clock.pump([0.015] * 4)
         self.assertIn(b"\x13\x02\x23\x01", self.said)

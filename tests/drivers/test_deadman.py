@@ -1,4 +1,4 @@
-"""Tests of the dead man's switch: when it halts a robot, what it hears, and what drivers tell it."""
+"""Tests of the dead man's switch: its halt condition, its protocol, and its use by the drivers."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ from tests.formats.rfc6455 import masked
 
 
 class Way(Open):
-    """A way that leads nowhere and keeps what was said; ``is_answered`` as a server that answers."""
+    """A channel that records halt messages; with ``is_answered``, each one is confirmed."""
 
     def __init__(self, is_answered: bool = False) -> None:
         super().__init__(-1)
@@ -64,17 +64,17 @@ class Way(Open):
 
 
 class WatchTests(SynchronousTestCase):
-    """When a robot is halted."""
+    """The time and the number of halts."""
 
     def setUp(self) -> None:
-        """A robot that is guarded, and may move until 10."""
+        """Guard a robot that may move until 10."""
         self.way = Way()
         self.watch = Watch()
         self.watch.guard(self.way, b"halt")
         self.watch.until(10.0)
 
     def test_halts_when_the_time_is_over(self) -> None:
-        """Not before the grace after the end; then three times, a tenth of a second apart; that is one halt."""
+        """The halt is sent after the deadline plus a grace period, three times at intervals, and counted once."""
         wait = self.watch.wait(9.0)
         self.assertIsNotNone(wait)
         self.assertAlmostEqual(wait or 0.0, 1.0 + GRACE_S)
@@ -90,7 +90,7 @@ class WatchTests(SynchronousTestCase):
         self.assertIsNone(self.watch.wait(20.0))
 
     def test_heeds_newer_words(self) -> None:
-        """A later end moves it, rest ends it, and either ends what is being said again."""
+        """A new deadline replaces the old one, rest removes it, and both end the repetition of a halt."""
         self.watch.until(11.0)
         self.watch.turn(10.5)
         self.assertEqual(self.way.said, [])
@@ -107,7 +107,7 @@ class WatchTests(SynchronousTestCase):
             self.assertEqual(self.way.said, [])
 
     def test_halts_at_once_when_the_node_is_gone(self) -> None:
-        """If a motion is in force, and else not at all."""
+        """The end of the node halts the robot at once if it may move, and otherwise sends nothing."""
         self.watch.end(5.0)
         self.watch.turn(5.001)
         self.assertEqual(self.way.said, [b"halt"])
@@ -117,7 +117,7 @@ class WatchTests(SynchronousTestCase):
         self.assertIsNone(still.wait(5.0))
 
     def test_lets_go_of_what_was_guarded(self) -> None:
-        """A new way closes the old one, and what is in force stays so; without a way nothing is said or counted."""
+        """A new channel closes the old one and keeps the deadline; without a channel nothing is sent or counted."""
         other = Way()
         self.watch.guard(other, b"other")
         self.assertFalse(self.way.is_open)
@@ -131,7 +131,7 @@ class WatchTests(SynchronousTestCase):
         self.assertEqual((self.watch.halts, self.watch.wait(13.0)), (1, None))
 
     def test_asks_a_server_until_it_answers(self) -> None:
-        """What was answered is not asked for again."""
+        """A halt that a server confirmed is not repeated."""
         server = Way(is_answered=True)
         self.watch.guard(server, b"GET")
         for moment in (10.1, 10.3, 10.5):
@@ -140,7 +140,7 @@ class WatchTests(SynchronousTestCase):
 
 
 class Told(Watch):
-    """A watch that keeps what it was told."""
+    """A watch that records its calls."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -161,10 +161,10 @@ class Told(Watch):
 
 
 class EarTests(SynchronousTestCase):
-    """What the process understands."""
+    """The protocol of the process."""
 
     def test_hears_words_cut_anyhow(self) -> None:
-        """Whole, or a byte at a time, each word is heard once, and each descriptor goes with its own word."""
+        """Messages are read for each division of the bytes, and each file descriptor belongs to its message."""
         said = HEAD.pack(GUARD, 0.0, 4) + b"halt" + HEAD.pack(UNTIL, 7.5, 0) + HEAD.pack(REST, 0.0, 0)
         said += HEAD.pack(LEAVE, 0.0, 0) + HEAD.pack(GUARD, 0.0, 0)
         call = b"10.0.0.5\x0080\0GET /x\0y"
@@ -187,7 +187,7 @@ class EarTests(SynchronousTestCase):
 
 
 class OrderedDeadMan(MemoryDeadMan):
-    """A switch whose end takes until ``ended`` fires."""
+    """A switch that ends when ``ended`` fires."""
 
     def close(self) -> Deferred[None]:
         super().close()
@@ -196,7 +196,7 @@ class OrderedDeadMan(MemoryDeadMan):
 
 
 class Puppet(BaseDriver):
-    """A robot of nothing; what it is told goes to the list of its switch, too."""
+    """A fake driver that records its commands in its switch's list, too."""
 
     def __init__(self, clock: Clock, switch: OrderedDeadMan | None) -> None:
         description = Description("puppet", "puppet", {"base2d": {}}, {"base.vx": (-1.0, 1.0)}, 0.1)
@@ -205,7 +205,7 @@ class Puppet(BaseDriver):
         self.link = MemoryLink(clock, 0.0)
 
     def up(self) -> None:
-        """There is a link, and the robot is seen."""
+        """Open the link and send an observation."""
         self._up()
         self._observed({}, 0.0)
 
@@ -232,7 +232,7 @@ class Puppet(BaseDriver):
 
 
 class BaseDriverTests(SynchronousTestCase):
-    """What every driver tells its switch, and in which order."""
+    """The calls of each driver to its switch, and their order."""
 
     def setUp(self) -> None:
         self.clock = Clock()
@@ -242,7 +242,7 @@ class BaseDriverTests(SynchronousTestCase):
         self.driver.up()
 
     def test_tells_before_it_commands(self) -> None:
-        """How long a motion is in force is told before it is commanded; at the end the halt goes with the rest."""
+        """The deadline is set before the motion is commanded; at the end, rest is set with the halt."""
         self.driver.act({"base.vx": 0.1}, Permit(1, 0.2))
         self.assertEqual(self.switch.seconds, 0.2)
         self.clock.advance(0.2)
@@ -250,21 +250,21 @@ class BaseDriverTests(SynchronousTestCase):
         self.assertEqual(self.switch.told, ["guard", "until", "drive", "rest", "halt"])
 
     def test_a_refused_command_arms_nothing(self) -> None:
-        """A command with an old token or a passed deadline is not told."""
+        """A command with an old token or a passed deadline does not set the switch."""
         self.driver.act({"base.vx": 0.1}, Permit(5, 0.2))
         for permit in (Permit(4, 5.0), Permit(6, 0.0)):
             self.assertRaises(StaleCommand, self.driver.act, {"base.vx": 0.1}, permit)
         self.assertEqual((self.switch.seconds, self.switch.told.count("until")), (0.2, 1))
 
     def test_what_is_over_is_over(self) -> None:
-        """A command that comes late, before the timer that ends the one before it, begins from rest."""
+        """A late command, before the timer of the previous motion's end, starts from rest."""
         self.driver.act({"base.vx": 0.1}, Permit(1, 0.2))
-        self.clock.rightNow = 0.22  # time passes, and no timer is called yet
+        self.clock.rightNow = 0.22  # time passes without timer calls
         self.assertEqual(self.driver.act({}, Permit(1, 0.5)), {"base.vx": 0.0})
         self.assertEqual(self.switch.told[3:], ["rest", "halt", "until", "drive"])
 
     def test_follows_the_link(self) -> None:
-        """A lost link is let go, and the next one is guarded."""
+        """The switch releases a lost link and guards the next one."""
         self.driver.down()
         self.assertIsNone(self.switch.word)
         self.driver.up()
@@ -272,7 +272,7 @@ class BaseDriverTests(SynchronousTestCase):
         self.assertEqual(self.switch.told, ["guard", "rest", "leave", "guard"])
 
     def test_ends_with_the_driver(self) -> None:
-        """Whoever disconnects waits for the end of the switch as well."""
+        """``disconnect`` waits for the end of the switch."""
         ended = self.driver.disconnect()
         self.assertTrue(self.switch.is_closed)
         self.assertNoResult(ended)
@@ -280,23 +280,23 @@ class BaseDriverTests(SynchronousTestCase):
         self.assertIsNone(self.successResultOf(ended))
 
     def test_counts_its_halts(self) -> None:
-        """``halts`` is told where there is a switch, and left out where there is none."""
+        """The diagnostics contain ``halts`` only if there is a switch."""
         self.switch.halts = 2
         self.assertEqual(self.driver.diagnostics()["halts"], 2)
         self.assertNotIn("halts", Puppet(self.clock, None).diagnostics())
 
 
 class LastWordTests(RobotCase):
-    """The bytes by which each robot is halted."""
+    """The bytes that halt each kind of robot."""
 
     def build(self) -> None:
         self.switch = MemoryDeadMan()
 
     def tearDown(self) -> None:
-        """The robots go on."""
+        """Skip the check of the base class, as the robots are still running."""
 
     def word(self, driver: BaseDriver, settle: float = 1.0) -> LastWord:
-        """What it is guarded by, once it is connected."""
+        """Return the halt message of a driver after it has connected."""
         connected = driver.connect()
         self.pass_time(settle)
         self.successResultOf(connected)
@@ -304,7 +304,7 @@ class LastWordTests(RobotCase):
         return self.switch.word
 
     def test_aibo(self) -> None:
-        """Forward, strafe and rotate of nothing, to the walk server alone."""
+        """The AIBO gets zero for forward, strafe and rotate, at the walk server only."""
         dog = AiboEmulator(self.clock, self.body, Random(1))
         dog.start()
         driver = AiboDriver({"host": "dog", "camera": False}, "dog", dog.connector(), self.clock, dead_man=self.switch)
@@ -316,14 +316,14 @@ class LastWordTests(RobotCase):
         self.assertEqual(dog.heard, [("f", 0.0), ("s", 0.0), ("r", 0.0)])
 
     def test_create2(self) -> None:
-        """Drive direct, both wheels at 0 (OI specification, opcode 145)."""
+        """The Create 2 gets Drive Direct with both wheels at 0 (OI specification, opcode 145)."""
         robot = Create2(self.body, self.clock, Random(1))
         connector = MemoryConnector(self.clock, robot.accept)
         driver = Create2Driver(checked_create2({"port": "x"}), "robot", connector, self.clock, self.switch)
         self.assertEqual(self.word(driver).halt, bytes((145, 0, 0, 0, 0)))
 
     def test_bittle(self) -> None:
-        """Stand up, with the line feed that ends a skill; over HTTP the request for that."""
+        """The Bittle gets the skill to stand up with its line feed, or the HTTP request for it."""
         robot = Bittle(self.body, self.clock, Random(1))
         connector = MemoryConnector(self.clock, robot.accept)
         driver = BittleDriver(checked_bittle({"port": "x"}), "dog", connector, self.clock, self.switch)
@@ -339,13 +339,13 @@ class LastWordTests(RobotCase):
             self.assertTrue(word.halt.endswith(b"\r\n\r\n"))
 
     def test_rosbridge(self) -> None:
-        """A masked text frame that publishes no velocity, of the type that the base listens to."""
+        """A ROS base gets a masked text frame with zero velocity, of the type to which it subscribes."""
         for kind, is_stamped in (("Twist", False), ("TwistStamped", True)):
             robot = RosbridgeRobot(self.clock, self.body, Random(1), velocity_type=f"geometry_msgs/msg/{kind}")
             self.assertEqual("twist" in self.published(self.word(self.rosbridge(robot))), is_stamped)
 
     def test_rosbridge_that_says_its_type_late(self) -> None:
-        """Where the type is known only later, the switch is told anew."""
+        """If the message type is known only later, the halt message is updated."""
         robot = RosbridgeRobot(self.clock, self.body, Random(1), velocity_type="geometry_msgs/msg/TwistStamped")
         robot.rosapi_s = ASK_S + 1.0
         driver = self.rosbridge(robot)
@@ -372,7 +372,7 @@ class LastWordTests(RobotCase):
         return message
 
     def test_none_in_memory(self) -> None:
-        """A driver over links of memory has no process beside it."""
+        """A driver with links in memory has no switch process."""
         robot = Create2(self.body, self.clock, Random(1))
         connector = MemoryConnector(self.clock, robot.accept)
         driver = driver_for("create2", {"port": "x"}, "robot", self.clock, connector)

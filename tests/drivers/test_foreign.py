@@ -1,4 +1,4 @@
-"""Tests of drivers of other distributions, found by entry points and by their place."""
+"""Tests of drivers from other distributions, found by entry point or by ``module:Class``."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MODULES = ("rover_of_tests", "torn_of_tests", "plain_of_tests")
 
 class ForeignTests(SynchronousTestCase):
     def setUp(self) -> None:
-        """A distribution with a good driver and broken ones on this process's path, as pip would put it there."""
+        """Put a distribution with a working driver and broken ones on this process's path, as pip does."""
         folder = Path(self.mktemp()).resolve()
         (folder / "rovers-1.dist-info").mkdir(parents=True)
         (folder / "rovers-1.dist-info" / "METADATA").write_text("Name: rovers\nVersion: 1\n")
@@ -36,7 +36,7 @@ class ForeignTests(SynchronousTestCase):
         self.addCleanup(lambda: [sys.modules.pop(name, None) for name in MODULES])
 
     def refused(self, kind: str) -> str:
-        """The one line with which a kind is refused."""
+        """Return the one-line error of a refused kind."""
         lines = {
             str(self.assertRaises(UsageError, driver_for, kind, {"host": "x"}, "dog1", Clock())),
             str(self.assertRaises(UsageError, describe, kind, {"host": "x"})),
@@ -48,7 +48,7 @@ class ForeignTests(SynchronousTestCase):
         return line
 
     def test_kinds_of_others_are_known(self) -> None:
-        """An installed entry point is a kind like any other, and is not imported by being known."""
+        """An installed entry point is a kind like the built-in ones, and is imported only on use."""
         self.assertLess({"rover", "torn", "gone", "aibo", "sim"}, set(kinds()))
         self.assertNotIn("rover_of_tests", sys.modules)
         driver = driver_for("rover", {"host": "rover"}, "dog1", Clock())
@@ -61,7 +61,7 @@ class ForeignTests(SynchronousTestCase):
         self.assertEqual(driver.description, describe("rover_of_tests:Rover", {"host": "rover"}))
 
     def test_broken_ones_are_named_and_harm_nothing(self) -> None:
-        """What cannot be imported, called or made is refused in a line that names it; the others are as before."""
+        """A driver that cannot be imported or created is refused with an error that names it; others still work."""
         self.assertIn("RuntimeError: torn in two", self.refused("torn"))
         self.assertIn("no_such_module_of_tests", self.refused("gone"))
         self.assertIn("AttributeError", self.refused("rover_of_tests:Nobody"))
@@ -71,6 +71,6 @@ class ForeignTests(SynchronousTestCase):
         self.assertEqual(describe("rover", {"host": "rover"}).kind, "rover")
 
     def test_built_in_kinds_stay(self) -> None:
-        """An entry point with the name of a built-in kind does not take its place."""
+        """An entry point with the name of a built-in kind does not replace it."""
         self.assertEqual(driver_for("sim", {}, "dog1", Clock()).description.kind, "aibo-ers7")
         self.assertEqual(kinds().count("sim"), 1)

@@ -1,4 +1,4 @@
-"""Tests of ``drivers.joined``: a Create 2 with parts on its back keeps the contract, and what is its own."""
+"""Tests of ``drivers.joined``: a Create 2 with additional sensors as one device."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from tests.drivers.test_create2_driver import Create2Case
 
 
 class Part(BaseDriver):
-    """Something that senses what the test says, and knows one skill."""
+    """A sensor with values set by the test, and one skill."""
 
     def __init__(
         self,
@@ -73,7 +73,7 @@ class Part(BaseDriver):
 
 
 class Lens(Part):
-    """One whose pictures can be asked for."""
+    """A camera with an adjustable frame rate."""
 
     camera_fps = 5.0
 
@@ -82,12 +82,12 @@ class Lens(Part):
 
 
 class JoinedTests(Conformance, Create2Case):
-    """A Create 2 with a camera on its back keeps the contract."""
+    """A Create 2 with a camera passes the conformance tests."""
 
     END_S = 0.2
 
     def build(self) -> None:
-        """A folder of pictures in the place of the camera."""
+        """Use a folder of pictures as the camera."""
         super().build()
         self.folder = Path(self.mktemp())
         self.folder.mkdir()
@@ -95,7 +95,7 @@ class JoinedTests(Conformance, Create2Case):
             (self.folder / f"{mark}.jpg").write_bytes(jpeg(mark))
 
     def make_driver(self, **options: object) -> Driver:
-        """A Create 2 with a camera, as the registry makes it."""
+        """Return a Create 2 with a camera, created by the registry."""
         camera = ("camera", {"source": str(self.folder), "fps": 10})
         driver = driver_for("create2", {"port": "memory"}, "vacuum", self.clock, self.connector, [camera])
         self.drivers.append(driver)
@@ -108,7 +108,7 @@ class JoinedTests(Conformance, Create2Case):
         return driver
 
     def test_shows_what_its_parts_see(self) -> None:
-        """The device has the camera's capability before it connects, and its pictures in the robot's observations."""
+        """The device has the camera's capability before it connects, and its frames in the robot's observations."""
         driver = self.make_driver()
         self.assertIn("camera", driver.description.capabilities)
         self.assertEqual(
@@ -126,7 +126,7 @@ class JoinedTests(Conformance, Create2Case):
         self.assertIn("bump.left", self.newest(driver).values)
 
     def test_rides_with_a_camera_board_and_a_compass(self) -> None:
-        """Robot, camera board and compass are one device; each is lost and comes back alone."""
+        """Robot, network camera and compass are one device; each reconnects separately."""
         self.body.jpeg = jpeg(9)
         self.body.values["compass.heading"] = 0.5
         camera, compass = MjpegCamera(self.clock, self.body), NmeaCompass(self.clock, self.body)
@@ -165,7 +165,7 @@ class JoinedTests(Conformance, Create2Case):
         compass.stop()
 
     def test_leaves_out_what_is_not_ready(self) -> None:
-        """What a part told vanishes when it falls silent, and is there again with its next word; the robot goes on."""
+        """A silent part's values are omitted until its next observation, while the robot stays ready."""
         compass = Part(self.clock)
         driver = self.with_parts(compass)
         driver.connect()
@@ -186,7 +186,7 @@ class JoinedTests(Conformance, Create2Case):
         self.assertNotIn("compass.heading", self.newest(driver).values)
 
     def test_says_why_its_robot_is_not_heard(self) -> None:
-        """What keeps the robot from being heard is told as its own driver tells it."""
+        """A problem of the robot is reported as by its driver alone."""
         main = Create2Driver(checked({"port": "memory"}), "vacuum", self.connector, self.clock)
         driver = joined(main, [Part(self.clock)], "vacuum")
         self.connector.is_open = False
@@ -196,7 +196,7 @@ class JoinedTests(Conformance, Create2Case):
         driver.disconnect()
 
     def test_is_as_fresh_as_its_robot(self) -> None:
-        """Words of a part make no observation, and none of a robot that is silent looks fresh because of them."""
+        """A part's values cause no observation, and do not make a silent robot's look new."""
         compass = Part(self.clock)
         driver, seen = self.with_parts(compass), list[Observation]()
         driver.subscribe(seen.append)
@@ -216,13 +216,13 @@ class JoinedTests(Conformance, Create2Case):
         self.assertGreater(driver.diagnostics()["age"], age + 0.9)
 
     def test_keeps_what_is_the_robots(self) -> None:
-        """A key and a capability that the robot has stay its own; of two parts, the first that is ready tells."""
+        """The robot's keys and capabilities precede a part's; of two equal parts the first that is ready counts."""
         robot, part = Part(self.clock), Part(self.clock)
         alone = joined(robot, [part], "post")
         alone.connect()
         robot.tell(compass_heading=1.0)
         part.tell(compass_heading=9.0, hum_hz=50.0)
-        robot.tell(power_level=1.0)  # and not where north is, this time
+        robot.tell(power_level=1.0)  # without a heading this time
         self.assertEqual(self.newest(alone).values, {"power.level": 1.0, "hum.hz": 50.0})
         first, second, vain = Part(self.clock), Part(self.clock), Part(self.clock, "case", "power")
         driver = self.with_parts(first, second, vain)
@@ -243,7 +243,7 @@ class JoinedTests(Conformance, Create2Case):
         self.assertIn("compass2.frames", driver.diagnostics())
 
     def test_dates_a_picture_by_the_robots_clock(self) -> None:
-        """However the part's clock stands, the picture of an observation is as old as it really is."""
+        """The age of a frame is correct for each offset of the part's clock."""
         lens = Lens(self.clock, "camera")
         driver = self.with_parts(lens)
         driver.connect()
@@ -257,7 +257,7 @@ class JoinedTests(Conformance, Create2Case):
         self.assertEqual(seen.frame.seq, 7)
 
     def test_films_where_somebody_does(self) -> None:
-        """The rate of pictures is asked of whoever has the camera; without a camera nobody can be asked."""
+        """The frame rate is set at the part with a camera; without such a part it cannot be set."""
         lens = Lens(self.clock, "camera")
         driver: object = self.with_parts(Part(self.clock), lens)
         assert isinstance(driver, Filming)
@@ -267,7 +267,7 @@ class JoinedTests(Conformance, Create2Case):
         self.assertNotIsInstance(self.with_parts(Part(self.clock, "camera")), Filming)
 
     def test_asks_who_knows_the_skill(self) -> None:
-        """A skill is had from the robot or from the part that knows it; what nobody knows is named with what is."""
+        """A skill is executed by the robot or the part that has it; an unknown one is refused with the known ones."""
         driver = self.with_parts(Part(self.clock))
         self.assertEqual(driver.description.skills, ("dock", "beep", "hum"))
         self.assertEqual(self.successResultOf(driver.invoke("hum")), {"hummed": True})
@@ -276,7 +276,7 @@ class JoinedTests(Conformance, Create2Case):
         self.assertIn("dock, beep, hum", str(error))
 
     def test_outlives_a_part_that_is_none(self) -> None:
-        """A part that is refused for good is named once, and the robot goes on; one that never came is no news."""
+        """A failing part is logged once and the robot works; a part that never connects is not logged."""
         compass, absent = Part(self.clock), Part(self.clock, "camera")
         driver = self.with_parts(compass, absent)
         driver.log = log = KeptLog()  # type: ignore[assignment]
@@ -291,7 +291,7 @@ class JoinedTests(Conformance, Create2Case):
         self.assertEqual((compass.opened, absent.opened, absent.closed), (1, 1, 1))
 
     def test_leaves_its_parts_with_its_robot(self) -> None:
-        """Where the connection to the robot is given up, the parts are left as well."""
+        """If the connection to the robot fails, the parts are disconnected as well."""
         main, part = Part(self.clock), Part(self.clock)
         driver = joined(main, [part], "post")
         connected = driver.connect()
@@ -300,7 +300,7 @@ class JoinedTests(Conformance, Create2Case):
         self.assertEqual((part.opened, part.closed, driver.state), (1, 1, "closed"))
 
     def test_is_gone_when_all_are(self) -> None:
-        """Disconnect waits for the parts' links as well, also where the robot never came and it is called twice."""
+        """``disconnect`` waits for the parts, also if the robot never connected and on the second call."""
 
         class Slow(Part):
             gone: Deferred[None]
@@ -321,7 +321,7 @@ class JoinedTests(Conformance, Create2Case):
             self.assertIsNone(self.successResultOf(leaving))
 
     def test_refuses_a_second_robot(self) -> None:
-        """What moves is no part, whether it is described or made; what is wrong with a part says with which."""
+        """A robot that moves is refused as a part, and the error of an invalid part contains its number."""
         robot = ("bittle", {"port": "/dev/x"})
         compass = describe("camera", {})
         self.assertIn("part 2", str(self.assertRaises(UsageError, described, compass, [compass, describe(*robot)])))

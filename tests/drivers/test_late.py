@@ -1,7 +1,7 @@
-"""Tests that no driver says a motion again whose deadline has passed, though its timers were late.
+"""Tests that no driver repeats a motion after its deadline, even if its timers are late.
 
-A node that was frozen finds all of its timers overdue, and is called by them in the order in which they were due: what
-repeats a motion comes before what ends it.
+After a pause of the process all timers are overdue, and run in the order of their times: the repetition of a motion
+before its end.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ FROZEN_S = 2.0
 
 @dataclass
 class WatchedBody(MemoryBody):
-    """A body that keeps what it was told."""
+    """A base that records its velocities."""
 
     told: list[tuple[float, float, float]] = field(default_factory=list)
 
@@ -35,14 +35,14 @@ class WatchedBody(MemoryBody):
 
 
 class LateTests(RobotCase):
-    """Each driver whose robot does not look at deadlines itself, frozen for a while after a command."""
+    """Each driver of a robot without deadlines, with a pause of the process after a command."""
 
     def build(self) -> None:
-        """A body that keeps what it was told."""
+        """Create the base that records its velocities."""
         self.body = self.watched = WatchedBody()
 
     def tearDown(self) -> None:
-        """The robots go on."""
+        """Skip the check of the base class, as the robots are still running."""
 
     def enabled(self, kind: str, connector: Any, settle: float = 1.0, **options: object) -> Driver:
         self.kind, self.connector = kind, connector
@@ -50,7 +50,7 @@ class LateTests(RobotCase):
         return driver
 
     def freeze(self, driver: Driver, permitted: float, before: float = 0.0) -> None:
-        """Permit a motion, let time jump beyond its deadline, and see that the robot is told to halt and no more."""
+        """Permit a motion, pause beyond its deadline, and check that the robot gets only zero velocities."""
         driver.act({"base.vx": 0.1}, self.permit(seconds=permitted))
         self.pass_time(before)
         self.watched.told.clear()
@@ -60,7 +60,7 @@ class LateTests(RobotCase):
         self.assertEqual(self.body.motion, (0.0, 0.0, 0.0))
 
     def test_aibo(self) -> None:
-        """The walk that is said every half second is not said again after its deadline."""
+        """The walk that is repeated each half second is not repeated after its deadline."""
         for phase in range(10):
             self.setUp()
             dog = AiboEmulator(self.clock, self.body, Random(1))
@@ -77,13 +77,13 @@ class LateTests(RobotCase):
         self.freeze(self.enabled("rosbridge", connector, host="robot"), 0.5, before=0.12)
 
     def test_create2(self) -> None:
-        """Nothing but the halt leaves after the deadline."""
+        """After the deadline only the halt is sent."""
         robot = Create2(self.body, self.clock, Random(1))
         connector = MemoryConnector(self.clock, robot.accept)
         self.freeze(self.enabled("create2", connector, port="memory"), 0.5, before=0.1)
 
     def test_silence_of_a_frozen_node_is_not_the_robots(self) -> None:
-        """A robot that has spoken all the while is not taken for silent by a node that was frozen and did not hear."""
+        """After a pause of the node, a driver does not treat an active robot as silent."""
         ear = Ear()
         self.addCleanup(ear.close)
         for phase in range(5):
@@ -107,14 +107,14 @@ class LateTests(RobotCase):
         self.assertEqual(ear.heard, [])
 
     def test_bittle_without_an_answer(self) -> None:
-        """A gait that was not answered is not asked for again after its deadline."""
+        """A gait without an answer is not requested again after its deadline."""
         robot = Bittle(self.body, self.clock, Random(1))
         driver = self.enabled("bittle", MemoryConnector(self.clock, robot.accept), port="memory")
         robot.faults.half_open = True
         self.freeze(driver, 1.2, before=0.1)
 
     def test_bittle_over_wifi(self) -> None:
-        """A gait that waits for the request before it, or for its own connection, leaves no more after its deadline."""
+        """A gait that waits for an earlier request or its connection is not sent after its deadline."""
         for board in ("biboard", "nyboard"):
             for phase in range(30):
                 self.setUp()

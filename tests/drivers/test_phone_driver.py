@@ -1,4 +1,4 @@
-"""Tests of ``drivers.phone``: a device that sees, and that whoever holds it moves."""
+"""Tests of ``drivers.phone``: a device with a camera and without motors."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ JPEG = b"\xff\xd8 a picture \xff\xd9"
 
 
 class PhoneDriverTests(Conformance, RobotCase):
-    """A phone keeps the contract of what senses, and what is its own."""
+    """The phone driver passes the conformance tests for sensors and further tests of its functions."""
 
     STEP_S = 0.05
     kind = "phone"
     options = {"orientation": True, "position": True}
 
     def pass_time(self, seconds: float) -> None:
-        """Turn the clock; phones look 20 times a second while time passes."""
+        """Advance the clock; each phone sends 20 frames a second."""
         for _ in range(round(seconds / self.STEP_S)):
             self.clock.advance(self.STEP_S)
             for driver in self.drivers:
                 driver.look(JPEG, 208, 156, {})
 
     def test_says_what_it_has(self) -> None:
-        """Of the capabilities a phone has the camera always, the others where its browser tells them; no motion."""
+        """The capabilities contain the camera, and orientation and position if the browser reports them; no motion."""
         everything = describe("phone", {"orientation": True, "position": True})
         self.assertEqual(sorted(everything.capabilities), ["camera", "orientation", "position"])
         self.assertEqual(everything.limits, {})
@@ -38,7 +38,7 @@ class PhoneDriverTests(Conformance, RobotCase):
         self.assertIsInstance(driver_for("phone", {}, "anna", self.clock), PhoneDriver)
 
     def test_tells_where_it_sees_the_target(self) -> None:
-        """What the page measured is in the observation with its picture; where it saw no target, that is NaN."""
+        """The page's measurements are in the observation with the frame; without a target they are NaN."""
         driver = self.make_driver()
         driver.look(JPEG, 208, 156, {})
         self.assertIsNone(driver.observe(), "nothing is taken before connect")
@@ -54,7 +54,7 @@ class PhoneDriverTests(Conformance, RobotCase):
         self.assertTrue(math.isnan(float(seen.values["target.bearing"])))
 
     def test_goes_stale_and_comes_back(self) -> None:
-        """Half a second without a look is stale; the next look is the phone again, and counts as a reconnection."""
+        """After half a second without a frame the phone is stale; the next frame counts as a reconnect."""
         driver = self.ready()
         self.clock.advance(PhoneDriver.STALE_S + 0.01)
         self.assertEqual(driver.state, "stale")

@@ -1,4 +1,4 @@
-"""Tests of ``drivers.pyro``: a robot as brains of 2011 knew it, over the drivers and emulators of today."""
+"""Tests of ``drivers.pyro``: the robot interface of Pyro brains (2011), over the present drivers and emulators."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ from tests.drivers.contract import RobotCase
 
 
 def encoded(image: Any) -> bytes:
-    """A JPEG that keeps the colours, but for a few steps."""
+    """Return a JPEG with almost exact colours."""
     finest = [cv2.IMWRITE_JPEG_QUALITY, 100, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
     return bytes(cv2.imencode(".jpg", image, finest)[1].tobytes())
 
 
 def picture(left: int, colour: tuple[int, int, int] = (190, 32, 42)) -> bytes:
-    """A grey picture of 104 by 80 with a patch of 16 by 16 in this colour (red, green, blue), ``left`` pixels in."""
+    """Return a grey picture of 104 x 80 with a patch of 16 x 16 in this colour (RGB) at column ``left``."""
     image = np.full((80, 104, 3), 128, np.uint8)
     image[32:48, left : left + 16] = colour[::-1]
     return encoded(image)
 
 
 class _Lab(RobotCase):
-    """A dog that is driven by way of ``pyro``."""
+    """A dog that is driven through ``pyro``."""
 
     STEP_S = 0.004
     kind = "aibo"
@@ -59,14 +59,14 @@ class _Lab(RobotCase):
         self.connector = self.robot.connector()
 
     def moved(self) -> tuple[float, ...]:
-        """The body's motion a moment later, rounded."""
+        """Return the robot's motion after a short time, rounded."""
         self.pass_time(0.06)
         return tuple(round(speed, 3) for speed in self.body.motion)
 
 
 class MotionTests(_Lab):
     def test_shares_become_speeds(self) -> None:
-        """A share is one of the robot's own limit, which differs ahead and back; left is positive."""
+        """A relative speed is scaled by the robot's limit, which differs forward and backward; left is positive."""
         self.pyro.move(0.5, 0.0)
         self.assertEqual(self.moved(), (0.08, 0.0, 0.0))
         self.pyro.move(-0.5, 0.0)
@@ -77,7 +77,7 @@ class MotionTests(_Lab):
         self.assertEqual(self.moved(), (0.0, 0.0, 2.03))
 
     def test_one_axis_leaves_the_others(self) -> None:
-        """``translate``, ``rotate`` and ``strafe`` go on with what the others were told."""
+        """``translate``, ``rotate`` and ``strafe`` keep the speeds of the other axes."""
         self.pyro.translate(0.25)
         self.pyro.rotate(0.5)
         self.pyro.strafe(-0.25)
@@ -87,14 +87,14 @@ class MotionTests(_Lab):
         self.assertEqual(self.moved(), (0.0, 0.0, 0.0))
 
     def test_too_much_is_all_there_is(self) -> None:
-        """A share beyond 1 is 1, and what is no number is refused before anything moves."""
+        """A relative speed above 1 is clipped, and a value that is no number is refused."""
         self.pyro.move(7.0, 0.0)
         self.assertEqual(self.moved(), (0.16, 0.0, 0.0))
         for wrong in (math.nan, math.inf, "fast", True):
             self.assertRaises(UsageError, self.pyro.move, wrong, 0.0)
 
     def test_robot_stops_when_its_brain_falls_silent(self) -> None:
-        """Half a second after the last word the robot stands; whoever updates goes on moving it."""
+        """The robot stops half a second after the last command; ``update`` extends the time."""
         self.pyro.move(0.5, 0.0)
         for _ in range(20):
             self.pass_time(0.1)
@@ -104,14 +104,14 @@ class MotionTests(_Lab):
         self.assertEqual(self.body.motion, (0.0, 0.0, 0.0))
 
     def test_robot_of_a_team_is_not_taken(self) -> None:
-        """A robot that has obeyed a team refuses the lab's commands, and can be stopped all the same."""
+        """A robot that has obeyed a team's token refuses the brain's motions, but not a stop."""
         self.driver.act({"base.vx": 0.1}, self.permit(7, 2.0))
         self.assertRaises(StaleCommand, self.pyro.move, 0.5, 0.0)
         self.pyro.stop()
         self.assertEqual(self.moved(), (0.0, 0.0, 0.0))
 
     def test_pressed_switch_is_no_error_of_the_brain(self) -> None:
-        """A dog whose back is pressed stands, and nothing is raised; it moves when connected again, not by itself."""
+        """A pressed emergency stop halts the dog without an exception; it moves again only after ``connect``."""
         self.pyro.move(0.5, 0.0)
         self.robot.press()
         self.pass_time(0.2)
@@ -130,7 +130,7 @@ class MotionTests(_Lab):
         self.assertEqual(self.moved(), (0.08, 0.0, 0.0))
 
     def test_place_is_counted_from_where_it_was_localized(self) -> None:
-        """``localize`` says where the robot is; from there its odometry goes on, turned with it."""
+        """``localize`` sets the pose, and the odometry continues from it."""
         self.pyro.move(0.0, 0.5)
         self.pass_time(0.3)
         self.pyro.stop()
@@ -147,7 +147,7 @@ class MotionTests(_Lab):
 
 class ThreadTests(_Lab):
     def test_every_call_goes_where_the_driver_lives(self) -> None:
-        """What moves, updates, stops and sounds goes through ``call``; another thread touches no driver."""
+        """Motion, update, stop and sound are executed through ``call``, so that no other thread uses the driver."""
         calls: list[Callable[[], Any]] = []
         robot = PyroRobot(self.driver, self.clock, calls.append)
         robot.move(0.5, 0.0)
@@ -163,13 +163,13 @@ class ThreadTests(_Lab):
 
 class DeviceTests(_Lab):
     def feel(self, **values: Value) -> None:
-        """The body feels this; ``range_near`` stands for ``range.near``."""
+        """Set values of the robot's sensors; ``range_near`` stands for ``range.near``."""
         self.body.values |= {key.replace("_", ".", 1): value for key, value in values.items()}
         self.pass_time(0.1)
         self.pyro.update()
 
     def test_range_sensor_has_values_groups_and_units(self) -> None:
-        """The rangers of a dog are readings in robots' diameters, metres and shares, alone, in groups and by angle."""
+        """The range readings are available in robot diameters, metres and fractions, singly, in groups and by angle."""
         self.feel(range_near=0.3, range_far=0.36)
         far = self.pyro.range
         self.assertEqual([round(v, 3) for v in far.distance("M")], [0.3, 0.36, 1.5])
@@ -181,12 +181,12 @@ class DeviceTests(_Lab):
         self.assertEqual([round(v, 3) for v in far[0].hit if v is not None], [0.42, 0.0, 0.0])
 
     def test_nothing_in_reach_is_as_far_as_it_sees(self) -> None:
-        """A reading without an echo is the farthest that the sensors measure, and never NaN."""
+        """A reading without an echo is the sensor's maximum range, and never NaN."""
         self.feel(range_near=math.nan)
         self.assertEqual(self.pyro.range[0].distance("M"), 1.5)
 
     def test_devices_and_features_in_the_words_of_brains(self) -> None:
-        """What the robot has is named as brains ask for it; what it has not is named in what is raised."""
+        """Devices and features have their Pyro names; the error of a missing one names it."""
         robot = self.pyro
         self.assertEqual(robot.builtinDevices, ["battery", "camera", "ir", "position", "ptz"])
         self.assertEqual(robot.supportedFeatures, ["continuous-movement", "range-sensor", "odometry", "mono-sound"])
@@ -199,7 +199,7 @@ class DeviceTests(_Lab):
         self.assertIs(robot.startDevice("camera0"), robot.camera[0])
 
     def test_device_that_is_removed_tells_nothing_new(self) -> None:
-        """A removed device is not among the devices and keeps what it told; started again it follows the robot."""
+        """A removed device keeps its last values; after ``startDevice`` it is updated again."""
         self.feel(power_level=0.5)
         battery = self.pyro.battery[0]
         self.pyro.removeDevice("battery")
@@ -211,7 +211,7 @@ class DeviceTests(_Lab):
         self.assertAlmostEqual(battery.level, 0.4, 2)
 
     def test_joints_buttons_and_sensors_by_their_old_names(self) -> None:
-        """Names of the old interface find what the dog tells; a wrong one is answered with those there are."""
+        """The old names of joints, buttons and sensors work; a wrong name is refused with the known ones."""
         self.feel(button_chin=1.0, range_near=0.2)
         robot = self.pyro
         self.assertEqual(robot.getButton("chin"), 1.0)
@@ -224,7 +224,7 @@ class DeviceTests(_Lab):
         robot.playSound("bark")
 
     def test_head_turns_in_shares(self) -> None:
-        """Pan to one side and tilt arrive at the dog as radians of its joints, and the pose says where it looks."""
+        """Relative pan and tilt become joint angles of the dog, and ``pose`` returns them."""
         ptz = self.pyro.ptz[0]
         ptz.setPose(0.5, -0.5, 0.0, 0.5)
         self.pass_time(0.3)
@@ -237,7 +237,7 @@ class DeviceTests(_Lab):
         self.assertLess(max(abs(one) for one in ptz.pose), 0.03)
 
     def test_picture_goes_through_the_filters(self) -> None:
-        """A red patch is matched and framed; with no patch the frame is all zeros; bytes that are none are counted."""
+        """A red patch is found with its frame; without one the frame is zero; an invalid picture is counted."""
         camera = self.pyro.camera[0]
         camera.addFilter("match", 190, 32, 42)
         camera.addFilter("blobify", 0, 255, 255, 0, 1, 1, 1)
@@ -257,7 +257,7 @@ class DeviceTests(_Lab):
 
 class FilterTests(SynchronousTestCase):
     def test_function_as_a_filter(self) -> None:
-        """A function may apply filters itself, and sees each picture once; two matches mark both colours."""
+        """A function as a filter may apply other filters, runs once per picture, and two matches mark both colours."""
         camera = Camera(104, 80)
 
         def process(one: Camera) -> Any:
@@ -285,7 +285,7 @@ class Create2Tests(_Lab):
         self.connector = MemoryConnector(self.clock, self.robot.accept)
 
     def test_robot_without_ranger_has_bumpers(self) -> None:
-        """Bumpers count from the left; a range sensor that is not there is named as such, and so is a walk sideways."""
+        """Bumpers are ordered from the left; a missing range sensor and a sideways motion each raise an error."""
         self.assertEqual(self.pyro.builtinDevices, ["battery", "bumper", "position"])
         self.assertEqual((self.pyro.bumper[0].value, self.pyro.stall), ([0.0, 0.0], 0))
         self.body.values["bump.right"] = True
@@ -302,7 +302,7 @@ class Create2Tests(_Lab):
 
 class ScanTests(SynchronousTestCase):
     def test_scan_counts_from_the_left(self) -> None:
-        """The sectors of a scanner are a row from the left round to behind, with the groups that brains ask for."""
+        """The sectors of a scan are ordered from the left clockwise, with the groups of Pyro."""
         names = ("front", "front_left", "left", "back", "right", "front_right")
         values: dict[str, Value] = {f"range.{name}": 0.1 * n for n, name in enumerate(names)}
         scan = ranger_of(describe("rosbridge", {}), values)
@@ -319,7 +319,7 @@ class ScanTests(SynchronousTestCase):
         self.assertRaises(AttributeError, scan.__getitem__, "above")
 
     def test_units(self) -> None:
-        """Each unit is told from metres; a unit or an angle that nobody knows is refused with those there are."""
+        """Each unit is converted from metres; an unknown unit or angle is refused."""
         one = SensorValue(0.5, 2.0, 0, Geometry(0.1, 0.0, 0.0, math.pi / 2, 0.3), 0.125)
         rows = {"ROBOTS": 2.0, "METERS": 0.5, "m": 0.5, "CM": 50.0, "MM": 500.0, "SCALED": 0.25, "RAW": 0.5}
         self.assertEqual({unit: one.distance(unit) for unit in rows}, rows)
@@ -330,7 +330,7 @@ class ScanTests(SynchronousTestCase):
 
 class BrainTests(_Lab):
     def run_for(self, brain: type[Brain], seconds: float) -> tuple[Brain, list[Any]]:
-        """Let a brain of this kind run."""
+        """Run a brain of this class for ``seconds``."""
         made: list[Brain] = []
 
         def init(engine: Engine) -> Brain:
@@ -345,7 +345,7 @@ class BrainTests(_Lab):
         return made[0], ended
 
     def test_brain_steps_ten_times_a_second(self) -> None:
-        """In a second a brain makes ten steps, each after an update; the robot stands when it ends."""
+        """A brain makes ten steps a second, each after an update; at its end the robot stops."""
 
         class Walk(Brain):
             def step(self) -> None:
@@ -356,7 +356,7 @@ class BrainTests(_Lab):
         self.assertEqual((ended, self.moved()), ([None], (0.0, 0.0, 0.0)))
 
     def test_brain_that_raises_stops_its_robot(self) -> None:
-        """An error in a step ends the brain, gives back what it took, stands the robot still, and is told."""
+        """An exception in a step ends the brain, calls ``destroy``, stops the robot, and is reported."""
         given: list[int] = []
 
         class Fall(Brain):
@@ -372,7 +372,7 @@ class BrainTests(_Lab):
         self.assertEqual((str(ended[0].value), given, self.moved()), ("tripped", [1], (0.0, 0.0, 0.0)))
 
     def test_brain_pauses_and_quits(self) -> None:
-        """A paused brain takes no step and its robot stands; one that quits ends by itself."""
+        """A paused brain makes no steps and its robot stands; ``quit`` ends the brain."""
 
         class Nap(Brain):
             def step(self) -> None:

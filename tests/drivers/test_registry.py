@@ -71,10 +71,10 @@ INCOMPLETE: list[tuple[str, dict[str, object], str]] = [
 
 
 class RegistryTests(SynchronousTestCase):
-    """Kind to driver."""
+    """From a kind's name to its driver."""
 
     def test_makes_a_driver(self) -> None:
-        """A driver of each kind is made idle, and is what its description says."""
+        """A new driver of each kind is idle and has the registry's description."""
         connector: Any = object()
         for kind in built_in_kinds():
             options = NEEDED.get(kind, {})
@@ -82,7 +82,7 @@ class RegistryTests(SynchronousTestCase):
             self.assertEqual((driver.state, driver.description), ("idle", describe(kind, options, "dog2")), kind)
 
     def test_every_kind_is_complete(self) -> None:
-        """Each package of a driver is found, is described in one line, and has both functions of the registry."""
+        """Each driver package is found, has a docstring, and has both functions that the registry calls."""
         folder = Path(drivers.__file__).parent
         self.assertEqual(sorted(built_in_kinds()), sorted(file.parent.name for file in folder.glob("*/driver.py")))
         for kind in built_in_kinds():
@@ -92,12 +92,12 @@ class RegistryTests(SynchronousTestCase):
             self.assertTrue(import_module(f"drivers.{kind}").__doc__, kind)
 
     def test_names_the_known_kinds(self) -> None:
-        """An unknown kind is a usage error that lists the kinds there are."""
+        """An unknown kind raises a usage error with the known kinds."""
         for ask in (lambda: driver_for("warp", {}, "dog1", Clock()), lambda: describe("warp", {})):
             self.assertIn("known are " + ", ".join(kinds()), str(self.assertRaises(UsageError, ask)))
 
     def test_names_the_wrong_option(self) -> None:
-        """Each wrong option is refused in one line that names its key and what to write."""
+        """Each invalid option is refused with one line that names its key and a remedy."""
         for kind, key, value in WRONG:
             line = str(self.assertRaises(UsageError, describe, kind, {**NEEDED.get(kind, {}), key: value}))
             self.assertIn(key, line)
@@ -106,13 +106,13 @@ class RegistryTests(SynchronousTestCase):
             self.assertIn(words, str(self.assertRaises(UsageError, describe, kind, options)))
 
     def test_leaves_the_camera_out_of_the_description(self) -> None:
-        """A dog with its camera off does not offer one."""
+        """A dog without its camera has no camera capability."""
         self.assertIn("camera", describe("sim", {}).capabilities)
         self.assertNotIn("camera", describe("sim", {"camera": False}).capabilities)
         self.assertNotIn("camera", describe("sim", {"camera_fps": 0}).capabilities)
 
     def test_imports_no_kind_before_it_is_asked_for(self) -> None:
-        """The registry alone loads no driver, and the sim driver loads no OpenCV, NumPy or physics."""
+        """The registry imports a driver only on use, and the sim driver imports no OpenCV, NumPy or physics."""
         script = (
             "import sys; from twisted.internet.task import Clock\n"
             "import drivers.registry as r; assert 'drivers.sim.driver' not in sys.modules\n"

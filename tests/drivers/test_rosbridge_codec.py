@@ -38,7 +38,7 @@ ANY = st.recursive(
 
 
 def spoilt(message: Any, path: tuple[Any, ...], value: Any) -> Any:
-    """A copy of ``message`` with another value at ``path``."""
+    """Return a copy of ``message`` with another value at ``path``."""
     copy = json.loads(json.dumps(message))
     at = copy
     for step in path[:-1]:
@@ -53,10 +53,10 @@ def paths(message: Any, start: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
 
 
 class SayingTests(SynchronousTestCase):
-    """What is said to rosbridge, byte for byte as its protocol has it."""
+    """Operations sent to rosbridge, byte for byte."""
 
     def test_writes_the_operations_of_the_protocol(self) -> None:
-        """Advertise, publish, subscribe and call_service are written as ROSBRIDGE_PROTOCOL.md shows them."""
+        """Advertise, publish, subscribe and call_service are encoded as in ROSBRIDGE_PROTOCOL.md."""
         vectors = (
             (
                 encoded("advertise", topic="/cmd_vel", type="geometry_msgs/Twist"),
@@ -86,15 +86,15 @@ class SayingTests(SynchronousTestCase):
             self.assertEqual(said, wanted)
 
     def test_never_says_what_is_no_number(self) -> None:
-        """NaN is no JSON: it does not leave this machine."""
+        """NaN, which JSON lacks, raises ValueError."""
         self.assertRaises(ValueError, encoded, "publish", msg=codec.twist(math.nan, 0.0, 0.0))
 
 
 class HearingTests(SynchronousTestCase):
-    """What rosbridge says."""
+    """Operations received from rosbridge."""
 
     def test_reads_the_operations_of_the_protocol(self) -> None:
-        """Publications, answers that succeed and fail, and the status are told apart."""
+        """Publications, service responses of both results, and status messages are decoded."""
         self.assertEqual(decoded(b'{"op":"publish","topic":"/a","msg":{"b":1}}'), Published("/a", {"b": 1}))
         said = b'{"op":"service_response","id":"7","service":"/s","values":{"type":"x"},"result":true}'
         self.assertEqual(decoded(said), Answered("7", {"type": "x"}, True))
@@ -105,7 +105,7 @@ class HearingTests(SynchronousTestCase):
         self.assertEqual(decoded(b'{"op":"status","level":"error","msg":"oh"}'), Status("error", "oh"))
 
     def test_refuses_what_is_no_operation(self) -> None:
-        """Bytes, JSON and operations that make no sense are bad frames, however deep or large they are."""
+        """Invalid bytes, JSON and operations raise BadFrame, for each depth and size."""
         for said in (
             *(b"", b"\xff\xfe", b"{", b"[]", b"3", b"null", b"{}", b'{"op":"png"}', b'{"op":["publish"]}'),
             *(b'{"op":"publish","topic":1,"msg":{}}', b'{"op":"publish","topic":"/a","msg":[]}'),
@@ -115,7 +115,7 @@ class HearingTests(SynchronousTestCase):
 
     @given(st.binary(max_size=60))
     def test_any_bytes(self, data: bytes) -> None:
-        """Whatever arrives is a message or a bad frame, and nothing else is raised."""
+        """Random bytes give a message or BadFrame, and no other exception."""
         try:
             decoded(data)
         except BadFrame:
@@ -123,7 +123,7 @@ class HearingTests(SynchronousTestCase):
 
     @given(ANY)
     def test_any_json(self, said: Any) -> None:
-        """So is any JSON, NaN and Infinity as old rosbridges write them included."""
+        """Random JSON, with the NaN and Infinity of old versions, gives a message or BadFrame."""
         for whole in (said, {"op": "publish", "topic": "/a", "msg": said}, {"op": "service_response", "id": said}):
             try:
                 decoded(json.dumps(whole).encode())
@@ -132,10 +132,10 @@ class HearingTests(SynchronousTestCase):
 
 
 class ReadingTests(SynchronousTestCase):
-    """ROS messages in SI values."""
+    """ROS messages as SI values."""
 
     def test_odometry(self) -> None:
-        """Place, heading from the quaternion, and the speed; slow enough is standing."""
+        """Odometry gives position, heading and velocity; ``base.moving`` is false below a threshold."""
         values = codec.odometry(ODOMETRY)
         self.assertEqual((values["odom.x"], values["odom.y"], values["base.moving"]), (1.0, -2.5, True))
         self.assertAlmostEqual(abs(float(values["odom.yaw"])), math.pi)
@@ -144,7 +144,7 @@ class ReadingTests(SynchronousTestCase):
         self.assertIs(codec.odometry(still)["base.moving"], False)
 
     def test_absurd_odometry(self) -> None:
-        """Null, NaN, infinite, enormous, missing, and an orientation that is no rotation: all of it is dropped."""
+        """Null, NaN, infinite, too large and missing values, and a zero quaternion raise BadFrame."""
         for path in (
             ("pose", "pose", "position", "x"),
             ("pose", "pose", "orientation", "w"),
@@ -157,7 +157,7 @@ class ReadingTests(SynchronousTestCase):
         self.assertRaises(BadFrame, codec.odometry, spoilt(ODOMETRY, ("pose", "pose", "orientation"), zero))
 
     def test_scan(self) -> None:
-        """The nearest echo of each sector; null, 0.0 and beyond the range are none; the scanner may stand turned."""
+        """Each sector gives its nearest echo; null, 0.0 and values out of range are ignored; an offset turns it."""
         values = codec.scan(SCAN, SECTORS)
         self.assertEqual((values["range.right"], values["range.front"]), (1.0, 0.5))
         self.assertTrue(math.isnan(float(values["range.left"])))
@@ -167,7 +167,7 @@ class ReadingTests(SynchronousTestCase):
         self.assertEqual([codec.scan(raw, SECTORS)[f"range.{name}"] for name in ("front", "left")], [0.7, 0.2])
 
     def test_absurd_scan(self) -> None:
-        """A scan without ranges, with too many, with words among them or absurd limits is dropped."""
+        """A scan with missing, too many or invalid ranges, or invalid limits, raises BadFrame."""
         for key, value in (
             *(("ranges", None), ("ranges", []), ("ranges", "0.5"), ("ranges", [0.5, "x"]), ("ranges", [True])),
             *(("ranges", [1.0] * (codec.MOST_READINGS + 1)), ("angle_increment", 0.0), ("angle_min", None)),
@@ -176,7 +176,7 @@ class ReadingTests(SynchronousTestCase):
             self.assertRaises(BadFrame, codec.scan, {**SCAN, key: value}, SECTORS)
 
     def test_imu(self) -> None:
-        """Acceleration always, the attitude unless the message says that it is unknown."""
+        """The acceleration is always given, the attitude unless its covariance marks it as unknown."""
         turn = math.sin(math.pi / 12), math.cos(math.pi / 12)
         said = {
             "linear_acceleration": {"x": 0.1, "y": 0, "z": 9.8},
@@ -190,7 +190,7 @@ class ReadingTests(SynchronousTestCase):
         self.assertRaises(BadFrame, codec.imu, {"linear_acceleration": {"x": 0, "y": 0, "z": 2000}})
 
     def test_battery(self) -> None:
-        """What is known of it; null and NaN are not; a level beyond full is dropped and names the option."""
+        """Known values are given, null and NaN are omitted; a level above full raises BadFrame with the option."""
         said = {"voltage": 11.5, "current": None, "percentage": 0.8, "power_supply_status": 1}
         self.assertEqual(codec.battery(said), {"power.volts": 11.5, "power.level": 0.8, "power.charging": True})
         self.assertEqual(codec.battery({"percentage": 80.0}, 100.0)["power.level"], 0.8)
@@ -201,7 +201,7 @@ class ReadingTests(SynchronousTestCase):
             self.assertRaises(BadFrame, codec.battery, each)
 
     def test_picture(self) -> None:
-        """A whole JPEG out of base64 with its size; anything else is a bad frame that says what it was."""
+        """A complete JPEG is decoded from base64 with its size; other data raises BadFrame with the format."""
         said = {"format": "jpeg", "data": base64.b64encode(JPEG).decode()}
         self.assertEqual(codec.picture(said), (JPEG, 128, 96))
         png = base64.b64encode(b"\x89PNG").decode()
@@ -211,7 +211,7 @@ class ReadingTests(SynchronousTestCase):
             self.assertRaises(BadFrame, codec.picture, {"format": "jpeg", "data": data})
 
     def test_stamp(self) -> None:
-        """ROS 1 and 2 name the parts of a stamp differently; what is none is not taken for one."""
+        """The stamps of ROS 1 and 2 are read; an invalid one gives None."""
         self.assertEqual(codec.stamp(ODOMETRY), 12.5)
         self.assertEqual(codec.stamp({"header": {"stamp": {"secs": 3, "nsecs": 0}}}), 3.0)
         for at in (None, 3, {"sec": 1.5, "nanosec": 0}, {"sec": -1, "nanosec": 0}, {"sec": 1, "nanosec": 10**9}):
@@ -220,7 +220,7 @@ class ReadingTests(SynchronousTestCase):
 
     @given(st.data(), ANY)
     def test_any_field(self, data: st.DataObject, value: Any) -> None:
-        """With any value at any place a message is finite numbers, truths and text, or a bad frame."""
+        """A message with any value in any field gives finite numbers, booleans and strings, or BadFrame."""
         readers = (
             (codec.odometry, ODOMETRY),
             (lambda said: codec.scan(said, SECTORS), SCAN),
@@ -239,7 +239,7 @@ class ReadingTests(SynchronousTestCase):
 
 
 def spoilt_python(message: Any, path: tuple[Any, ...], value: Any) -> Any:
-    """As ``spoilt``, with values that JSON does not have."""
+    """Return a copy like ``spoilt``, also with values that JSON lacks."""
     marked = spoilt(message, path, "\0here")
 
     def put(at: Any) -> Any:

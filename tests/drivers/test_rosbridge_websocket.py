@@ -1,4 +1,4 @@
-"""Tests of ``drivers.rosbridge.websocket``: whom it greets, what it hears, and what it says last."""
+"""Tests of ``drivers.rosbridge.websocket``: the opening handshake and its errors."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tests.formats.rfc6455 import answer_to
 
 class GreetingTests(SynchronousTestCase):
     def test_asks_for_its_path(self) -> None:
-        """The request names path and host, and an emulated rosbridge takes it."""
+        """The request contains path and host, and the emulated rosbridge accepts it."""
         said = WebSocket("server.example.com", "/chat").opening()
         self.assertTrue(said.startswith(b"GET /chat HTTP/1.1\r\nHost: server.example.com\r\n"))
         server = WebSocket()
@@ -19,7 +19,7 @@ class GreetingTests(SynchronousTestCase):
         self.assertTrue(server.is_open)
 
     def test_names_what_answers_instead(self) -> None:
-        """Another server, a proxy that answers anew and endless noise are faults that say what was met."""
+        """Another server, a wrong key and endless headers are faults with the reason."""
         for said, reason in (
             (b"HTTP/1.1 404 Not Found\r\n\r\n", "404"),
             (b"SSH-2.0-OpenSSH_9\r\n\r\n", "SSH-2.0"),
@@ -34,7 +34,7 @@ class GreetingTests(SynchronousTestCase):
             self.assertEqual(one.received(answer), ([], b""))
 
     def test_turns_a_browser_away(self) -> None:
-        """A request without the upgrade, or without a key, gets 400."""
+        """A request without the upgrade or without a key gets status 400."""
         for said in (b"GET / HTTP/1.1\r\nHost: h\r\n\r\n", b"POST / HTTP/1.1\r\nUpgrade: websocket\r\n\r\n"):
             one = WebSocket()
             self.assertTrue(one.received(said)[1].startswith(b"HTTP/1.1 400"))

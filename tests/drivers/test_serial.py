@@ -1,4 +1,4 @@
-"""Tests of ``drivers.serial`` with devices that are only opened in words."""
+"""Tests of ``drivers.serial`` with fake devices."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from drivers.serial import BACKLOG, FLUSH_S, SerialConnector, SerialLine, proble
 
 
 class Device(StringTransport):
-    """A serial port as Twisted's: what is written waits in ``dataBuffer`` until ``flush``."""
+    """A serial port as Twisted's: written data stays in ``dataBuffer`` until ``flush``."""
 
     def __init__(self, link: Protocol) -> None:
         super().__init__()
@@ -40,10 +40,10 @@ class Device(StringTransport):
             self.connectionLost(Failure(OSError("closed")))
 
     def stopReading(self) -> None:  # noqa: N802 (Twisted's)
-        """Nothing."""
+        """Do nothing."""
 
     def stopWriting(self) -> None:  # noqa: N802 (Twisted's)
-        """Nothing."""
+        """Do nothing."""
 
     def connectionLost(self, reason: Failure) -> None:
         self.link.connectionLost(reason)
@@ -62,7 +62,7 @@ class SerialTests(SynchronousTestCase):
         self.downs = 0
 
     def opened(self, link: Protocol, device: str, baud: int, reactor: Any) -> Any:
-        """Open a device, or fail as told."""
+        """Open a device, or raise ``error``."""
         self.asked.append((device, baud, reactor.seconds()))
         if self.error is not None:
             raise self.error
@@ -85,7 +85,7 @@ class SerialTests(SynchronousTestCase):
         return line
 
     def test_carries_bytes_both_ways(self) -> None:
-        """Once open, bytes go both ways, and the link knows when too many wait."""
+        """An open device carries bytes in both directions, and the link is busy when too many are buffered."""
         self.line()
         self.clock.advance(0.0)
         self.assertEqual(self.asked, [("/dev/robot", 115200, 0.0)])
@@ -98,7 +98,7 @@ class SerialTests(SynchronousTestCase):
         self.assertEqual((self.heard, self.devices[0].value()[:5]), ([b"hello"], b"there"))
 
     def test_tries_again_with_back_off_and_names_why(self) -> None:
-        """A device that cannot be opened is asked for less and less often, each reason in one line, until it opens."""
+        """A device that cannot be opened is retried with growing delays; each cause is one line."""
         line = self.line()
         for number, words in (
             (errno.ENOENT, "no such device"),
@@ -120,7 +120,7 @@ class SerialTests(SynchronousTestCase):
         self.assertEqual((line.problem, len(self.links)), ("", 1))
 
     def test_names_errors_without_a_number(self) -> None:
-        """An unknown error is told in its own words; one that wraps the system's is told as that."""
+        """An unknown error is reported with its text, and one caused by a system error with the system's."""
         self.assertIn("strange baud", problem_of(ValueError("strange\nbaud")))
         try:
             try:
@@ -131,7 +131,7 @@ class SerialTests(SynchronousTestCase):
             self.assertIn("no permission", problem_of(error))
 
     def test_opens_again_after_a_pulled_cable(self) -> None:
-        """A lost device is told, and opened again; what is sent meanwhile is lost."""
+        """A lost device is reported and opened again; data sent in between is lost."""
         self.line()
         self.clock.advance(0.0)
         self.devices[0].connectionLost(Failure(OSError("gone")))
@@ -142,7 +142,7 @@ class SerialTests(SynchronousTestCase):
         self.assertEqual((self.downs, len(self.links)), (1, 2))
 
     def test_hangs_up_after_what_was_sent(self) -> None:
-        """Hanging up lets the last bytes leave, closes, and leaves nothing on the clock; twice is one."""
+        """``hang_up`` sends the last bytes, closes, and leaves no delayed call, also if called twice."""
         line = self.line()
         self.clock.advance(0.0)
         self.links[0].send(b"stop")
@@ -156,7 +156,7 @@ class SerialTests(SynchronousTestCase):
         self.assertEqual(self.clock.getDelayedCalls(), [])
 
     def test_hangs_up_on_a_device_that_takes_nothing(self) -> None:
-        """A device that never takes the last bytes is closed after a second, also where it is hung up on twice."""
+        """A device that does not accept the last bytes is closed after a second."""
         line = self.line()
         self.clock.advance(0.0)
         self.links[0].send(b"stop")
@@ -167,7 +167,7 @@ class SerialTests(SynchronousTestCase):
         self.assertEqual(self.clock.getDelayedCalls(), [])
 
     def test_hangs_up_before_it_is_open(self) -> None:
-        """A line that waits for its device can be ended."""
+        """A line that waits for its device can be closed."""
         self.error = OSError(errno.ENOENT, "none")
         line = self.line()
         self.clock.advance(0.0)

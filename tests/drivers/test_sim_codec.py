@@ -49,19 +49,19 @@ MESSAGES: list[Message] = [
 
 
 def payload(*row: object) -> bytes:
-    """A payload that no honest client makes."""
+    """Return a payload with these fields, valid or not."""
     return bytes(msgpack.packb(list(row)))
 
 
 class CodecTests(SynchronousTestCase):
-    """One payload to a message and back."""
+    """From a message to its payload and back."""
 
     def test_gives_back_every_message(self) -> None:
-        """What was encoded is decoded to an equal message, for each kind."""
+        """Each message type survives encoding and decoding."""
         self.assertEqual([decoded(encoded(message)[HEADER:]) for message in MESSAGES], MESSAGES)
 
     def test_refuses_wrong_fields(self) -> None:
-        """Unknown tags, missing, surplus, ill-typed and unbounded fields are all bad frames."""
+        """Unknown tags and missing, surplus, ill-typed or too large fields raise BadFrame."""
         for bad in (
             b"",
             payload(),
@@ -91,7 +91,7 @@ class CodecTests(SynchronousTestCase):
             self.assertRaises(BadFrame, decoded, bad)
 
     def test_is_total(self) -> None:
-        """Any bytes at all are a message or a BadFrame."""
+        """Random bytes give a message or BadFrame."""
 
         @given(st.binary(max_size=200))
         @example(b"\x91" * 5000)
@@ -109,19 +109,19 @@ class CodecTests(SynchronousTestCase):
         check()
 
     def test_refuses_to_send_what_nobody_would_take(self) -> None:
-        """A message above the limit of a frame is the sender's fault."""
+        """Encoding a message above the maximum frame size raises ValueError."""
         self.assertRaises(ValueError, encoded, Picture(1, 1.0, 1, 1, bytes(MAX_PAYLOAD)))
 
 
 class FrameReaderTests(SynchronousTestCase):
-    """A stream of bytes to messages."""
+    """From a stream of bytes to messages."""
 
     def setUp(self) -> None:
         self.stream = b"".join(encoded(message) for message in MESSAGES)
         self.reader = FrameReader()
 
     def test_reads_whole_and_byte_by_byte(self) -> None:
-        """However the bytes are cut, the same messages come out."""
+        """The reader gives the same messages for each division of the bytes."""
         self.assertEqual(list(self.reader.read(self.stream)), MESSAGES)
         pieces = FrameReader()
         read = [message for byte in self.stream for message in pieces.read(bytes([byte]))]
@@ -129,7 +129,7 @@ class FrameReaderTests(SynchronousTestCase):
         self.assertEqual((pieces.frames, pieces.bad_frames), (len(MESSAGES), 0))
 
     def test_drops_noise_and_goes_on(self) -> None:
-        """After bytes that are no frame, the reader finds the next one; it counts what it dropped."""
+        """After invalid bytes the reader finds the next frame, and counts the dropped data."""
         for noise in (
             b"rubbish",
             MARKER + b"\xff\xff\xff\xff",
@@ -139,20 +139,20 @@ class FrameReaderTests(SynchronousTestCase):
         ):
             reader = FrameReader()
             read = list(reader.read(noise + self.stream))
-            # Noise that looks like the start of a frame may swallow the first real ones, never all of them.
+            # Noise that looks like the start of a frame may consume the first real ones, but never all of them.
             self.assertEqual(read, MESSAGES[-len(read) :])
             self.assertGreater(len(read), len(MESSAGES) - 3)
             self.assertGreater(reader.bad_frames, 0)
 
     def test_keeps_little_of_endless_noise(self) -> None:
-        """Noise without end does not fill the memory."""
+        """The buffered size stays limited under endless noise."""
         for _ in range(50):
             self.assertEqual(list(self.reader.read(bytes(10_000))), [])
         self.assertLessEqual(len(self.reader._rest), MAX_PAYLOAD + HEADER)
         self.assertEqual(list(self.reader.read(self.stream)), MESSAGES)
 
     def test_survives_any_stream(self) -> None:
-        """Any bytes, cut anywhere, give messages or nothing, and raise nothing."""
+        """Random bytes in random pieces give messages or nothing, and raise no exception."""
 
         @given(st.lists(st.binary(max_size=60) | st.sampled_from([MARKER, encoded(Halt()), encoded(Alive())[:5]])))
         def check(chunks: list[bytes]) -> None:

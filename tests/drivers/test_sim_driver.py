@@ -1,4 +1,4 @@
-"""Tests of ``drivers.sim.driver`` against the real yard, joined through memory."""
+"""Tests of ``drivers.sim.driver`` against the robot simulator, connected in memory."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from tests.drivers.contract import RobotCase
 
 
 def pump(clock: Clock, seconds: float) -> None:
-    """Let time pass in small steps, so that answers to answers arrive."""
+    """Advance the time in small steps, so that answers to answers arrive."""
     clock.pump([0.004] * round(seconds / 0.004))
 
 
 class SimDriverTests(Conformance, RobotCase):
-    """A dog of the yard keeps the contract, and what is its own."""
+    """The driver of a simulated dog passes the conformance tests and further tests of its functions."""
 
     STEP_S = 0.004
     kind = "sim"
@@ -44,7 +44,7 @@ class SimDriverTests(Conformance, RobotCase):
         return math.hypot(motion.vx, motion.vy)
 
     def test_shows_every_key_with_four_samples(self) -> None:
-        """An observation has the keys of an ERS-7, and the rangers and accelerometers four samples each."""
+        """An observation has the keys of an ERS-7, with four samples for each ranger and accelerometer."""
         seen = self.newest(self.connected())
         self.assertEqual(
             set(seen.values),
@@ -59,7 +59,7 @@ class SimDriverTests(Conformance, RobotCase):
         self.assertLess(abs(float(seen.values["imu.az"]) - 9.8), 0.5)
 
     def test_gets_pictures_at_the_rate_it_asked_for(self) -> None:
-        """Two seconds at 15 pictures a second bring 30 whole JPEGs with growing numbers."""
+        """Two seconds at 15 frames a second give 30 complete JPEGs with consecutive numbers."""
         driver = self.make_driver(camera=True, camera_fps=15)
         seen: set[int] = set()
         driver.subscribe(lambda one: seen.add(one.frame.seq if one.frame else 0))
@@ -73,7 +73,7 @@ class SimDriverTests(Conformance, RobotCase):
         self.assertEqual((frame.width, frame.height), (208, 160))
 
     def test_is_told_that_there_is_no_such_robot(self) -> None:
-        """Connecting to a robot that the yard lacks fails at once, with the names of those that it has."""
+        """Connecting to a robot that the simulator lacks fails at once, with the names of its robots."""
         driver = self.make_driver(robot="dog9")
         connected = driver.connect()
         self.pass_time(0.1)
@@ -81,7 +81,7 @@ class SimDriverTests(Conformance, RobotCase):
         self.assertEqual(driver.state, "closed")
 
     def test_waits_for_a_robot_that_is_taken(self) -> None:
-        """A second driver of dog1 is turned away while the first holds it, and gets it when that one leaves."""
+        """A second driver of dog1 is refused while the first is connected, and connects after the first leaves."""
         first, second = self.make_driver(), self.make_driver()
         first.connect()
         self.pass_time(0.1)
@@ -94,7 +94,7 @@ class SimDriverTests(Conformance, RobotCase):
         self.successResultOf(connected)
 
     def test_is_stale_when_the_yard_falls_silent(self) -> None:
-        """A yard that sends nothing though its link is open makes the driver stale, and act refuses."""
+        """If the simulator sends nothing over an open link, the driver is stale, and ``act`` raises NotEnabled."""
         driver = self.ready()
         assert self.yard._pending is not None
         self.yard._pending.cancel()
@@ -104,7 +104,7 @@ class SimDriverTests(Conformance, RobotCase):
         self.assertRaises(NotEnabled, driver.act, {"base.vx": 0.1}, self.permit())
 
     def test_replays_from_a_seed(self) -> None:
-        """The same seed and the same commands give the same observations and pictures, bit by bit."""
+        """The same seed and commands give identical observations and frames."""
 
         def run() -> list[object]:
             self.setUp()
@@ -124,7 +124,7 @@ class SimDriverTests(Conformance, RobotCase):
 
 
 class MuteRobot:
-    """The far end of a link that shows sensors once and answers nothing."""
+    """A remote end that sends sensor values once and answers nothing."""
 
     def __init__(self, link: Link) -> None:
         self.link = link
@@ -138,14 +138,14 @@ class MuteRobot:
         self.heard += data
 
     def link_down(self) -> None:
-        """Nothing to do."""
+        """Do nothing."""
 
 
 class SimDriverAloneTests(SynchronousTestCase):
-    """The driver against a far end that misbehaves."""
+    """The driver against a faulty remote end."""
 
     def setUp(self) -> None:
-        """A driver, connected to what only talks when told to."""
+        """Connect a driver to a remote end that sends only on request."""
         self.clock = Clock()
         self.robots: list[MuteRobot] = []
         connector = MemoryConnector(self.clock, self.accept)
@@ -158,7 +158,7 @@ class SimDriverAloneTests(SynchronousTestCase):
         return self.robots[-1]
 
     def test_says_that_the_robot_does_not_answer(self) -> None:
-        """Motors that are never switched fail the Deferred of enable with NoReply after a second."""
+        """If the motors are never switched on, ``enable`` fails with NoReply after a second."""
         enabled = self.driver.enable()
         pump(self.clock, 0.9)
         self.assertNoResult(enabled)
@@ -167,7 +167,7 @@ class SimDriverAloneTests(SynchronousTestCase):
         self.assertIn(encoded(Motors(True)), self.robots[0].heard)
 
     def test_answers_every_switch(self) -> None:
-        """A switch that is asked for while another one fails is answered as the last one is."""
+        """A switch that is requested while another one fails gets the result of the last one."""
         again: list[Deferred[bool]] = []
         self.driver.enable().addErrback(lambda _: again.append(self.driver.enable()))
         last = self.driver.disable()
@@ -177,7 +177,7 @@ class SimDriverAloneTests(SynchronousTestCase):
         self.assertEqual(len(again), 1)
 
     def test_lives_on_after_bad_bytes(self) -> None:
-        """Rubbish and messages that only clients send are counted and dropped."""
+        """Invalid bytes, and messages that only clients send, are counted and dropped."""
         self.robots[0].link.send(b"rubbish" + encoded(Motors(True)))
         self.robots[0].tell()
         pump(self.clock, 0.02)
@@ -185,7 +185,7 @@ class SimDriverAloneTests(SynchronousTestCase):
         self.assertEqual(self.driver.state, "ready")
 
     def test_ends_the_motion_on_its_own_side_too(self) -> None:
-        """At the deadline the driver itself sends a halt, once."""
+        """At the deadline the driver sends one halt."""
         self.robots[0].link.send(encoded(Sensors(1.0, {"estop.engaged": False}, {}, 0)))
         pump(self.clock, 0.02)
         self.driver.act({"base.vx": 0.1}, Permit(1, self.clock.seconds() + 0.1))
@@ -195,10 +195,10 @@ class SimDriverAloneTests(SynchronousTestCase):
 
 
 class YardOperatorTests(SynchronousTestCase):
-    """The operator's side of the same wire."""
+    """The operator's client of the same protocol."""
 
     def setUp(self) -> None:
-        """A yard and an operator who has connected."""
+        """Create a simulator and a connected operator."""
         self.clock = Clock()
         self.yard = Yard(self.clock, Random(1), loaded("three-dogs"))
         self.yard.start()
@@ -208,7 +208,7 @@ class YardOperatorTests(SynchronousTestCase):
         pump(self.clock, 0.2)
 
     def test_sees_the_truth(self) -> None:
-        """The snapshot is what the world says, in plain data that JSON can carry."""
+        """The snapshot equals the world's state, in values that JSON can encode."""
         snapshot = self.successResultOf(self.connected)
         self.assertEqual(list(snapshot["walls"]), [3.0, 2.4])
         self.assertEqual([dog["name"] for dog in snapshot["dogs"]], ["dog1", "dog2", "dog3"])
@@ -216,7 +216,7 @@ class YardOperatorTests(SynchronousTestCase):
         json.dumps(self.operator.snapshot)
 
     def test_moves_things(self) -> None:
-        """Target and dogs go where the operator puts them, and the next snapshots show it."""
+        """The operator moves target and dogs, and the next snapshots show it."""
         seen: list[object] = []
         end = self.operator.subscribe(lambda snapshot: seen.append(snapshot["target"]))
         for order in (
@@ -236,7 +236,7 @@ class YardOperatorTests(SynchronousTestCase):
         self.assertIn(snapshot["target"], seen)
 
     def test_is_told_why_not(self) -> None:
-        """What cannot be done fails with the yard's own words."""
+        """An impossible order fails with the simulator's message."""
         for order, words in (
             (self.operator.place_target(9.0, 1.0), "does not fit"),
             (self.operator.move_dog("dog7", 1.0, 1.0, 0.0), "no dog is named"),
@@ -245,7 +245,7 @@ class YardOperatorTests(SynchronousTestCase):
             self.assertIn(words, str(self.failureResultOf(order, UsageError).value))
 
     def test_fails_orders_without_a_link(self) -> None:
-        """Orders fail with LinkLost when the link breaks under them, and before it is there again."""
+        """Orders fail with LinkLost if the link breaks, and until it is open again."""
         on_the_way = self.operator.clear_target()
         self.connector.cut()
         self.failureResultOf(on_the_way, LinkLost)
@@ -255,7 +255,7 @@ class YardOperatorTests(SynchronousTestCase):
         self.assertIsNotNone(self.operator.snapshot)
 
     def test_leaves_nothing_behind(self) -> None:
-        """After disconnect, also twice, no timer of the operator is left."""
+        """After one or two calls of ``disconnect`` no timer is left."""
         self.operator.disconnect()
         self.operator.disconnect()
         self.yard.stop()

@@ -1,11 +1,11 @@
-"""Invariants of the library, checked over random schedules of faults on simulated time.
+"""Invariants of the library, checked over random schedules of faults in virtual time.
 
-``python -m tests.invariants --schedules 2000 --seed 1`` runs that many.  A workload brings its operations and writes
-down what came of them (``schedule.Workload``); ``sim.team.checker`` judges it.  Of each that fails it prints the line
-that replays it, and that of the least which still fails so: the fewest faults (``--keep``), no weather (``--calm``),
-the fewest workloads (``--only``), the shortest time (``--seconds``).
+``python -m tests.invariants --schedules 2000 --seed 1`` runs 2000 schedules.  A workload performs operations and
+records their results (``schedule.Workload``); ``sim.team.checker`` checks them.  For each failed schedule the command
+prints the line that replays it, and the line of its smallest variant that still fails: the fewest faults (``--keep``),
+no weather (``--calm``), the fewest workloads (``--only``), the shortest time (``--seconds``).
 
-``--log FILE --resume`` adds what was run to a logbook, and leaves out what stands there; Ctrl-C ends it after the
-present schedule.  ``--scheduler ADDRESS`` runs on the machines that wait there (the extra ``sweep``).  ``--bugs`` puts
-in one bug after the other: each has to show.
+``--log FILE --resume`` adds the results to a logbook, and skips the seeds in it; Ctrl-C ends the run after the present
+schedule.  ``--scheduler ADDRESS`` runs on the workers of a Dask scheduler (the extra ``sweep``).  ``--bugs`` runs with
+each seeded bug in turn, which the schedules must detect.
 """

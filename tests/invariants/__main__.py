@@ -1,4 +1,4 @@
-"""Runs schedules from the command line; see the package."""
+"""Run schedules from the command line; see the package."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ NAMES = (*WORKLOADS, *ALONE)
 
 
 def main() -> int:
-    """Run what the arguments say; 1 where a schedule failed (or, with bugs, where one of them did not show)."""
+    """Run the command; return 1 if a schedule failed, or with ``--bugs`` if a bug was not detected."""
     parser = argparse.ArgumentParser(prog="python -m tests.invariants", description=__doc__)
     parser.add_argument("--schedules", type=int, help="how many to run (default 200; of each bug at most 400)")
     parser.add_argument("--seed", type=int, default=1, help="the seed of the first; the others follow (default 1)")
@@ -75,7 +75,7 @@ def main() -> int:
 
 
 def numbers(told: str | None) -> tuple[int, ...] | None:
-    """The numbers of faults as they stand behind ``--keep``."""
+    """Return the numbers of faults in ``--keep``."""
     if told in (None, "none"):
         return None if told is None else ()
     named = str(told).split(",")
@@ -85,7 +85,7 @@ def numbers(told: str | None) -> tuple[int, ...] | None:
 
 
 class Session:
-    """One call of the command: runs, prints what failed, and adds to the logbook."""
+    """One call of the command: runs the schedules, prints failures, and writes the logbook."""
 
     def __init__(self, wanted: argparse.Namespace, trim: Trim) -> None:
         self._wanted = wanted
@@ -95,7 +95,7 @@ class Session:
         self._failed = self._ran = 0
 
     def run(self, seeds: range) -> int:
-        """Run every seed; 1 where one failed, or where a bug that was put in did not show."""
+        """Run all seeds; return 1 if one failed, or if none detected the seeded bug."""
         wanted = self._wanted
         signal.signal(signal.SIGINT, self._interrupt)
         if not wanted.log:
@@ -119,12 +119,12 @@ class Session:
                 raise KeyboardInterrupt
 
     def _interrupt(self, *_: object) -> None:
-        """End after the present schedule: within one, a Deferred would take the interrupt for its own failure."""
+        """End after the present schedule: inside one, a Deferred would catch the interrupt as its failure."""
         self._is_interrupted = True
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def _tell(self, outcome: Outcome) -> None:
-        """Print what failed, and the line that repeats the least of it."""
+        """Print the failure, and the line that replays its smallest variant."""
         say(f"FAILED  {line(outcome.seed, self._trim, self._wanted.bug)}")
         say(f"        {outcome.title}")
         for violation in outcome.found[:6]:
@@ -139,7 +139,7 @@ class Session:
         say(f"        {kept} of {whole.faults} faults are left, after {left.runs} runs: {left.outcome.found[0]}")
 
     def _log(self, seeds: range) -> None:
-        """Run stretch by stretch, and add a line for each, also for one that is interrupted."""
+        """Run the seeds in stretches, and log each one, also if it is interrupted."""
         wanted, what = self._wanted, "+".join(self._trim.only)
         text = Path(wanted.log).read_text(encoding="utf-8") if os.path.exists(wanted.log) else ""
         logged = logbook.entries(text, wanted.log)
@@ -165,12 +165,12 @@ class Session:
 
 
 def until_then(moment: float) -> Callable[[], bool]:
-    """Whether that moment is over."""
+    """Return a function that tells whether ``moment`` has passed."""
     return lambda: time.monotonic() > moment
 
 
 def commit_of(tree: Path) -> str:
-    """The commit of the tree, with + behind it where the tree was changed; nothing where it is none of git's."""
+    """Return the commit of the tree, with + if it has changes, or an empty string outside a repository."""
     asked = subprocess.run(
         ["git", "describe", "--always", "--dirty=+", "--exclude=*"], cwd=tree, capture_output=True, text=True
     )
@@ -178,7 +178,7 @@ def commit_of(tree: Path) -> str:
 
 
 def show_bugs(seeds: range, jobs: int, scheduler: str) -> int:
-    """Print of each bug which schedule showed it, how many it took, and what was broken."""
+    """Print for each bug the schedule that detected it, the number of schedules, and the violations."""
     hidden, began = 0, time.monotonic()
     say(f"{'bug':48s} {'workloads':16s} {'seed':>5s}  {'needed':>6s}  shows as")
     for bug, only, number, outcome in hunt_all(seeds, jobs, scheduler):
@@ -193,7 +193,7 @@ def show_bugs(seeds: range, jobs: int, scheduler: str) -> int:
 
 
 def say(text: str) -> None:
-    """Print a line at once."""
+    """Write a line at once."""
     sys.stdout.write(text + "\n")
     sys.stdout.flush()
 

@@ -1,4 +1,4 @@
-"""Seeded bugs: each breaks the library in one place, and some schedule has to show it."""
+"""Seeded bugs: each breaks the library in one place, and a schedule must detect it."""
 
 from __future__ import annotations
 
@@ -215,7 +215,7 @@ async def _decided_by_the_new(self: Council, ballot: Any, members: Any, keep: bo
 
 
 def _row(event: Event, stand: Stand, kind: Kind, state: State = State.OPEN) -> list[tuple[Any, str, Any]]:
-    """The table with another answer in one row."""
+    """Return a change of the table with another answer in one row."""
     return [(acceptor_, "TABLE", {**TABLE, (state, event, stand): (kind, TABLE[state, event, stand][1])})]
 
 
@@ -336,7 +336,7 @@ FINDERS = {name: finders for finders, bugs in _BUGS.items() for name in bugs}
 
 @contextmanager
 def seeded(name: str | None) -> Iterator[None]:
-    """The library with that bug in it (None: as it is)."""
+    """Apply the seeded bug ``name`` to the library, or none."""
     changes = BUGS[name] if name else []
     kept = [(place, attribute, getattr(place, attribute)) for place, attribute, _ in changes]
     for place, attribute, broken in changes:

@@ -1,9 +1,8 @@
-"""Deciders: whatever each agent hears, and in which order, all decide the same, and on what is lawful.
+"""Deciders: agents that receive the same reports decide the same, for each order of the reports.
 
-C1  agents that heard the same reports in any order assign the same one      (E7, S3)
-C2  a report of nonsense is never assigned, and makes no difference          (S4)
-C3  among 300 agents the cheapest is found, as among three
-C4  when bidders stop by the rule that there is for it, no task has two owners
+C1  agents with the same reports in any order assign the same agent            (E7, S3) C2  an invalid report is never
+assigned, and does not change the assignment    (S4) C3  among 300 agents the cheapest is found, as among three C4  if
+bidders stop by the stopping rule, no task has two owners
 """
 
 from __future__ import annotations
@@ -22,14 +21,14 @@ LINE = 12
 
 
 class Deciders(Workload):
-    """Reports of random teams, and bidders on a line, beside the schedule of ``schedule.seed``."""
+    """Reports of random teams, and bidders in a line, in addition to the schedule of ``schedule.seed``."""
 
     def __init__(self, schedule: Schedule) -> None:
         self._dice = random.Random(f"deciders/{schedule.seed}")
         self._found: list[str] = []
 
     def step(self) -> None:
-        """One small team decides."""
+        """Let a small team decide."""
         contacts = [Report(f"agent-{n:03d}", self._dice.choice([1.0, 1.0, 2.0])) for n in range(4)]
         views = [self._dice.sample(contacts, len(contacts)) for _ in contacts]
         assigned = sorted({str(Nearest().find(view).assigned_agent) for view in views})
@@ -41,7 +40,7 @@ class Deciders(Workload):
             self._found.append(f"C2: a cost of {bad.cost} makes {Nearest().find(view).assigned_agent} win")
 
     def settled(self) -> None:
-        """A large team decides once, and a line of bidders talks until it is over."""
+        """Let a large team decide once, and a line of bidders bid until all have stopped."""
         far = [Report(f"agent-{n:03d}", 300.0 - n) for n in range(300)]
         found = Nearest().find(far).assigned_agent
         if found != "agent-299":
@@ -50,12 +49,12 @@ class Deciders(Workload):
         self._found += [f"C4: {' and '.join(o)} own {t}" for t, o in stopped(mission).items() if len(o) > 1]
 
     def verdict(self) -> list[str]:
-        """Every violation so far."""
+        """Return the violations found so far."""
         return self._found
 
 
 def stopped(mission: Mission) -> dict[str, list[str]]:
-    """Who believes to own each task, of bidders on a line of which each stops by itself."""
+    """Return the owners of each task, for bidders in a line that each stop independently."""
     names = mission.alive
     near = {a: [names[m] for m in (n - 1, n + 1) if 0 <= m < len(names)] for n, a in enumerate(names)}
     bidders = {}

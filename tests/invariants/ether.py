@@ -1,7 +1,7 @@
-"""Ether: groups, results and leases of a team in memory, with reports that come late, twice, in any order, or never.
+"""Ether: groups, results and leases of a team in memory, with delayed, repeated, reordered and lost reports.
 
-It stands for everything between whole agents, so that a schedule of them costs milliseconds: presence by leases,
-results kept by a majority, and a council that grants a task's lease to one of those that reach it.
+It replaces the network between complete agents, so that a schedule takes milliseconds: presence by leases, results
+stored by a majority, and a council that grants a task's lease to one of the agents that reach it.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ OPERATOR = 0
 
 @dataclass
 class Weather:
-    """How messages fare: seconds, and shares of those that are lost and doubled."""
+    """The delay of messages in seconds, and their rates of loss and duplication."""
 
     delay: float = 0.02
     loss: float = 0.0
@@ -41,7 +41,7 @@ class Weather:
 
 @dataclass
 class Replica:
-    """What one node has heard; it outlives the node's process."""
+    """The data that one node has received; it survives the node's process."""
 
     tasks: dict[str, Task] = field(default_factory=dict)
     results: dict[str, dict[tuple[int, str, str], Result]] = field(default_factory=dict)
@@ -50,7 +50,7 @@ class Replica:
 
 
 class Ether:
-    """The nodes 0 (the operator's) to ``n``, of which the others have robots."""
+    """The nodes 0 (the operator's) to ``n``; all others have robots."""
 
     def __init__(self, clock: HeapClock, rng: random.Random, n: int) -> None:
         self.clock = clock
@@ -66,18 +66,18 @@ class Ether:
         clock.callLater(REPEAT, self._repeat)
 
     def reaches(self, one: int, other: int) -> bool:
-        """Whether messages between the two may arrive."""
+        """Return whether messages between the two places can arrive."""
         return self.side.get(one, 0) == self.side.get(other, 0)
 
     def send(self, source: int, target: int, deliver: Callable[[], None]) -> None:
-        """Carry one message, in this weather."""
+        """Send a message through the present weather."""
         for _ in range(1 + (self.rng.random() < self.weather.double)):
             lost = self.rng.random() < self.weather.loss or not self.reaches(source, target)
             if not lost:
                 self.clock.callLater(self.weather.delay * self.rng.uniform(0.2, 3.0), deliver)
 
     def everywhere(self, source: int, change: Callable[[int], None]) -> None:
-        """Make a change here at once, and at the others when they hear of it."""
+        """Apply a change at ``source`` at once, and at the others when the message arrives."""
         change(source)
         for target in range(len(self.replicas)):
             if target != source:
@@ -88,7 +88,7 @@ class Ether:
         self.everywhere(OPERATOR, lambda place: self._task(place, task))
 
     def conclude(self, place: int, task_id: str, result: Result) -> Deferred[None]:
-        """Record an outcome; acknowledged when a majority has it, which they tell (or not) within a second."""
+        """Record an outcome; after 0.3 s it is acknowledged if a majority has stored it, else it fails."""
         done: Deferred[None] = Deferred()
         self.everywhere(place, lambda target: self._result(target, task_id, result))
 
@@ -109,23 +109,23 @@ class Ether:
         return done
 
     def order(self, task_id: str, order: Order) -> None:
-        """Pause a task, or let it go on."""
+        """Publish a pause or resume order."""
         self.everywhere(OPERATOR, lambda place: self._order(place, task_id, order))
 
     def forget(self, task_id: str) -> None:
-        """The outcome's record runs out everywhere, and the task's does not."""
+        """Expire the outcome's record at all nodes, but not the task's."""
         for place, replica in enumerate(self.replicas):
             replica.results.pop(task_id, None)
             self.changed(place, task_id)
             self.listed(place)
 
     def report(self, place: int, task_id: str, member: Member | None) -> None:
-        """Carry a report to all (None: it is taken back)."""
+        """Send a report to all (None: withdraw it)."""
         for target in range(1, len(self.replicas)):
             self.send(place, target, lambda target=target: self._member(target, place, task_id, member))  # type: ignore[misc]
 
     def results(self, place: int, task_id: str) -> list[Record]:
-        """The outcomes that the node of a place knows, as records."""
+        """Return the outcomes that the node of a place knows, as records."""
         known = self.replicas[place].results.get(task_id, {})
         return [
             Record(group_key(task_id), RESULT, bytes(32), 1, "team", 1.0, result.packed(), bytes(64))
@@ -133,12 +133,12 @@ class Ether:
         ]
 
     def outcome(self, place: int, task_id: str) -> Result | None:
-        """How a task ended, as the node of a place knows."""
+        """Return the outcome of a task that the node of a place knows."""
         known = self.replicas[place].results.get(task_id, {})
         return known[max(known)] if known else None
 
     def changed(self, place: int, task_id: str) -> None:
-        """Tell those of the node who follow the task."""
+        """Notify the followers of the task at the node."""
         node = self.nodes.get(place)
         if node is None:
             return
@@ -153,7 +153,7 @@ class Ether:
             ordered([Record(group_key(task_id), ORDER, bytes(32), 1, "team", 1.0, one, bytes(64)) for one in packed])
 
     def listed(self, place: int) -> None:
-        """Tell the agent of the node which tasks there are."""
+        """Notify the agent of the node of the present tasks."""
         node = self.nodes.get(place)
         if node is not None and node.on_tasks is not None:
             tasks = self.replicas[place].tasks
@@ -190,7 +190,7 @@ class Ether:
         self.changed(place, task_id)
 
     def _repeat(self) -> None:
-        """Everybody tells the others again what it knows, and looks who is silent."""
+        """Send all reports again, exchange data with a random node, and expire silent members."""
         self.clock.callLater(REPEAT, self._repeat)
         for place, node in sorted(self.nodes.items()):
             for task_id, member in sorted(node.reports.items()):
@@ -212,17 +212,17 @@ class Ether:
 
 
 class Council:
-    """A council of the operator alone, which never changes."""
+    """A council of the operator's node alone, without changes."""
 
     def learn(self, packed: bytes) -> None:
-        """The record tells nothing new."""
+        """Ignore the record."""
 
     def visit(self) -> None:
-        """It is there."""
+        """Do nothing, as the member is always present."""
 
 
 class Lessee:
-    """The claimant's side of a council that sits at the operator's."""
+    """The lease client for a council at the operator's node."""
 
     TTL = 1.5
     council = Council()
@@ -236,32 +236,32 @@ class Lessee:
 
     @property
     def lease(self) -> Lease | None:
-        """The lease if it is held now."""
+        """Return the lease if it is held now."""
         is_held = self.token and self._ether.clock.seconds() < self._deadline
         return Lease(self._task_id, self.token, self._deadline) if is_held else None
 
     def outrank(self, token: int) -> None:
-        """Take higher tokens than this one from now on."""
+        """Use higher tokens than this one from now on."""
         self._floor = max(self._floor, token)
 
     def want(self) -> None:
-        """Claim, and renew."""
+        """Claim the lease, and renew it."""
         if not self._wanted:
             self._wanted = True
             self._ether.clock.callLater(0.02, self._claim, self._life)
 
     def suspect(self) -> None:
-        """Who wants it asks often enough."""
+        """Do nothing: claims are repeated often enough."""
 
     def end(self, token: int) -> Deferred[bytes]:
-        """The council lets everybody end a task here."""
+        """Permit the end of the task."""
         return succeed(b"")
 
     def stand_by(self, rank: int = 1) -> None:
-        """Nobody is told here when a lease is free: only who wants it asks."""
+        """Do nothing: this council does not notify standbys, and each client polls it."""
 
     def release(self, heirs: object = (), rest: float = 0.0) -> Deferred[object]:
-        """Give back; where the robot still moves, leave it to run out."""
+        """Return the lease; while the robot still moves, let it expire instead."""
         self._wanted, self._deadline = False, 0.0
         self._life += 1
         holder = self._ether.holders.get(self._task_id)
@@ -296,7 +296,7 @@ class Lessee:
 
 
 class Node:
-    """What an agent sees of its node."""
+    """The part of a node that its agent uses."""
 
     def __init__(self, ether: Ether, place: int) -> None:
         self.ether = ether
@@ -318,19 +318,19 @@ class Node:
         self.on_tasks: Callable[[list[Record]], None] | None = None
 
     def justify(self, verdict: object) -> None:
-        """Why somebody goes is asked by nobody here."""
+        """Ignore the decision record."""
 
     def strategy(self, name: str) -> Guard:
-        """The strategy of that name."""
+        """Return the strategy of this name."""
         return self.strategies.named(name, self.deployed)
 
     def watch_tasks(self, changed: Callable[[list[Record]], None]) -> None:
-        """Follow the tasks."""
+        """Watch the tasks."""
         self.on_tasks = changed
         self.ether.listed(self.place)
 
     def group(self, task: Task, heard: Any, ordered: Any, panel: Any = None) -> Any:
-        """A place among those at a task; all of them write."""
+        """Return a membership in the group of a task; all members write reports."""
         task_id = task.task_id
         followers = self.groups.setdefault(task_id, [])
         followers.append((heard, ordered))
@@ -353,11 +353,11 @@ class Node:
         )
 
     def lessee(self, task: Task, changed: Callable[[], None], floor: int) -> Lessee:
-        """The claimant of a task's lease."""
+        """Return the lease client of a task."""
         return Lessee(self.ether, self.place, task.task_id, changed, floor)
 
     def _get(self, key: bytes) -> Deferred[list[Record]]:
-        """What a majority knows, where one is reached."""
+        """Return the records that the reachable nodes know, if these are a majority."""
         reached = [place for place in range(len(self.ether.replicas)) if self.ether.reaches(self.place, place)]
         if 2 * len(reached) <= len(self.ether.replicas) or self.ether.rng.random() < self.ether.weather.loss:
             return fail(Unavailable(len(reached), len(self.ether.replicas)))

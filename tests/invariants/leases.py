@@ -1,7 +1,7 @@
-"""The workload of leases: agents claim, keep, lose and give back tasks under every fault (E1 to E3, E5, E8, E9).
+"""The workload of leases: agents claim, keep, lose and return leases under all faults (E1 to E3, E5, E8, E9).
 
-It is a world of its own, light enough for a thousand schedules in two minutes: the protocol's classes, simulated
-machines and a simulated link.  What agents select is left to dice: commitment must hold whatever selection says.
+It has a separate world, small enough for a thousand schedules in two minutes: the classes of the protocol, simulated
+machines and a simulated link.  The assignments are random, as leases must be exclusive for any assignment.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ KINDS = (
 
 
 def draw_faults(dice: random.Random, n: int, agents: Sequence[int], has_stores: bool) -> list[TimedFault]:
-    """The faults of one schedule of ``n`` places; those of agents come up more often."""
+    """Return random faults for a schedule with ``n`` places; places of agents are chosen more often."""
     faults = []
     for _ in range(dice.choice([1, 2, 3, 3, 4, 6])):
         at = dice.uniform(0.5, 12.0)
@@ -55,7 +55,7 @@ def draw_faults(dice: random.Random, n: int, agents: Sequence[int], has_stores: 
 
 
 class Leases(LeaseTeam):
-    """The run of ``seed``: everything follows from it."""
+    """The run of ``seed``, which determines everything."""
 
     def __init__(self, seed: int, trim: Trim = WHOLE, ttl: float = TTL) -> None:
         dice = self._dice = random.Random(f"leases/{seed}")
@@ -63,9 +63,9 @@ class Leases(LeaseTeam):
         agents = dice.choice([2, 3, 3, 4])
         stop_time = dice.choice([0.0, 0.0, 0.3])
         drift = dice.choice([0.0, 0.01, 0.01, 0.01, 0.05])
-        # The worst that is allowed must come up often: a slow holder, fast members.
+        # The worst permitted case must occur often: a slow holder and fast members.
         rates = [1.0 + dice.choice([-1, 1]) * drift for _ in range(n)]
-        # Without stores a restarted member has forgotten everything: then councils stay, and tokens may fall back.
+        # Without stores a restarted member loses all state: then councils do not change, and tokens may decrease.
         has_stores = dice.random() < 0.7
         super().__init__(f"leases/{seed}", rates, agents, ttl, stop_time, drift, has_stores)
         self.air = Air(
@@ -89,18 +89,18 @@ class Leases(LeaseTeam):
 
     @property
     def digest(self) -> str:
-        """The hash of every message that arrived, and when."""
+        """The hash of all messages that arrived, with their times."""
         return self.board.digest()
 
     def __str__(self) -> str:
-        """What the schedule was."""
+        """Describe the schedule."""
         stores = "stores" if self.has_stores else "no stores"
         return f"n={self.n} agents={len(self.agents)} drift={self.drift} stop={self.stop_time} {stores} {self.air} " + (
             "; ".join(map(str, self.faults))
         )
 
     def run(self) -> list[str]:  # type: ignore[override]
-        """Faults, then health; the violations, a line each."""
+        """Run the faults, then the healthy phase; return one line per violation."""
         self.clock.advance(self.ttl + 0.1)
         self.radio.air = self.air
         self.referee.agree()
@@ -118,7 +118,7 @@ class Leases(LeaseTeam):
         return self.referee.found
 
     def _choose(self) -> None:
-        """Selection, as dice: now and then another agent is to act, or nobody."""
+        """Randomly let agents claim, stand by, leave or suspect."""
         for task_id in self.councils:
             for place in self.agents:
                 bidder = self.bidders[place]
@@ -146,9 +146,9 @@ class Leases(LeaseTeam):
                 self.bidders[place] = self.born(place)
 
     def _verify_health(self, task_id: str) -> None:
-        """E3, the graceful leave and E5, when everything is well and one after the other goes."""
+        """Check E3, the graceful leave and E5 while all is healthy and one agent after the other leaves."""
         if not self.has_stores:
-            # A lease that no member remembers any more has to end first: the next one may have its token again.
+            # A lease that no member remembers must end first, as the next one may have its token.
             self.clock.advance(self.ttl)
         for rank, place in enumerate(self._dice.sample(self.agents, len(self.agents))):
             lessee = self.bidders[place].lessee(task_id)
@@ -156,7 +156,7 @@ class Leases(LeaseTeam):
                 lessee.stand_by(rank)
             else:
                 lessee.want()
-        # A restarted member keeps silent for a ttl; a device may have to tell its token first.
+        # A restarted member is silent for one TTL, and a device may have to report its token first.
         since, most = self.clock.seconds(), 2 * self.ttl + SLACK + 1.0
         if not self._wait_for_command(task_id, f"all is well with {task_id}", 0, since, most, most):
             return
@@ -176,7 +176,7 @@ class Leases(LeaseTeam):
         self.bidders[holder].lessee(task_id).stand_by(len(self.agents))
 
     def _depart_suddenly(self, task_id: str, token: int, holder: int) -> None:
-        """The executor is killed, frozen or cut off; one member of the council goes with it."""
+        """Kill, freeze or disconnect the executor, with one member of the council."""
         gone_at, dice = self.clock.seconds(), self._dice
         members = [self.place_of(member) for member in self.councils[task_id].members]
         spare = [place for place in members if place not in self.agents]
@@ -186,7 +186,7 @@ class Leases(LeaseTeam):
         others = [place for place in self.agents if place != holder]
         within = self.ttl / (1.0 - self.drift) + SLACK + STAGGER * (len(self.agents) - 1)
         if len(others) > 1 and dice.random() < 0.75:
-            # Selection names one agent when the lease ends, and thinks better of it.
+            # The strategy assigns one agent when the lease ends, then another.
             fickle = dice.choice(others)
             self.bidders[fickle].leave(task_id)
             self.clock.advance(dice.uniform(0.8, 1.0) * self.ttl)
@@ -195,7 +195,7 @@ class Leases(LeaseTeam):
                 self.clock.advance(dice.choice([0.004, 0.011, 0.017]))
                 if dice.random() < 0.2:
                     break
-            # A robot that it has moved has to come to rest first.
+            # A robot that this agent has moved must stop first.
             within += self.stop_time if self.bidders[fickle].holds(task_id) else 0.0
             self.bidders[fickle].leave(task_id)
         why = f"{holder} of {task_id} is gone ({how})"
@@ -203,7 +203,7 @@ class Leases(LeaseTeam):
         self._heal()
 
     def _conclude(self, task_id: str) -> None:
-        """The executor is done, or an operator cancels: from the acknowledgement on nothing moves."""
+        """Complete the task by its executor, or cancel it: after the acknowledgement no robot moves."""
         _, token, holder = self.referee.accepted[task_id][-1]
         place = self._dice.choice([holder, self.n - 1])
         if place == holder:
@@ -223,7 +223,7 @@ class Leases(LeaseTeam):
         self.clock.advance(2 * self.ttl)
 
     def _wait_for_command(self, task_id: str, why: str, above: int, since: float, within: float, most: float) -> bool:
-        """Wait ``most`` seconds for a command with a token ``above``, which is late ``within`` seconds of ``since``."""
+        """Wait up to ``most`` s for a command with a token above ``above``, due ``within`` s of ``since``."""
         began = self.clock.seconds()
         self.referee.history.note(Awaited, task_id, why, above, since, within)
         accepted = self.referee.accepted[task_id]
@@ -281,7 +281,7 @@ class Leases(LeaseTeam):
         self.referee.look_at_cuts()
 
     def _clog(self, *places: int) -> None:
-        """Cut them off, unless all is well by now."""
+        """Disconnect these places, unless the healthy phase has begun."""
         if not self._is_well:
             self._part(places)
             self.referee.look_at_cuts()
@@ -291,9 +291,9 @@ class Leases(LeaseTeam):
         self.radio.cut |= {pair for a in places for b in rest for pair in ((a, b), (b, a))}
 
     def _change(self, place: int, is_torn: bool = False) -> None:
-        """Somebody has another council chosen, at a moment when the task may be free, or its own.
+        """Let a node change the council, at a time when the task may be free or held by this node.
 
-        ``is_torn``: of members as new as can be, and none but them and whoever chooses them hear of it.
+        With ``is_torn``, mostly new members are chosen, and only they and the node learn of the change.
         """
         if not self.is_up(place) or not self.has_stores:
             return

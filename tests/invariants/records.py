@@ -1,4 +1,4 @@
-"""The workload of records: puts, removals and reads of all concerns, and what came of them (D1 to D7)."""
+"""The workload of records: writes, removals and reads at all consistency levels, and their results (D1 to D7)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ NAMES = ("a", "b")
 
 
 class Records(Workload):
-    """Clients of every node write their own slots under a few keys and read all of them."""
+    """Clients of each node write their slots under a few keys, and read all slots."""
 
     def __init__(self, schedule: Schedule) -> None:
         self._schedule = schedule
@@ -38,7 +38,7 @@ class Records(Workload):
             self._let_lie(schedule.node(schedule.liar))
 
     def step(self) -> None:
-        """A few operations at random nodes, and a look at every store and table."""
+        """Perform a few operations at random nodes, and inspect each store and routing table."""
         alive = self._schedule.alive()
         for _ in range(self._rng.randrange(3)):
             if alive:
@@ -47,7 +47,7 @@ class Records(Workload):
         self._look()
 
     def settled(self) -> None:
-        """Everybody reads everything, and looks up a few ids."""
+        """Let all nodes read all keys, and look up a few ids."""
         self._look()
         for place in self._schedule.alive():
             for key in KEYS:
@@ -57,13 +57,13 @@ class Records(Workload):
                 self._find(place, target)
 
     def verdict(self) -> list[str]:
-        """The tables as they are now."""
+        """Record the present tables."""
         for place in self._schedule.alive():
             known = self._schedule.node(place).overlay.roster.live()
             self._history.note(Counted, place, tuple(contact.node_id for contact in known))
         return []
 
-    # -- what clients do --------------------------------------------------------------------------------------------
+    # -- operations of clients --------------------------------------------------------------------------------------
 
     def _put(self, place: int) -> None:
         key, name = self._rng.choice(KEYS), self._rng.choice(NAMES)
@@ -93,7 +93,7 @@ class Records(Workload):
         follow(self._history, asked, looking, lambda found: tuple(contact.node_id for contact in found))
 
     def _meddle(self, place: int) -> None:
-        """A member stores what it must not: an old record of another, and one that it made up."""
+        """Let a member send an old record of another member, and a forged one."""
         if not self._old:
             return
         node = self._schedule.node(place)
@@ -108,13 +108,13 @@ class Records(Workload):
                     forged.addErrback(_weather)
 
     def _let_lie(self, node: EntangledNode) -> None:
-        """A member that names contacts that are not there."""
+        """Let a member answer lookups with contacts that do not exist."""
         ghosts = [Identity(bytes([n]) * 32) for n in range(200, 204)]
         named = [[ghost.public, "10.9.9.9", 9000 + n] for n, ghost in enumerate(ghosts)]
         node.endpoint.expose("find_node", lambda peer, target: named)
         node.endpoint.expose("members", lambda peer, after: [] if after else named)
 
-    # -- what everybody can see -------------------------------------------------------------------------------------
+    # -- observations -----------------------------------------------------------------------------------------------
 
     def _look(self) -> None:
         fleet = self._schedule.fleet

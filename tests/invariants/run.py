@@ -1,4 +1,4 @@
-"""Run: one schedule with the workloads that its seed draws, in this process or in several."""
+"""Run one schedule, or several in parallel, with the workloads that the seed selects."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ from tests.invariants.wire import Wire
 
 
 class Alone(Protocol):
-    """A workload with a world and faults of its own, which last so many ``seconds``."""
+    """A workload with a separate world and faults, which last ``seconds``."""
 
     seconds: float
 
     @property
     def faults(self) -> Sequence[object]:
-        """What happens, or has happened, to it."""
+        """The faults of the workload."""
 
     @property
     def digest(self) -> str:
-        """A hash of what happened."""
+        """A hash of all events."""
 
     def run(self) -> list[str]:
-        """Every violation, a line each."""
+        """Run the workload and return one line per violation."""
 
 
 WORKLOADS: dict[str, Callable[[Schedule], Workload]] = {
@@ -57,10 +57,10 @@ SHARES = {"records": 0.15, "tuples": 0.06, "stores": 0.06, "wire": 0.06, "decide
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of one schedule: its ``title``, the ``found`` violations, and the hash of every datagram in it.
+    """The result of one schedule: its ``title``, the violations (``found``), and the hash of all datagrams.
 
-    ``names`` are its workloads, ``faults`` how many there were in the world that had most, ``seconds`` how long they
-    went on in the one where that was longest.
+    ``names`` are its workloads, ``faults`` the largest number of faults in a world, and ``seconds`` the longest
+    duration of a world.
     """
 
     seed: int
@@ -73,14 +73,14 @@ class Outcome:
 
     @property
     def worlds(self) -> list[tuple[str, ...]]:
-        """The workloads of each of its worlds, which know nothing of each other."""
+        """The workloads of each independent world."""
         alone = [(name,) for name in self.names if name in ALONE]
         together = tuple(name for name in self.names if name in WORKLOADS)
         return [*alone, together] if together else [*alone]
 
 
 def drawn(seed: int) -> list[str]:
-    """The workloads of a seed."""
+    """Return the workloads of a seed."""
     dice = random.Random(f"workloads/{seed}")
     return [
         *(name for name, share in SHARES.items() if dice.random() < share),
@@ -89,9 +89,9 @@ def drawn(seed: int) -> list[str]:
 
 
 def run(seed: int, only: tuple[str, ...] = (), bug: str | None = None, trim: Trim = WHOLE) -> Outcome:
-    """Run the schedule of ``seed``, with the workloads of ``only`` instead of those drawn, and with a bug put in.
+    """Run the schedule of ``seed``, with the workloads ``only`` if given, and with a seeded bug.
 
-    ``trim`` says what is left of it; the workloads that it names are meant, whatever ``only`` says.
+    ``trim`` is the part of the schedule that remains; its workloads have precedence over ``only``.
     """
     names = tuple(trim.only or only or drawn(seed))
     with seeded(bug):
@@ -119,7 +119,7 @@ def run_all(
     trim: Trim = WHOLE,
     scheduler: str = "",
 ) -> Iterator[Outcome]:
-    """Run many, ``jobs`` at a time or on the workers of a ``scheduler``; what came of each, in the order of seeds."""
+    """Run many schedules, ``jobs`` in parallel or on the workers of a ``scheduler``; yield outcomes in order."""
     return sweep(seeds, partial(run, only=only, bug=bug, trim=trim), jobs, scheduler)
 
 
@@ -139,13 +139,13 @@ def hunt(number: int, seeds: Sequence[int]) -> Hunted:
 
 
 def hunt_all(seeds: Sequence[int], jobs: int, scheduler: str = "") -> Iterator[Hunted]:
-    """Look for every bug, several at a time; what came of each in the order in which they are listed."""
+    """Look for all bugs in parallel; yield the results in the order of the bugs."""
     return sweep(range(len(BUGS)), partial(hunt, seeds=seeds), jobs, scheduler)
 
 
 @dataclass(frozen=True)
 class Least:
-    """The ``trim`` that is left, what came of it, and in how many ``runs`` it was found."""
+    """The smallest failing ``trim``, its outcome, and the number of ``runs`` to find it."""
 
     trim: Trim
     outcome: Outcome
@@ -155,9 +155,9 @@ class Least:
 def least(
     outcome: Outcome, bug: str | None = None, is_over: Callable[[], bool] = lambda: False, whole: Trim = WHOLE
 ) -> Least:
-    """The least of a failed schedule that breaks the same invariant; when ``is_over`` says so it ends with what it has.
+    """Shrink a failed schedule while it violates the same invariant, until ``is_over`` returns true.
 
-    The schedule was ``whole`` before, or what that says was left of it.
+    ``whole`` is the part of the schedule that the failed run had.
     """
     invariant = outcome.found[0].partition(":")[0]
     best, runs = Least(replace(whole, only=outcome.names), outcome, 0), 0
@@ -175,7 +175,7 @@ def least(
 
     worlds = outcome.worlds
     if len(worlds) > 1:
-        # They know nothing of each other: it is in one of them.
+        # The worlds are independent, so one of them fails alone.
         any(fails(replace(whole, only=world)) for world in worlds)
     left = best.outcome
     shrunk(best.trim, left.faults, left.names if len(left.worlds) == 1 else (), left.seconds, fails)
@@ -183,7 +183,7 @@ def least(
 
 
 def line(seed: int, trim: Trim, bug: str | None = None) -> str:
-    """The command that repeats it."""
+    """Return the command that replays the schedule."""
     words = ["python -m tests.invariants --schedules 1", f"--seed {seed}"]
     if trim.only:
         words.append(f"--only {','.join(trim.only)}")

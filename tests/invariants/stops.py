@@ -1,11 +1,11 @@
-"""Random sequences of stops, releases, partitions, restarts and hostile messages over the halts of a small team.
+"""Run random sequences of stops, releases, partitions, restarts and hostile messages on the halts of a small team.
 
-The halts are the real ones; the network below them delivers late, twice or not at all, disks lose what was not written,
-and replicas forget records and offer old ones.  Checked after each step: once a robot's node has acknowledged a stop of
-an honest operator, the robot stands until a release by a member that may order, naming that very stop, has reached it.
-Checked at the end, with the network healed: an operator can release all of it.
+The halts are the product's.  The network below them delays, repeats and loses messages, disks lose unwritten data, and
+replicas forget records and return old ones.  Checked after each step: once a robot's node has acknowledged a stop by an
+honest operator, the robot stands until it receives a release that names this stop, from a member with the right to
+order.  Checked at the end, with a healthy network: an operator can release the whole team.
 
-``python -m tests.invariants.stops --sequences 10000 --seed 1`` runs so many, and prints what happened in them.
+``python -m tests.invariants.stops --sequences 10000 --seed 1`` runs 10,000 sequences and prints the counts of events.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Violation(AssertionError):
 
 
 class Disk(MemoryStore):
-    """A store whose notes survive a crash only once they are written."""
+    """A store that loses unwritten notes in a crash."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -65,20 +65,20 @@ class Disk(MemoryStore):
         self.waiting: list[tuple[bytes | None, Deferred[None]]] = []
 
     def written(self) -> Deferred[None]:
-        """Fire when the disk says so."""
+        """Return a Deferred that fires when the disk has written the note."""
         done: Deferred[None] = Deferred()
         self.waiting.append((self.noted(NOTE), done))
         return done
 
     def commit(self) -> None:
-        """Write what is owed."""
+        """Write the pending note."""
         self.safe = self.noted(NOTE)
         waiting, self.waiting = self.waiting, []
         for _, done in waiting:
             done.callback(None)
 
     def crash(self) -> None:
-        """Lose what was not written."""
+        """Lose the unwritten note."""
         self.waiting.clear()
         self._notes.pop(NOTE, None)
         if self.safe is not None:
@@ -87,7 +87,7 @@ class Disk(MemoryStore):
 
 @dataclass
 class Life:
-    """One life of a node, as its halt sees the library."""
+    """One run of a node, with the parts of the library that its halt uses."""
 
     net: Net
     name: str
@@ -106,42 +106,42 @@ class Life:
             self.halt.watch(self.obey)
 
     def obey(self) -> str:
-        """As an agent does."""
+        """Obey the halt as an agent does."""
         if not self.halt.is_known:
             self.halt.learn()
         return STANDS if self.halt.is_on else "goes on"
 
     def expose(self, name: str, answer: Callable[..., Any], changes: bool, idempotent: bool) -> None:
-        """Take the answers to calls."""
+        """Store the handler of the calls."""
         self.answer = answer
 
     def later(self, seconds: float, call: Callable[[], None]) -> None:
-        """A timer that ends with this life."""
+        """Schedule a call that is dropped at the end of this run."""
         self.net.clock.callLater(seconds, lambda: None if self.is_over else call())
 
     def may(self, public: bytes, method: str) -> bool:
-        """Whether a present member may call that."""
+        """Return whether a present member may call the method."""
         return self.net.may(public)
 
     def may_store(self, slot: Slot) -> bool:
-        """Whether the owner may write there at present."""
+        """Return whether the owner may write the slot at present."""
         return self.net.may(slot.owner)
 
     def may_stay(self, slot: Slot) -> bool:
-        """As the most lenient of replicas: what was written stays, whoever wrote it."""
+        """Keep each stored record, as the most permissive replica does."""
         return True
 
     def call(self, contact: Contact, method: str, *arguments: object, changes: bool = False) -> Deferred[Any]:
-        """Ask another node."""
+        """Call another node."""
         return self.net.send(self.name, self.net.names[contact.public], arguments)
 
     def put(self, key: bytes, name: str, value: bytes, lifetime: str) -> Deferred[int]:
-        """Store a record; it spreads when the network lets it."""
+        """Store a record, which spreads by gossip."""
         self.net.write(self.name, value)
         return succeed(1)
 
     def get(self, key: bytes) -> Deferred[list[Record]]:
-        """A majority read."""
+        """Read from a majority."""
         near = [other for other in NODES if self.net.reaches(self.name, other)]
         if len(near) <= len(NODES) // 2:
             return fail(Unavailable(len(near), len(NODES) // 2 + 1))
@@ -150,13 +150,13 @@ class Life:
         return succeed(records)
 
     def watch(self, key: bytes, changed: Callable[[list[Record]], None], keep: bool) -> Life:
-        """Follow the records that this node holds; the life is its own watch."""
+        """Watch the records at this node; the watch is this object."""
         self.changed = changed
         self.look()
         return self
 
     def look(self) -> None:
-        """Tell the watch what the replica of this node holds."""
+        """Notify the watch of changed records."""
         records = self.net.newest([self.name])
         if self.changed is not None and records != self.records:
             self.records = records
@@ -165,7 +165,7 @@ class Life:
 
 
 class Net:
-    """A team, what is under way in it, and what each robot owes to whom."""
+    """A team, its messages in transit, and the stops that each robot must obey."""
 
     def __init__(self, seed: int, counts: Counter[str]) -> None:
         self.dice = random.Random(seed)
@@ -185,19 +185,19 @@ class Net:
         for name in NODES:
             self.begin(name)
 
-    # -- what the lives ask -----------------------------------------------------------------------------------------
+    # -- interface for the nodes ------------------------------------------------------------------------------------
 
     def may(self, public: bytes) -> bool:
-        """Whether the holder of this key is a member that may order now."""
+        """Return whether the owner of this key is a member with the right to order."""
         name = self.names.get(public, "")
         return name in TEAM and name not in self.revoked and roles.may_call((TEAM[name],), METHOD)
 
     def reaches(self, one: str, other: str) -> bool:
-        """Whether two nodes hear each other."""
+        """Return whether two nodes can communicate."""
         return self.sides[one] == self.sides[other] and other in self.lives
 
     def newest(self, names: list[str]) -> list[Record]:
-        """The newest record of each owner, as these nodes hold them."""
+        """Return the newest record of each owner at these nodes."""
         best: dict[bytes, Record] = {}
         for name in names:
             for owner, record in self.replicas[name].items():
@@ -206,7 +206,7 @@ class Net:
         return [best[owner] for owner in sorted(best)]
 
     def write(self, name: str, value: bytes) -> None:
-        """A new record of an owner, at its own replica where it is a node."""
+        """Write a new record of an owner to its replica, or to a random one if the owner is no node."""
         own = self.identities[name].public
         known = [r.sequence for r in (*self.old, *self.newest(list(NODES))) if r.owner == own]
         record = Record(HALT, SLOT, own, max(known, default=0) + 1, "team", 600.0, value, self.dice.randbytes(64))
@@ -214,7 +214,7 @@ class Net:
         self.hold(name if name in NODES else self.dice.choice(NODES), record)
 
     def hold(self, name: str, record: Record) -> None:
-        """Have a replica take a record, where it beats what it holds and its owner may write it."""
+        """Store a record at a replica if it beats the present one and its owner may write it."""
         owner = self.names.get(record.owner)
         if owner is not None and not self.may(record.owner):
             return
@@ -224,19 +224,19 @@ class Net:
                 self.lives[name].look()
 
     def reached(self, name: str, records: list[Record]) -> None:
-        """Take note of what the records of members that may order release at a robot."""
+        """Record the releases that reach a robot in records of members with the right to order."""
         for record in records:
             if name in ROBOTS and self.may(record.owner) and _is_msgpack(record.value):
                 self.released(name, msgpack.unpackb(record.value or b""))
 
     def released(self, name: str, fields: object) -> None:
-        """What these fields release is owed no more."""
+        """Remove the released stops from the stops that the robot must obey."""
         statement = statement_of(fields)
         if statement is not None:
             self.owed[name] -= set(statement.released)
 
     def send(self, sender: str, to: str, arguments: tuple[Any, ...]) -> Deferred[Any]:
-        """One call; it may be lost, and so may its answer."""
+        """Send a call; the request or its answer may be lost."""
         self.sent.append((sender, to, arguments))
         if not self.reaches(sender, to) or self.dice.random() < 0.1:
             return fail(NoAnswer("lost"))
@@ -244,7 +244,7 @@ class Net:
         return fail(NoAnswer("lost")) if self.dice.random() < 0.1 else answered
 
     def deliver(self, sender: str, to: str, arguments: tuple[Any, ...]) -> Deferred[Any]:
-        """What the endpoint of ``to`` does with a call: the role decides, then the types, then the method."""
+        """Process a call as the endpoint of ``to`` does: check the role, the types, then call the method."""
         if not self.may(self.identities[sender].public):
             self.counts["refused"] += 1
             return fail(Refused("role"))
@@ -265,7 +265,7 @@ class Net:
             said, obeyed = answer
             if to in ROBOTS and life is self.lives.get(to) and not said.endswith(UNSAVED):
                 ids = {stop for stop, _ in obeyed} & self.tracked
-                # A release may have come between the order and the end of the write.
+                # A release may have arrived between the order and the end of the write.
                 fresh = {stop for stop, _ in arguments[0]} & ids & set(life.halt.stops)
                 self.owed[to] |= fresh
                 self.counts["acknowledged"] += len(fresh)
@@ -273,24 +273,24 @@ class Net:
 
         return answered.addCallback(acknowledged)
 
-    # -- what happens -----------------------------------------------------------------------------------------------
+    # -- events -----------------------------------------------------------------------------------------------------
 
     def begin(self, name: str) -> None:
-        """The first or next life of a node."""
+        """Start a node."""
         life = self.lives[name] = Life(self, name)
         life.halt.learn() if name in ROBOTS else life.halt.follow()
 
     def contacts(self) -> list[Contact]:
-        """Every node."""
+        """Return the contacts of all nodes."""
         return [Contact(self.identities[name].public, Address("10.0.0.1", 1)) for name in NODES]
 
     def stop(self) -> None:
-        """An honest operator stops the team."""
+        """Let an honest operator stop the team."""
         name = self.orderer()
         if name:
             before = set(self.lives[name].halt.stops)
             asked = self.lives[name].halt.stop
-            # The id is known before the first answer comes.
+            # The id must be known before the first answer arrives.
             state = self.dice.getstate()
             self.tracked.add(self.dice.randbytes(ID_BYTES))
             self.dice.setstate(state)
@@ -298,7 +298,7 @@ class Net:
             self.counts["stops"] += bool(set(self.lives[name].halt.stops) - before)
 
     def release(self) -> None:
-        """An honest operator releases all that it knows, or some of it."""
+        """Let an honest operator release some or all stops that it knows."""
         name = self.orderer()
         if name:
             known = list(self.lives[name].halt.stops)
@@ -307,18 +307,18 @@ class Net:
             self.counts["releases"] += 1
 
     def orderer(self) -> str:
-        """An honest operator that is up and not revoked."""
+        """Return an honest operator that is online and not revoked, or an empty string."""
         up = [name for name in HONEST if name in self.lives and name not in self.revoked]
         return self.dice.choice(up) if up else ""
 
     def partition(self) -> None:
-        """The network falls into two, or is whole again."""
+        """Divide the network in two, or heal it."""
         is_whole = self.dice.random() < 0.5
         self.sides = {name: 0 if is_whole else self.dice.randrange(2) for name in TEAM}
         self.counts["partitions"] += 1
 
     def restart(self) -> None:
-        """A node, or all of them, end without a word and come back."""
+        """Crash one node or all, and restart them later."""
         for name in NODES if self.dice.random() < 0.1 else [self.dice.choice(NODES)]:
             life = self.lives.pop(name, None)
             if life is None:
@@ -331,12 +331,12 @@ class Net:
             self.clock.callLater(self.dice.random() * 20.0, self.come_back, name)
 
     def come_back(self, name: str) -> None:
-        """Begin a life where there is none."""
+        """Start a node if it is not running."""
         if name not in self.lives:
             self.begin(name)
 
     def forget(self) -> None:
-        """A replica drops a record, as when its time is over."""
+        """Let a replica lose a record, as at its expiry."""
         name = self.dice.choice(NODES)
         if self.replicas[name]:
             del self.replicas[name][self.dice.choice(list(self.replicas[name]))]
@@ -345,7 +345,7 @@ class Net:
             self.counts["records lost"] += 1
 
     def gossip(self) -> None:
-        """Two replicas compare."""
+        """Let pairs of replicas exchange records."""
         for _ in range(6):
             one, other = self.dice.sample(NODES, 2)
             if one in self.lives and self.reaches(one, other):
@@ -354,7 +354,7 @@ class Net:
                     self.hold(other, record)
 
     def repeat(self) -> None:
-        """The network delivers an earlier call of a present member again, or a replica offers an earlier record."""
+        """Repeat an earlier call of a present member, or let a replica return an old record."""
         self.counts["repeated"] += 1
         if self.sent and self.dice.random() < 0.6:
             sender, to, arguments = self.dice.choice(self.sent)
@@ -364,7 +364,7 @@ class Net:
             self.hold(self.dice.choice(NODES), self.dice.choice(self.old))
 
     def revoke(self) -> None:
-        """An operator is revoked; one honest one remains."""
+        """Revoke an operator; one honest operator remains."""
         name = self.dice.choice(("bob", "web", "thief"))
         if name not in self.revoked and self.dice.random() < 0.3:
             self.revoked.add(name)
@@ -376,12 +376,12 @@ class Net:
             self.counts["revoked"] += 1
 
     def attack(self) -> None:
-        """A member that must not order, an invented key, or an operator's stolen key sends something hostile."""
+        """Send a hostile message from a member without the right to order, an invented key or a stolen operator key."""
         self.counts["hostile"] += 1
         sender = self.dice.choice(("eye", "boot", "dog1", "thief", OUTSIDE))
         known = list(self.tracked)
         if sender == "thief" and self.dice.random() < 0.9:
-            known = []  # it may release the stops that it knows; its inventions are the attack
+            known = []  # it may release known stops; the attack is invented ones
         arguments = self.dice.choice(
             [
                 lambda: (2 ** self.dice.choice((31, 53, 63)), self.dice.random() < 0.5, sender),
@@ -404,17 +404,17 @@ class Net:
             if to in self.lives:
                 self.deliver(sender, to, arguments).addErrback(_expected)
 
-    # -- what must hold ---------------------------------------------------------------------------------------------
+    # -- invariants -------------------------------------------------------------------------------------------------
 
     def check(self, what: str) -> None:
-        """No robot that owes a stop may move."""
+        """Check that no robot with an unreleased stop may move."""
         for name in ROBOTS:
             life = self.lives.get(name)
             if life is not None and self.owed[name] and not life.halt.is_on:
                 raise Violation(f"after {what} {name} may move, though {len(self.owed[name])} stops are not released")
 
     def step(self) -> None:
-        """One thing that happens."""
+        """Run one random event."""
         events = (
             (self.stop, 4),
             (self.release, 3),
@@ -436,14 +436,14 @@ class Net:
         self.check("a while")
 
     def tick(self, seconds: float) -> None:
-        """Let time pass, in which agents look."""
+        """Let time pass, and let the agents refresh their halts."""
         self.clock.advance(seconds)
         for name in ROBOTS:
             if name in self.lives and self.lives[name].halt.is_on:
                 self.lives[name].halt.refresh()
 
     def end(self) -> None:
-        """All are back, nobody is hostile any more: an operator releases what the devices name."""
+        """Restart all nodes, end the attacks, and let an operator release all stops that the devices name."""
         self.sides = dict.fromkeys(TEAM, 0)
         self.revoked.add("thief")
         gone = self.identities[OUTSIDE].public, *(self.identities[name].public for name in self.revoked)
@@ -466,7 +466,7 @@ class Net:
 
 
 def run(seed: int, counts: Counter[str]) -> None:
-    """One sequence; raises ``Violation``."""
+    """Run one sequence; raise ``Violation`` if an invariant fails."""
     net = Net(seed, counts)
     counts["sequences"] += 1
     for _ in range(STEPS):
@@ -487,7 +487,7 @@ def _is_msgpack(value: bytes | None) -> bool:
 
 
 def main() -> int:
-    """Run what the arguments say; 1 where a sequence failed."""
+    """Run the command; return 1 if a sequence failed."""
     parser = argparse.ArgumentParser(prog="python -m tests.invariants.stops", description=__doc__)
     parser.add_argument("--sequences", type=int, default=10_000, help="how many to run (default 10000)")
     parser.add_argument("--seed", type=int, default=1, help="the seed of the first; the others follow (default 1)")

@@ -1,4 +1,4 @@
-"""The workload of stores: disks that fill up and rot, and S-a to S-c over nodes that lose power."""
+"""The workload of stores: full and corrupt disks, and S-a to S-c for nodes that lose power."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ RECOVERY = 2.0
 
 
 class Stores(Workload):
-    """Fills the disk of one node after the other for a while, and lets one store rot."""
+    """Fills the disk of one node after the other for some time, and corrupts one store."""
 
     def __init__(self, schedule: Schedule) -> None:
         assert isinstance(schedule.fleet, DiskFleet)
@@ -37,21 +37,21 @@ class Stores(Workload):
         schedule.fleet.attend(self._born, lambda place, node: None)
         voters = min(schedule.n, 8)
         deaths = sum(len(fault.places) for fault in schedule.faults if fault.kind == "die")
-        # A store that rots is one replica less; beyond what a majority can do without, nothing is promised.
+        # A corrupt store is one replica less; the invariants hold only while a majority remains.
         if deaths + 1 <= voters // 2:
             killed = [place for fault in schedule.faults if fault.kind.startswith("kill") for place in fault.places]
             if killed:
                 schedule.fleet.decay[self._rng.choice(killed)] = self._rng.choice(["row", "file"])
 
     def step(self) -> None:
-        """Fill a disk, look at one that is full, or make room again."""
+        """Fill a disk, probe a full one, or free space."""
         if self._full is None:
             alive = self._schedule.alive()
             if alive and self._rng.random() < 0.1:
                 place = self._rng.choice(alive)
                 self._full = (place, self._fleet.disk(place))
                 self._full[1].writer.fault = FULL
-                # It may outlast the other faults, but not the repair interval.
+                # It may last longer than the other faults, but not longer than the repair interval.
                 self._fleet.clock.callLater(self._rng.choice([1.0, 4.0, 8.0]), self._make_room)
             return
         place, store = self._full
@@ -59,7 +59,7 @@ class Stores(Workload):
             self._probe(place, store)
 
     def settled(self) -> None:
-        """Everything must be written by now, and soon in the file."""
+        """Check that all data is written by now."""
         for place in self._schedule.alive():
             store = self._fleet.disk(place)
             if store.trouble:
@@ -68,7 +68,7 @@ class Stores(Workload):
             written.addErrback(self._unwritten, place)
 
     def verdict(self) -> list[str]:
-        """What was found, and the files as they are now."""
+        """Return the violations, after a comparison of memory and files."""
         for line in self._fleet.lost:
             self._say("S-a", line)
         for line in self._fleet.overlooked:
@@ -84,7 +84,7 @@ class Stores(Workload):
     def _unwritten(self, failure: Failure, place: int) -> None:
         self._say("S-c", f"node {place} cannot write: {failure.value}")
 
-    # -- a rotten store ---------------------------------------------------------------------------------------------
+    # -- a corrupt store --------------------------------------------------------------------------------------------
 
     def _born(self, place: int, node: EntangledNode) -> None:
         if self._fleet.decayed and self._fleet.decayed[-1] == place:
@@ -92,7 +92,7 @@ class Stores(Workload):
                 self._fleet.clock.callLater(moment, self._read_early, place, node)
 
     def _read_early(self, place: int, node: EntangledNode) -> None:
-        """Read at a node whose store has rotted: what a majority holds must not be denied."""
+        """Read at a node with a corrupt store: it must not deny records that a majority holds."""
         if place not in self._schedule.alive() or self._schedule.node(place) is not node:
             return
         for key in KEYS:
@@ -121,7 +121,7 @@ class Stores(Workload):
             self._say("S-c", f"node {place} does not write {RECOVERY:.0f} s after there was room: {store.trouble}")
 
     def _probe(self, place: int, store: DiskStore) -> None:
-        """Write to the node with the full disk, from within and from another node; read what it holds."""
+        """Write to the node with the full disk locally and from another node."""
         self._number += 1
         node = self._schedule.node(place)
         record = self._record(node)

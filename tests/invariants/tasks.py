@@ -1,6 +1,6 @@
-"""The workload of tasks: whole agents over an ether in memory, and all that they decided and did (E4 to E7).
+"""The workload of tasks: complete agents over a network in memory, with all their decisions and actions (E4 to E7).
 
-It needs no fleet of nodes: ``python -m tests.invariants --only tasks`` runs it alone, a few milliseconds a schedule.
+It needs no team of nodes: ``python -m tests.invariants --only tasks`` runs it alone, in milliseconds per schedule.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class Tasks:
             self.birth(place)
 
     def run(self) -> list[str]:
-        """Everything; the violations."""
+        """Run the schedule and return the violations."""
         with self._recorded():
             if not self.is_calm:
                 delay, loss, double = (
@@ -81,16 +81,16 @@ class Tasks:
         return check(self.history)
 
     def __str__(self) -> str:
-        """What kind of schedule it is."""
+        """Describe the schedule."""
         calm = ", calm" if self.is_calm else ""
         return f"{self.n} agents, {len(self.tasks)} tasks{calm}, faults: {'; '.join(self.faults)}"
 
     @property
     def digest(self) -> str:
-        """A hash of who acted when."""
+        """A hash of all assignments and their times."""
         return hashlib.blake2s("".join(self.trace).encode(), digest_size=8).hexdigest()
 
-    # -- what happens -----------------------------------------------------------------------------------------------
+    # -- events -----------------------------------------------------------------------------------------------------
 
     def birth(self, place: int) -> None:
         """Start an agent."""
@@ -103,13 +103,13 @@ class Tasks:
         agent.startService()
 
     def death(self, place: int) -> None:
-        """End it without a word."""
+        """End an agent without notice."""
         self.history.note(Died, place)
         del self.ether.nodes[place]
         self.agents.pop(place).stopService()
 
     def step(self) -> None:
-        """Something at random."""
+        """Run random events."""
         dice = self.rng.random
         if dice() < 0.12 and len(self.tasks) < 4:
             self.submit()
@@ -129,7 +129,7 @@ class Tasks:
             self.fault()
 
     def fault(self) -> None:
-        """A member that goes, one that comes back, or a cut."""
+        """Stop or restart a member, or change the partition."""
         dice = self.rng.random()
         place = self.rng.randint(1, self.n)
         if dice >= 0.09:
@@ -146,17 +146,17 @@ class Tasks:
             self.birth(place)
 
     def submit(self) -> None:
-        """A task of any kind of task."""
+        """Submit a random task."""
         self.enter(self.any_task())
 
     def enter(self, task: Task) -> None:
-        """Make ``task`` one of the schedule's."""
+        """Add ``task`` to the schedule."""
         self.tasks[task.task_id] = task
         self.history.asked("operator", "submit", task.task_id)
         self.ether.submit(task)
 
     def any_task(self) -> Task:
-        """The next task: of any place, priority and deadline."""
+        """Return the next task, with random target, priority and deadline."""
         rng = self.rng
         name = f"t{len(self.tasks)}"
         return Task(
@@ -172,7 +172,7 @@ class Tasks:
         )
 
     def heal(self) -> None:
-        """The end of all faults; whoever is away comes back."""
+        """End all faults and restart absent agents."""
         self.ether.weather, self.ether.side = Weather(), {}
         for place in range(1, self.n + 1):
             if place not in self.agents:
@@ -182,30 +182,30 @@ class Tasks:
             self.ether.order(name, Order(RESUME, "operator", self.clock.seconds()))
 
     def is_settled(self) -> bool:
-        """Whether every agent knows the end of every task, and the operator does."""
+        """Return whether all agents and the operator know the outcome of each task."""
         if any(self.ether.outcome(OPERATOR, name) is None for name in self.tasks):
             return False
         dockets = [agent._docket for agent in self.agents.values()]
         return not any(docket.open or any(map(docket.is_new, self.tasks)) for docket in dockets)
 
     def late(self) -> None:
-        """Long after the end the outcome's record has run out, and the task is still listed by who was away."""
+        """Expire the outcome's record while the task is still listed."""
         for name in self.tasks:
             if self.ether.outcome(OPERATOR, name) is not None:
                 self.history.note(Expired, name)
                 self.ether.forget(name)
 
     def live(self, seconds: float) -> None:
-        """Let time pass, and look on."""
+        """Let time pass, and inspect the agents."""
         until = self.clock.seconds() + seconds
         while self.clock.seconds() < until - 1e-9:
             self.clock.advance(0.1)
             self.watch()
 
-    # -- what everybody can see -------------------------------------------------------------------------------------
+    # -- observations -----------------------------------------------------------------------------------------------
 
     def watch(self) -> None:
-        """Look at every agent."""
+        """Inspect each agent."""
         now = self.clock.seconds()
         for name, known in self.ether.acknowledged.items():
             if self._acknowledged.get(name) is not known:
@@ -224,12 +224,12 @@ class Tasks:
                     self.trace.append(f"{now:.2f} {name} dog{place} {token}")
 
     def holding(self, agent: Agent) -> tuple[str, ...]:
-        """The tasks whose leases an agent holds, where that is looked at."""
+        """Return the tasks for which an agent holds the lease; none in this workload."""
         return ()
 
     @contextmanager
     def _recorded(self) -> Iterator[None]:
-        """Each decision of each agent goes through here."""
+        """Record each decision of each agent."""
         place: Any = import_module("agents.conference")
         genuine = place.decide
 
@@ -255,7 +255,7 @@ class Tasks:
             del KINDS["walk"]
 
     def decided(self, members: list[Member], decision: Decision, hysteresis: float) -> None:
-        """Write down what an agent decided, and from what."""
+        """Record a decision and its reports."""
         me = members[0]
         group = ",".join(sorted(name for name, one in self.tasks.items() if one.title == self._title(me)))
         reports = tuple(Report(m.uuid, m.name, m.epoch, m.serial, m.cost) for m in members)
@@ -269,7 +269,7 @@ class Tasks:
         return next(name for name, part in agent._parts.items() if part.engagement.me is me)
 
     def verdict(self) -> None:
-        """What agents still have open."""
+        """Record the tasks that are still open at each agent."""
         for place, agent in self.agents.items():
             for name in self.tasks:
                 state = str(agent._parts[name].engagement.course) if name in agent._parts else ""
@@ -279,10 +279,10 @@ class Tasks:
 
 
 class Groups(Tasks):
-    """The workload of groups: as that of tasks, with tasks divided together, and the leases that agents hold (E8)."""
+    """The workload of groups: tasks that are divided together, and the leases that agents hold (E8)."""
 
     def submit(self) -> None:
-        """One to three tasks, most of them of one group; all of a schedule are divided by one strategy."""
+        """Submit one to three tasks, most of them in one group, all with the schedule's strategy."""
         rng = self.rng
         strategy = ("group_optimal", "cbba", "nearest")[self.n % 3]
         for _ in range(rng.choice([1, 2, 3])):
@@ -290,11 +290,11 @@ class Groups(Tasks):
             self.enter(replace(task, strategy=strategy, group=rng.choice(["g", "g", "g", ""])))
 
     def holding(self, agent: Agent) -> tuple[str, ...]:
-        """The tasks whose leases an agent holds."""
+        """Return the tasks for which an agent holds the lease."""
         lessees = {name: part.engagement.lessee for name, part in agent._parts.items()}
         return tuple(name for name, lessee in lessees.items() if lessee is not None and lessee.lease is not None)
 
 
 def faded(task: Task, **changes: Any) -> Task:
-    """The task with an edit of an operator's."""
+    """Return the task with an operator's change."""
     return replace(task, generation=task.generation + 1, **changes)

@@ -1,4 +1,4 @@
-"""The workload of tuples: puts, takes, claims and reads by several clients, and what came of them (T1 to T6)."""
+"""The workload of tuples: puts, takes, claims and reads by several clients, and their results (T1 to T6)."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ second sweep from elsewhere begins where the first did: that a tuple was left by
 
 
 class Tuples(Workload):
-    """Clients of every node put, take, claim and read jobs; two of them wait for a bell that rings at the end."""
+    """Clients of each node put, take, claim and read jobs; two wait for a bell tuple, put at the end."""
 
     def __init__(self, schedule: Schedule) -> None:
         self._schedule = schedule
@@ -53,7 +53,7 @@ class Tuples(Workload):
         schedule.fleet.attend(self._born, self._died)
 
     def step(self) -> None:
-        """A few operations at random nodes."""
+        """Perform a few operations at random nodes."""
         if not self._spaces:
             return
         if self._rng.random() < 0.4 and len(self._witness.open()) < MOST_WAITING:
@@ -64,7 +64,7 @@ class Tuples(Workload):
             act(place, self._spaces[place])
 
     def settled(self) -> None:
-        """Everybody reads all tuples; then a bell rings, and what is left is taken, at last one by one."""
+        """Let all nodes read all tuples, then put the bell and take the remaining tuples, at last one by one."""
         for place, space in sorted(self._spaces.items()):
             self._survey(place, space)
             self._listen(f"node {place}, which waits in the calm", space)
@@ -73,13 +73,13 @@ class Tuples(Workload):
         self._clock.callLater(FETCH, self._fetch)
 
     def verdict(self) -> list[str]:
-        """Who could still decide."""
+        """Record the members that can still decide."""
         self._seats()
         for space in self._spaces.values():
             space.stop()
         return []
 
-    # -- lives ------------------------------------------------------------------------------------------------------
+    # -- start and end of nodes -------------------------------------------------------------------------------------
 
     def _born(self, place: int, node: EntangledNode) -> None:
         self._lives += 1
@@ -88,7 +88,7 @@ class Tuples(Workload):
         space = self._spaces[place] = TupleSpace(node, self._clock, rng)
         self._witness.attend(node.seat, node.endpoint.expose, node.identity.public)
         if place < 2:
-            # A moment later, for it may not have started yet.
+            # Later, as the node may not have started yet.
             self._clock.callLater(0.1, self._wait, place, space)
 
     def _died(self, place: int, node: EntangledNode) -> None:
@@ -101,17 +101,17 @@ class Tuples(Workload):
             self._waiting[place] = self._listen(f"node {place}, which waits through it all", space)
 
     def _left(self) -> list[Posted]:
-        """The tuples that nobody took and that anybody who lives can take, as is promised of them."""
+        """Return the acknowledged tuples that were not taken and must still be takeable."""
         return [p for p in self._witness.open() if p.fields in self._acknowledged and self._can_decide(p)]
 
     def _can_decide(self, posted: Posted) -> bool:
-        """Whether a majority of the council lives, and remembers."""
+        """Return whether a majority of the council is online with its state."""
         seats = {node.identity.public: node.seat for node in map(self._schedule.node, self._schedule.alive())}
         there = [m for m in posted.council if m.contact.public in seats]
         able = [m for m in there if seats[m.contact.public].incarnation == m.incarnation]
         return 2 * len(able) > len(posted.council)
 
-    # -- what clients do --------------------------------------------------------------------------------------------
+    # -- operations of clients --------------------------------------------------------------------------------------
 
     def _put(self) -> None:
         fields = ("job", self._number, self._number / 2)
@@ -134,7 +134,7 @@ class Tuples(Workload):
         self._taking(space.get_many(JOB, self._rng.choice([1, 3])), place)
 
     def _taking(self, taking: Deferred[list[Tuple]], place: int) -> None:
-        """Write down what a client takes."""
+        """Record a client's take."""
         follow(self._history, self._history.asked(place, TAKE, "job"), taking, tuple)
 
     def _claim(self, place: int, space: TupleSpace) -> None:
@@ -142,7 +142,7 @@ class Tuples(Workload):
         claiming.addCallbacks(lambda claim: self._claimed(claim, place, space), _weather)
 
     def _claimed(self, claim: Claim, place: int, space: TupleSpace) -> None:
-        """Confirm it in time, or late, or twice; give it back; or never come back to it, as who dies."""
+        """Confirm the claim in time, late or twice, release it, or forget it like a failed client."""
         fate = self._rng.choice(["confirm", "late", "release", "forget"])
         if fate == "release":
             claim.release()
@@ -157,7 +157,7 @@ class Tuples(Workload):
         space.read_all(JOB).addErrback(_weather)
 
     def _again(self, place: int, space: TupleSpace) -> None:
-        """Ask members once more what decided a take: whoever accepted it then stands by it for ever."""
+        """Ask members again to confirm a decided take: each member that accepted it must repeat its answer."""
         decided = [one for one in self._witness.posted.values() if self._witness.takers(one.place)]
         if not decided:
             return
@@ -206,7 +206,7 @@ class Tuples(Workload):
         self._taking(self._spaces[place].get_many(JOB, 1000), place)
 
     def _fetch(self) -> None:
-        """Wait for each tuple by itself, so that none which cannot be taken stands before it."""
+        """Wait for each tuple separately, so that one which cannot be taken does not block the others."""
         for posted in self._left():
             place = self._rng.choice(sorted(self._spaces))
             self._get(posted.fields, place, self._spaces[place])

@@ -1,4 +1,4 @@
-"""Walk: the behaviour of the workload of tasks, and a robot on a line that it moves."""
+"""The behaviour in the workload of tasks, and its robot, which moves on a line."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from middleware.entangled.clock import HeapClock
 
 
 class Walk:
-    """Walk along a line to a target; distances are told in quarters, so that many are equal."""
+    """Walk along a line to a target; the cost is in quarters, so that equal costs are frequent."""
 
     def __init__(self, parameters: Mapping[str, float | str], rng: random.Random) -> None:
         self._target = float(parameters["target"])
@@ -25,36 +25,36 @@ class Walk:
         self._start = 1.0
 
     def look(self, seen: Observation, now: float) -> None:
-        """Take in where the body is, and how far the target seems to have drifted."""
+        """Read the robot's position and the drift of the target."""
         self._place, self._drift = float(seen.values["place"]), float(seen.values["drift"])
 
     @property
     def cost(self) -> float | None:
-        """The distance in whole quarters."""
+        """The distance, rounded to quarters."""
         return None if self._place is None else round(4.0 * abs(self._target - self._place) + self._drift) / 4.0
 
     @property
     def is_safe(self) -> bool:
-        """Now and then the body must not be stopped."""
+        """False at some positions, at which the robot must not be stopped."""
         return self._place is None or round(5.0 * self._place) % 5 != 0
 
     def search(self, now: float) -> Action:
-        """Stand."""
+        """Stand still."""
         return STAND
 
     def hold(self, now: float) -> Action:
-        """Stand."""
+        """Stand still."""
         return STAND
 
     def execute(self, context: Context) -> Action | None:
-        """Walk."""
+        """Walk to the target."""
         assert self._place is not None
         way = self._target - self._place
         return None if abs(way) < 0.1 else {**STAND, "base.vx": 0.8 if way > 0 else -0.8}
 
 
 class Robot:
-    """A driver whose robot walks on a line."""
+    """A driver of a robot on a line."""
 
     def __init__(self, clock: HeapClock, place: float) -> None:
         self.description = Description("walker", "", {}, {"base.vx": (-1.0, 1.0)}, 0.1)
@@ -69,34 +69,34 @@ class Robot:
 
     @property
     def token(self) -> int:
-        """The highest token that it has obeyed."""
+        """The highest token that the robot has obeyed."""
         return self._gate.token or 0
 
     def connect(self) -> Deferred[None]:
-        """Begin to sense."""
+        """Start to send observations."""
         self._is_on = True
         self._clock.callLater(0.1, self._live)
         return succeed(None)
 
     def enable(self) -> Deferred[bool]:
-        """Motors on."""
+        """Enable the motors."""
         return succeed(True)
 
     def disconnect(self) -> Deferred[None]:
-        """End."""
+        """End the connection."""
         self._is_on = False
         return succeed(None)
 
     def subscribe(self, seen: Callable[[Observation], None]) -> Callable[[], None]:
-        """Tell what is sensed."""
+        """Subscribe to the observations."""
         self._seen = seen
         return lambda: None
 
     def observe(self) -> None:
-        """Nothing beside what is told."""
+        """Do nothing, as observations are pushed."""
 
     def stop(self) -> None:
-        """Stand."""
+        """Stop the robot."""
         self._speed = 0.0
 
     def act(self, action: Action, permit: Permit) -> Action:
@@ -116,7 +116,7 @@ class Robot:
 
 
 def restarted(robot: Robot, clock: HeapClock) -> Robot:
-    """The same robot under a new life of its node: its gate has not forgotten."""
+    """Return the robot for its restarted node, with the same gate."""
     again = Robot(clock, robot.place)
     again._gate = robot._gate
     return again

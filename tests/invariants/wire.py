@@ -1,7 +1,7 @@
-"""The workload of the wire: shots of what no lawful node sends into live schedules, and what they do (R1 to R4).
+"""The workload of the wire: injected datagrams that no correct node sends, and their effects (R1 to R4).
 
-Shots are made of datagrams that were delivered: the same again, changed, cut short, sent to another node, or to the
-next life of the same one.  What a node would send because of a shot is held back, so a shot moves nothing but counters.
+The datagrams are derived from delivered ones: repeated, changed, truncated, sent to another node, or to the restarted
+node.  Answers to them are held back, so that an injection changes only counters.
 """
 
 from __future__ import annotations
@@ -50,19 +50,19 @@ FLOOD = 150
 
 @implementer(ILogObserver)
 class Ear:
-    """Hears what is logged above the level of debugging."""
+    """A log observer that records events above the debug level."""
 
     def __init__(self) -> None:
         self.heard: list[str] = []
 
     def __call__(self, event: Any) -> None:
-        """Take note of an event."""
+        """Record an event."""
         if event["log_level"] > LogLevel.debug:
             self.heard.append(str(event.get("log_format")))
 
 
 class Wire(Workload):
-    """Shoots at nodes while they work, counts how often a method runs, and looks at every table at the end."""
+    """Injects datagrams into running nodes, counts the runs of a method, and checks all table sizes at the end."""
 
     def __init__(self, schedule: Schedule) -> None:
         self._schedule = schedule
@@ -96,11 +96,11 @@ class Wire(Workload):
                 )
 
         vars(self._board).update(_transmit=tapped_carry, _deliver=tapped_deliver)
-        # The recordings outlive a node: they are fired at its next life.
+        # Stored datagrams are kept after the end of a node, and injected into its next run.
         schedule.fleet.attend(self._born, lambda place, node: None)
 
     def step(self) -> None:
-        """A shot or two, and a question that may run once."""
+        """Inject one or two datagrams, and send a request that must run at most once."""
         alive = self._schedule.alive()
         if not alive:
             return
@@ -111,24 +111,24 @@ class Wire(Workload):
             self._ask(asker, answerer)
 
     def settled(self) -> None:
-        """A few last shots, and a flood of handshakes at one node."""
+        """Inject a last datagram at each node, and flood one with handshakes."""
         alive = self._schedule.alive()
         for place in alive:
             self._shoot(place)
         self._flood(self._rng.choice(alive))
 
     def verdict(self) -> list[str]:
-        """The bytes of the stranger, and the sizes of the tables."""
+        """Record the bytes to and from the unknown address, and the sizes of the tables."""
         self._history.note(Strange, self._sent_to_stranger, self._got_from_stranger)
         for place in self._schedule.alive():
             for what, size, cap in self._tables(self._schedule.node(place)):
                 self._history.note(Size, place, what, size, cap)
         return []
 
-    # -- shots (R1, R3) ---------------------------------------------------------------------------------------------
+    # -- injected datagrams (R1, R3) --------------------------------------------------------------------------------
 
     def _shoot(self, place: int) -> None:
-        """Send one node something that it must drop, and compare what it remembers before and after."""
+        """Inject a datagram that the node must drop, and compare the node's state before and after."""
         own = self._schedule.fleet.address(place)
         shot = self._made(own)
         if shot is None:
@@ -141,7 +141,7 @@ class Wire(Workload):
         globalLogPublisher.addObserver(self._ear)
         try:
             receiver(datagram, source)
-        except Exception as error:  # whatever it is, it must not come out
+        except Exception as error:  # it must raise nothing
             raised = repr(error)
         finally:
             globalLogPublisher.removeObserver(self._ear)
@@ -151,10 +151,10 @@ class Wire(Workload):
         self._history.note(Shot, place, kind, datagram, before, self._state(node), raised, logged, answers)
 
     def _made(self, own: Address) -> tuple[str, Address, bytes] | None:
-        """A shot for the node at ``own``: what it is, where it seems to come from, and its bytes."""
+        """Return a datagram for the node at ``own``: its kind, source and bytes."""
         rng, now = self._rng, self._schedule.fleet.clock.seconds()
         kind = rng.choice(KINDS)
-        if kind == "greeting":  # lawful, and from nobody who has shown that he hears there
+        if kind == "greeting":  # valid, from an address that is not yet proven
             return kind, STRANGER, who(derived_key(TEAM, b"greet"), rng.randbytes(TOKEN_BYTES), rng)
         source = rng.choice([STRANGER, None])
         place = own
@@ -168,9 +168,9 @@ class Wire(Workload):
             return None
         recorded = known[rng.choice(sorted(known))]
         _, sender, datagram = rng.choice(recorded)
-        at = min(when for when, _, other in recorded if other == datagram)  # it may have been tried again since
+        at = min(when for when, _, other in recorded if other == datagram)  # it may have been retransmitted
         if kind == "replayed" and datagram[0] == INIT and at < max(now - RESPONSES_S, self._born_at[own]):
-            # It opens a session that nobody can use, for whoever plays the recording knows no key of it.
+            # It opens a session that is of no use to an attacker without its keys.
             return None
         if kind == "forged":
             where = rng.randrange(len(datagram))
@@ -184,13 +184,13 @@ class Wire(Workload):
         return kind, source or sender, datagram
 
     def _state(self, node: EntangledNode) -> str:
-        """What stands for all that a node remembers: equal states have an equal name, the same in every process."""
+        """Return a name for the state of a node: equal states have equal names, in each process."""
         clock = self._schedule.fleet.clock
         calls = sorted((time, order) for time, order, call in clock._heap if call.active())
         return self._states.setdefault(state_of([node, node.store, calls]), f"state {len(self._states)}")
 
     def _flood(self, place: int) -> None:
-        """Begin more handshakes at once than a node answers; each is from a member that nobody knows."""
+        """Start more handshakes at once than a node answers, from unknown members."""
         node = self._schedule.node(place)
         static = exchange_key(node.identity.public)
         dice = random.Random(f"flood/{self._schedule.seed}")
@@ -202,7 +202,7 @@ class Wire(Workload):
         half_open = len(node.endpoint._half_open._unconfirmed)
         self._history.note(Size, place, "handshakes with who showed no cookie", half_open, FLOOD * 4 // 5)
 
-    # -- questions (R2) ---------------------------------------------------------------------------------------------
+    # -- requests (R2) ----------------------------------------------------------------------------------------------
 
     def _born(self, place: int, node: EntangledNode) -> None:
         self._born_at[self._schedule.fleet.address(place)] = self._schedule.fleet.clock.seconds()
@@ -229,7 +229,7 @@ class Wire(Workload):
     # -- tables (R4) ------------------------------------------------------------------------------------------------
 
     def _tables(self, node: EntangledNode) -> list[tuple[str, int, int]]:
-        """Everything that peers can fill, and its cap."""
+        """Return all tables that peers can fill, with their sizes and limits."""
         endpoint: Any = node.endpoint
         peers, answerer = endpoint._peers, endpoint._answerer
         usage = node.store.usage

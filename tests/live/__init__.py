@@ -2,6 +2,6 @@
 
 import signal
 
-# A job in the background is given an ignored Ctrl-C, and so would the programs be that are sent one here.
+# A background job inherits an ignored SIGINT, and so would the child processes to which these tests send one.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -1,4 +1,4 @@
-"""Demonstration: what the tests of the whole demonstration share: its processes, and their page in a real browser."""
+"""Test cases with the whole demonstration: its processes, and its page in a real browser."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ PATIENCE_MS = 120_000
 
 
 class Demonstration:
-    """``python -m sim.demo`` as a child process; ``invitation`` is the address that it prints, with the code.
+    """``python -m sim.demo`` as a child process; ``invitation`` is the URL that it prints, with the join code.
 
-    With ``is_secure`` it serves its page over TLS as well, and the invitation leads there.
+    With ``is_secure`` the page is also served over TLS, and the invitation is its HTTPS URL.
     """
 
     def __init__(self, log: Path, *options: str, is_secure: bool = False) -> None:
         with log.open("w", encoding="utf-8") as errors:
-            # The page is the same whatever the three are, and the dogs of the yard weigh least.
+            # The page is the same for all kinds of robots, and simulated dogs need the least resources.
             command = [sys.executable, "-m", "sim.demo", "--robot", "sim", "--web-port", "0", *options]
             command += ["--tls"] if is_secure else []
             root = Path(__file__).parents[2]
             self._process = subprocess.Popen(command, cwd=root, stdout=subprocess.PIPE, stderr=errors, text=True)
         self.pid = self._process.pid
-        # Whether a browser may trust the certificate is shown elsewhere; here it is only the way to the camera.
+        # Other tests verify the certificate; here TLS only gives access to the camera.
         self._trust = ssl.create_default_context()
         self._trust.check_hostname, self._trust.verify_mode = False, ssl.CERT_NONE
         self._token = ""
@@ -49,7 +49,7 @@ class Demonstration:
             raise
 
     def _invitation(self, begins: str, log: Path) -> str:
-        """The address in the line that begins so."""
+        """Return the URL in the line that starts with ``begins``."""
         assert self._process.stdout is not None
         said = []
         for line in self._process.stdout:
@@ -57,19 +57,19 @@ class Demonstration:
             if line.startswith(begins):
                 break
             if line.startswith("If its node fails"):
-                raise AssertionError("".join(said))  # no address is said after that
+                raise AssertionError("".join(said))  # no URL follows this line
         else:
             raise AssertionError("".join(said) + log.read_text(encoding="utf-8"))
         threading.Thread(target=self._process.stdout.read, daemon=True).start()
         return said[-1].split()[2]
 
     def sign_in(self, url: str) -> None:
-        """Ask the node of the page at ``url`` from now on."""
+        """Use the node of the page at ``url`` from now on."""
         self.url = url
         self._token = self.api("session", {"code": self.code})["token"]
 
     def api(self, path: str, body: Any = None) -> Any:
-        """What the node of the page at ``url`` answers an operator; ``body`` is sent as JSON."""
+        """Return the answer of the page's node to an operator's request; ``body`` is sent as JSON."""
         headers = {"Content-Type": "application/json", "Authorization": f"Bearer {self._token}"}
         data = None if body is None else json.dumps(body).encode()
         asked = urllib.request.Request(f"{self.url}api/v1/{path}", data, headers)
@@ -83,13 +83,13 @@ class Demonstration:
         return pid
 
     def stop(self) -> None:
-        """End it, and wait until all its processes are gone."""
+        """End the demonstration, and wait for all its processes."""
         self._process.terminate()
         self._process.wait(20)
 
 
 class DemonstrationCase(SynchronousTestCase):
-    """The demonstration, started with ``options``, over TLS as well where it ``is_secure``."""
+    """The demonstration, started with ``options``, with TLS if ``is_secure`` is set."""
 
     options: tuple[str, ...] = ()
     is_secure = False
@@ -105,7 +105,7 @@ class DemonstrationPageCase(BrowserCase, DemonstrationCase):
     """The demonstration, and a browser."""
 
     def opened(self, screen: dict[str, Any], scheme: Any = "light") -> Any:
-        """The page, signed in, when it shows the team."""
+        """Return the page, signed in, when it shows the team."""
         page = self.tab(screen, scheme)
         page.set_default_timeout(PATIENCE_MS)
         page.goto(self.demo.invitation)

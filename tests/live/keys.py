@@ -1,4 +1,4 @@
-"""Keys: those of the web nodes of ``tests.live.team``, by name."""
+"""The keys of the web nodes of ``tests.live.team``, by name."""
 
 from __future__ import annotations
 
@@ -12,5 +12,5 @@ GATEWAYS = ("vaio", "pi")
 
 
 def key_of(name: str) -> TokenKey:
-    """The key of the web node of that name."""
+    """Return the key of the web node of this name."""
     return TokenKey(Identity(hashlib.blake2s(name.encode()).digest()))

@@ -1,6 +1,6 @@
-"""Namespaces: the case for tests that need network namespaces; where there are none they are skipped, and that loudly.
+"""A test case for network namespaces; without support for them its tests are skipped with a prominent message.
 
-With ``SWARM_CI=1`` a machine without them is a failure: there a test that was not run proves nothing.
+With ``SWARM_CI=1`` missing support is a failure, as a skipped test proves nothing.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class NamespaceCase(SynchronousTestCase):
             raise SkipTest(why)
 
     def internet(self, *sites: Site) -> Internet:
-        """One that is gone after the test."""
+        """Return an internet of these sites, which is removed after the test."""
         net = Internet(sites)
         net.__enter__()
         self.addCleanup(net.close)
@@ -36,7 +36,7 @@ class NamespaceCase(SynchronousTestCase):
 
 @cache
 def refused() -> str:
-    """Why there are none, told once in large letters; empty where there are."""
+    """Return the reason why namespaces are unavailable, printed once, or an empty string."""
     why = refusal()
     if why:
         stream = sys.__stderr__ or sys.stderr

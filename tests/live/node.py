@@ -1,4 +1,4 @@
-"""Node: real ``twistd`` processes and the real ``swarm`` command, in a folder of their own."""
+"""Test cases with real ``twistd`` processes and the real ``swarm`` command, in a temporary folder."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ PATIENCE_S = 30.0
 
 
 class Node:
-    """A node in a process of its own; ``lines`` are what it has said."""
+    """A node in a child process; ``lines`` is its output."""
 
     def __init__(self, process: subprocess.Popen[str]) -> None:
         self.process = process
@@ -29,7 +29,7 @@ class Node:
         self._reader.start()
 
     def says(self, words: str) -> None:
-        """Wait until it has said so; fails with what it said instead, at once where it has ended."""
+        """Wait until the output contains ``words``; fail with the output after a timeout or at the node's end."""
 
         def is_said() -> bool:
             has_ended = not self._reader.is_alive()
@@ -42,7 +42,7 @@ class Node:
         until(is_said, told=lambda: "".join(self.lines))
 
     def kill(self) -> None:
-        """End it at once, where it runs."""
+        """Kill the process if it runs."""
         self.process.kill()
         self.process.wait()
         self._reader.join()
@@ -51,11 +51,11 @@ class Node:
 
 
 class NodeCase(SynchronousTestCase):
-    """Nodes of this machine, which keep all that they keep in ``folder``."""
+    """Nodes on this machine, with all their files in ``folder``."""
 
     def setUp(self) -> None:
         super().setUp()
-        # Trial's own folders are deeper than the path of a socket may be.
+        # Trial's folders are deeper than the maximum length of a socket's path.
         self.folder = Path(tempfile.mkdtemp()).resolve()
         self.addCleanup(shutil.rmtree, self.folder)
         inherited = {name: value for name, value in os.environ.items() if not name.startswith("SWARM_")}
@@ -63,7 +63,7 @@ class NodeCase(SynchronousTestCase):
         self.environment = {**inherited, **here, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
 
     def popen(self, *arguments: str, stderr: int = subprocess.PIPE) -> subprocess.Popen[str]:
-        """``twistd -n swarm-node ARGUMENTS``."""
+        """Run ``twistd -n swarm-node ARGUMENTS``."""
         twistd = str(Path(sys.executable).parent / "twistd")
         command = [sys.executable, twistd, "-n", "--pidfile=", "swarm-node", *arguments]
         return subprocess.Popen(
@@ -71,26 +71,26 @@ class NodeCase(SynchronousTestCase):
         )
 
     def node(self, *arguments: str) -> Node:
-        """A node that ends with the test."""
+        """Return a node that is killed after the test."""
         node = Node(self.popen(*arguments, stderr=subprocess.STDOUT))
         self.addCleanup(node.kill)
         return node
 
     def file(self, text: str, name: str = "node") -> str:
-        """A settings file."""
+        """Write a settings file and return its path."""
         path = self.folder / f"{name}.toml"
         path.write_text(text, encoding="utf-8")
         return str(path)
 
     def key_file(self) -> str:
-        """A file with the secret of an open team."""
+        """Write a file with the secret of an open team and return its path."""
         path = self.folder / "team.key"
         path.touch(mode=0o600)
         path.write_text("t\n")
         return str(path)
 
     def swarm(self, *words: str) -> subprocess.CompletedProcess[str]:
-        """``swarm WORDS``."""
+        """Run ``swarm WORDS``."""
         program = "import sys; from swarmnode.command import main; sys.exit(main(sys.argv[1:]))"
         return subprocess.run(
             [sys.executable, "-c", program, *words],

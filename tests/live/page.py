@@ -1,8 +1,8 @@
-"""Page: what the tests in a real browser share: the screens, the page's server as a child process, and opening it.
+"""Shared parts of the tests in a real browser: screens, the page's server as a child process, and opened pages.
 
-A browser, its driver and the program that serves teams start slowly, and ``trial -j`` hands out single tests, so that a
-fixture of a class would be made for each.  They are started once in a process and live as long as it; each test has a
-browser context and a team of its own.
+A browser, its driver and the program that serves teams start slowly, and ``trial -j`` distributes single tests, so
+that a class fixture would be created for each.  They are started once per process and kept; each test has a separate
+browser context and team.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ SMALL = """[...document.querySelectorAll('button, input, select, nav a')].filter
 
 
 def pin(port: int) -> str:
-    """What Chromium is told to trust: the hash of the public key of the certificate that is served there."""
+    """Return the hash of the public key of the certificate at this port, for Chromium to trust."""
     from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
     from cryptography.x509 import load_pem_x509_certificate
 
@@ -70,7 +70,7 @@ def pin(port: int) -> str:
 
 
 def film(path: Path) -> Path:
-    """A film for the fake camera, 320 x 240: a red disc that trembles a little."""
+    """Write a video for the fake camera, 320 x 240: a red disc that trembles slightly."""
     import cv2
     import numpy as np
 
@@ -84,10 +84,10 @@ def film(path: Path) -> Path:
 
 
 class Chromium:
-    """The driver of the browser and a browser whose camera shows a film; a context without leave has no camera.
+    """The browser's driver and a browser with a video as camera; a context without permission has no camera.
 
-    Between two calls the driver has the thread marked as running an event loop; other tests run theirs, so the mark is
-    removed while no test uses it.
+    Between two calls the driver marks the thread as running an event loop; other tests run theirs, so the mark is
+    removed while no test uses the driver.
     """
 
     def __init__(self) -> None:
@@ -101,18 +101,18 @@ class Chromium:
         self.browser = self.launched("--host-resolver-rules=MAP vaio.local 127.0.0.1")
 
     def launched(self, *flags: str) -> Any:
-        """Another one, with more flags."""
+        """Start a browser with additional flags."""
         camera = ("--use-fake-device-for-media-stream", f"--use-file-for-fake-video-capture={self._film}")
         return self._driver.chromium.launch(executable_path=CHROMIUM, args=[*FLAGS, *camera, *flags])
 
     def resume(self) -> None:
-        """A test begins to use it."""
+        """Prepare the browser for a test."""
         asyncio._set_running_loop(self._loop)
         if not self.browser.is_connected():
             self.browser = self.launched("--host-resolver-rules=MAP vaio.local 127.0.0.1")
 
     def pause(self) -> None:
-        """A test has used it."""
+        """Release the browser after a test."""
         asyncio._set_running_loop(None)
 
     def _end(self) -> None:
@@ -124,12 +124,12 @@ class Chromium:
 
 @cache
 def chromium() -> Chromium:
-    """The one of this process."""
+    """Return the browser of this process."""
     return Chromium()
 
 
 class Team:
-    """A team and its page, served by a child process; ``order`` changes what it shows."""
+    """A team and its page, served by a child process; ``order`` changes its content."""
 
     _idle: list[subprocess.Popen[str]] = []
     """Processes that serve no team now."""
@@ -151,18 +151,18 @@ class Team:
         return process
 
     def order(self, words: str) -> str:
-        """Give an order, and wait until it is done; what the process says of it."""
+        """Send an order, wait for its end, and return the answer."""
         assert self._process.stdin is not None and self._process.stdout is not None
         self._process.stdin.write(words + "\n")
         self._process.stdin.flush()
         return self._process.stdout.readline()
 
     def freeze(self) -> None:
-        """Let the whole process stand, with its port open."""
+        """Suspend the process, with its port open."""
         os.kill(self.pid, signal.SIGSTOP)
 
     def thaw(self) -> None:
-        """Let it go on."""
+        """Resume the process."""
         os.kill(self.pid, signal.SIGCONT)
 
     def stop(self) -> None:
@@ -171,7 +171,7 @@ class Team:
         self._process.communicate()
 
     def end(self) -> None:
-        """Close the page; the process serves another team later."""
+        """Close the page; the process is used for another team later."""
         if self._process.poll() is None:
             self.thaw()
             if self.order("end"):
@@ -181,7 +181,7 @@ class Team:
 
 
 class BrowserCase(SynchronousTestCase):
-    """A browser; ``faults`` are the errors of its pages, ``asked`` the addresses that the newest one asked for."""
+    """A browser; ``faults`` are the errors of its pages, ``asked`` the URLs that the newest one requested."""
 
     if MISSING:
         skip = f"THE PAGE IS NOT TESTED IN A BROWSER: missing {'; '.join(MISSING)}"
@@ -196,15 +196,15 @@ class BrowserCase(SynchronousTestCase):
         self.faults: list[str] = []
 
     def launched(self, *flags: str) -> Any:
-        """A browser for this test alone, with more flags."""
+        """Return a separate browser for this test, with additional flags."""
         browser = chromium().launched(*flags)
         self.addCleanup(browser.close)
         return browser
 
     def tab(self, screen: dict[str, Any], scheme: Any = "light", **more: Any) -> Any:
-        """Return an empty page on that screen, in a session of its own.
+        """Return an empty page on that screen, in a new session.
 
-        Its service worker, which loads every file again, is blocked unless ``service_workers="allow"`` is given.
+        The service worker, which loads all files again, is blocked unless ``service_workers="allow"`` is given.
         """
         more = {"service_workers": "block", **more}
         context = self.browser.new_context(**screen, color_scheme=scheme, reduced_motion="reduce", **more)
@@ -217,42 +217,42 @@ class BrowserCase(SynchronousTestCase):
         return page
 
     def wait_for_node(self, page: Any, name: str) -> None:
-        """Wait until the page is live at the web node ``name``."""
+        """Wait until the page is connected to the web node ``name``."""
         page.locator("#node", has_text=name).wait_for()
         page.locator("#link[data-link=live]").wait_for()
 
     def live(self, page: Any, devices: int = 3) -> Any:
-        """The page, when it shows so many devices of the team."""
+        """Return the page when it shows this number of devices."""
         page.locator("#link[data-link=live]").wait_for()
         page.locator(".device").nth(devices - 1).wait_for(state="attached")
         return page
 
     def informed(self, page: Any) -> Any:
-        """The page, when it knows what its node has; that takes the place of what was there before."""
+        """Return the page when it has its node's features, which change its content."""
         page.evaluate(INFORMED)
         return page
 
     def view(self, page: Any, name: str) -> None:
-        """Look at a view, as a link to it does."""
+        """Open a view, as a link does."""
         page.evaluate(f"location.hash = {name!r}")
         page.locator(f"body[data-view={name}]").wait_for()
 
     def floor(self, page: Any) -> Callable[[float, float], tuple[float, float]]:
-        """Where on the screen a place of the yard is, from its metres."""
+        """Return a function from metres on the map to pixels on the screen."""
         box = page.locator(".floor").bounding_box()
         return lambda x, y: (box["x"] + box["width"] * x / 3.0, box["y"] + box["height"] * (1 - y / 2.4))
 
     def pass_by(self, page: Any, seconds: float) -> None:
-        """Turn the page's clock on; what it asks for thereupon has been asked for."""
+        """Advance the page's clock, and wait until the resulting requests are sent."""
         page.clock.fast_forward(1000 * seconds)
         page.evaluate("fetch('/api/v1/node').then((told) => told.text())")
 
     def told(self, page: Any, words: str) -> None:
-        """Wait until the page says so."""
+        """Wait until the page shows this message."""
         page.locator("#line", has_text=words).wait_for()
 
     def tab_to(self, page: Any, what: str) -> None:
-        """Go there by the Tab key alone."""
+        """Move the focus to an element with the Tab key."""
         for _ in range(90):
             if page.evaluate(f"document.activeElement.matches({what!r})"):
                 return
@@ -260,7 +260,7 @@ class BrowserCase(SynchronousTestCase):
         self.fail(f"no way to {what} by keyboard")
 
     def sound(self, page: Any) -> None:
-        """Axe finds nothing in what stands there now, nothing is wider than the screen, cut off or too small."""
+        """Check that axe finds no violation, and that no element is too wide, too small or cut off."""
         from axe_playwright_python.sync_playwright import Axe
 
         where = page.evaluate("`${innerWidth} ${location.hash}`")
@@ -270,14 +270,14 @@ class BrowserCase(SynchronousTestCase):
         self.assertEqual((page.evaluate(SMALL), self.faults), ([], []), where)
 
     def sound_by_day_and_night(self, page: Any) -> None:
-        """So it is in light colours and in dark ones."""
+        """Check the page in light and dark colours."""
         for scheme in ("light", "dark"):
             page.emulate_media(color_scheme=scheme)
             self.sound(page)
 
 
 class TeamCase(SynchronousTestCase):
-    """The page of the team of ``tests.live.team``."""
+    """The page of a team of ``tests.live.team``."""
 
     def setUp(self) -> None:
         super().setUp()
@@ -286,15 +286,15 @@ class TeamCase(SynchronousTestCase):
 
 
 class PageCase(BrowserCase, TeamCase):
-    """Such a page, and a browser."""
+    """The page of a team, and a browser."""
 
     def note(self, words: Any) -> None:
-        """Take note of what the page's console calls an error, and of where it comes from."""
+        """Record an error on the page's console, with its source."""
         if words.type == "error":
             self.faults.append(f"{words.text} {words.location['url']}")
 
     def opened(self, screen: dict[str, Any], scheme: Any = "light", has_clock: bool = False) -> Any:
-        """The page, signed in, when it shows the team; with ``has_clock`` its time can ``pass_by``."""
+        """Return the page, signed in, when it shows the team; with ``has_clock``, ``pass_by`` controls its time."""
         page = self.tab(screen, scheme)
         page.on("console", self.note)
         if has_clock:

@@ -1,7 +1,7 @@
 """Take the pictures of the page in docs/images from a real demonstration.
 
-``python -m tests.live.pictures`` takes all, with names of scenes only those.  The pictures show no mouse pointer, and
-have at most 256 colours, so that the files are small.
+``python -m tests.live.pictures`` takes all pictures; names of scenes as arguments select some.  The pictures show no
+mouse pointer, and have at most 256 colours to keep the files small.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ Picture = np.ndarray[Any, np.dtype[np.uint8]]
 
 
 class Photographer:
-    """Pages of one demonstration, and the pictures that are taken of them."""
+    """Pages of one demonstration, and the pictures of them."""
 
     def __init__(self, browser: Any, invitation: str) -> None:
         self._browser = browser
         self._invitation = invitation
 
     def opened(self, screen: dict[str, Any], scheme: str = "light", address: str = "") -> Any:
-        """A page, when it shows the team, or what else is at its ``address``."""
+        """Open a page and return it when it shows the team, or open the page at ``address``."""
         context = self._browser.new_context(**screen, color_scheme=scheme, reduced_motion="reduce")
         page = context.new_page()
         page.set_default_timeout(PATIENCE_MS)
@@ -53,25 +53,25 @@ class Photographer:
         return page
 
     def view(self, page: Any, name: str) -> None:
-        """Look at a view."""
+        """Open a view."""
         page.evaluate(f"location.hash = {name!r}")
         page.locator(f"body[data-view={name}]").wait_for()
         if name == "network":
             page.locator("#ties td").first.wait_for()
 
     def seen(self, page: Any) -> Picture:
-        """What the page shows now."""
+        """Return a screenshot of the page."""
         told = page.screenshot()
         picture = cv2.imdecode(np.frombuffer(told, np.uint8), cv2.IMREAD_COLOR)
         assert picture is not None
         return np.asarray(picture, np.uint8)
 
     def take(self, page: Any, name: str) -> None:
-        """Keep that."""
+        """Store a screenshot of the page."""
         keep(name, self.seen(page))
 
     def executing(self, page: Any) -> str:
-        """Have the demonstration run until a dog goes; returns its name."""
+        """Run the demonstration until a dog acts; return the dog's name."""
         page.get_by_role("button", name="Run Demo").click()
         going = page.locator(".device[data-state=EXECUTING] b")
         going.wait_for(state="attached")
@@ -92,23 +92,23 @@ def keep(name: str, picture: Picture) -> None:
 
 
 def beside(pictures: list[Picture]) -> Picture:
-    """Some of one height, side by side."""
+    """Return pictures of equal height, side by side."""
     gap = np.full((pictures[0].shape[0], GAP, 3), GREY, np.uint8)
     row = [each for picture in pictures for each in (picture, gap)][:-1]
     return np.hstack(row)
 
 
 def packed(picture: Picture) -> bytes:
-    """A PNG of the colours that serve it best, found by k-means with a fixed seed."""
+    """Return a PNG with the best palette, found by k-means with a fixed seed."""
     cv2.setRNGSeed(1)
     found = picture.reshape(-1, 3).astype(np.float32)
     some = found[np.random.default_rng(1).integers(0, len(found), SAMPLED)]
-    # What is rare on the whole, as a line of text in red, counts once at least.
+    # A rare colour, such as a line of red text, counts at least once.
     some = np.vstack([some, np.unique(picture.reshape(-1, 3) // 16 * 16 + 8, axis=0).astype(np.float32)])
     end = (cv2.TERM_CRITERIA_MAX_ITER + cv2.TERM_CRITERIA_EPS, 12, 1.0)
     _, _, centres = cv2.kmeans(some, COLOURS, np.zeros(0, np.int32), end, 1, cv2.KMEANS_PP_CENTERS)
     usual, counts = np.unique(picture.reshape(-1, 3), axis=0, return_counts=True)
-    # The grounds and the letters themselves, which cover most of it, are kept as they are.
+    # The colours of backgrounds and text, which cover most of the picture, stay exact.
     exact = usual[np.argsort(-counts)[: 256 - COLOURS]]
     palette = np.vstack([exact, np.rint(centres).astype(np.uint8)])
     cube = np.stack(np.meshgrid(*[np.arange(4, 256, 8)] * 3, indexing="ij"), -1).reshape(-1, 3).astype(np.float32)
@@ -130,7 +130,7 @@ def packed(picture: Picture) -> bytes:
 
 
 def quiet(photographer: Photographer, demo: Demonstration) -> None:
-    """Before anything is asked of the team."""
+    """Take pictures before the first task."""
     desk, phone = photographer.opened(DESK), photographer.opened(PHONE)
     desk.locator("figure[data-camera=live]").nth(2).wait_for()
     photographer.take(desk, "devices")
@@ -145,7 +145,7 @@ def quiet(photographer: Photographer, demo: Demonstration) -> None:
 
 
 def running(photographer: Photographer) -> None:
-    """While a dog goes to the target, on every screen, and afterwards."""
+    """Take pictures on each screen while a dog acts."""
     screens = {
         "demo-desktop": photographer.opened(DESK),
         "demo-desktop-dark": photographer.opened(DESK, "dark"),
@@ -167,7 +167,7 @@ def running(photographer: Photographer) -> None:
 
 
 def lost(photographer: Photographer, demo: Demonstration) -> None:
-    """The dog on its way is cut off; another takes over, which every view tells in its way."""
+    """Take pictures of all views after the acting dog has lost its network and another has taken over."""
     desk = photographer.opened(DESK)
     phones = {scheme: photographer.opened(PHONE, scheme) for scheme in ("light", "dark")}
     photographer.view(phones["dark"], "groups")
@@ -198,7 +198,7 @@ def lost(photographer: Photographer, demo: Demonstration) -> None:
 
 
 def takeover(photographer: Photographer, demo: Demonstration) -> None:
-    """Film a takeover: the node of the dog on its way is killed, and another dog gets the task."""
+    """Record a takeover as animation: the node of the acting dog is killed, and another dog gets the task."""
     desk = photographer.opened(DESK)
     frames: list[Picture] = []
     times: list[float] = []
@@ -225,7 +225,7 @@ def takeover(photographer: Photographer, demo: Demonstration) -> None:
 
 
 def opened(photographer: Photographer, demo: Demonstration) -> None:
-    """A device's dialog."""
+    """Take pictures of a device's dialog."""
     (uuid,) = [device["uuid"] for device in demo.api("devices") if device["name"] == "dog2"]
     for screen, scheme, name in ((DESK, "dark", "device-desktop"), (PHONE, "light", "device-phone")):
         page = photographer.opened(screen, scheme)
@@ -236,7 +236,7 @@ def opened(photographer: Photographer, demo: Demonstration) -> None:
 
 
 def stopped(photographer: Photographer) -> None:
-    """The team stands while its dogs search."""
+    """Take a picture of the stopped team."""
     phone = photographer.opened(PHONE)
     phone.get_by_role("button", name="Run Demo").click()
     phone.locator(".device[data-state=SEARCHING]").nth(2).wait_for()
@@ -248,7 +248,7 @@ def stopped(photographer: Photographer) -> None:
 
 
 def outdoors(browser: Any) -> None:
-    """Devices that say where they are, where there is no yard: of the tests' own team, as the demonstration has one."""
+    """Take a picture of positions on a map without a simulator, with the team of the tests."""
     team = Team()
     try:
         team.order("outdoors")
@@ -266,7 +266,7 @@ def outdoors(browser: Any) -> None:
 
 
 def main(wanted: list[str]) -> int:
-    """Take all, or those of the scenes whose names are ``wanted``."""
+    """Take all pictures, or only the ``wanted`` scenes."""
     if MISSING:
         sys.stdout.write(f"missing {'; '.join(MISSING)}\n")
         return 1
@@ -284,7 +284,7 @@ def main(wanted: list[str]) -> int:
                 "opened": lambda: opened(photographer, demo),
                 "stopped": lambda: stopped(photographer),
                 "outdoors": lambda: outdoors(browser),
-                # It ends a node of the demonstration for good.
+                # It permanently ends a node of the demonstration.
                 "takeover": lambda: takeover(photographer, demo),
             }
             for name, scene in scenes.items():

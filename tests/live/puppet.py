@@ -1,6 +1,6 @@
-"""Puppet: a program with one robot and nothing else of a node, for tests that freeze and kill it.
+"""A program with one robot and no other part of a node, for tests that freeze and kill it.
 
-It is given a kind and its options (JSON); it reads ``walk SECONDS`` and says what becomes of that.
+Its arguments are a driver's kind and options (JSON); it executes commands on its input and prints the results.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ SPEED = 0.1
 
 
 class Puppet(LineReceiver):
-    """What is said on the standard input, done."""
+    """Executes the commands on the standard input."""
 
     delimiter = b"\n"
 
@@ -32,7 +32,7 @@ class Puppet(LineReceiver):
         self._driver = driver
 
     def lineReceived(self, line: bytes) -> None:  # noqa: N802 (Twisted's)
-        """Walk for so long, and say until when; or say how it stands with the switch."""
+        """Walk for some seconds and print the deadline, or print the state of the dead man's switch."""
         word, *numbers = line.decode().split()
         if word == "walk":
             deadline = REACTOR.seconds() + float(numbers[0])
@@ -43,7 +43,7 @@ class Puppet(LineReceiver):
 
 
 def pid_of(driver: BaseDriver) -> int:
-    """The process of its dead man's switch; 0 for none."""
+    """Return the process id of the dead man's switch, or 0 without one."""
     keeper = driver._dead_man
     return keeper.pid or 0 if isinstance(keeper, Keeper) else 0
 

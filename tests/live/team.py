@@ -1,13 +1,15 @@
 """A web node with three dogs that stand still: the server of the page's tests, run as a child process.
 
-``python -m tests.live.team`` does what the lines on its input say, and answers each with a line.  ``team PORT`` begins
-a new team, and is answered with the port, the code to sign in with, and an operator's token and ticket; vaio and pi
-vouch for each other's sessions.  ``end`` closes its page.  Others change the team: ``gone NAME``, ``back NAME``,
-``status NAME STATUS``, ``name NAME`` (of the node that serves),
-``pages NODE=URL ...`` (the web nodes, itself first), ``strange FILE`` (devices and tasks whose words are those of that
-JSON list), ``session SECONDS`` (that one is signed in for at a time), ``place NAME KEY=NUMBER ...`` (where it says that
-it is), ``outdoors`` (without a yard), ``crowd COUNT`` (so many devices, three of them with cameras); it ends when its
-input does.
+``python -m tests.live.team`` executes the commands on its input, and answers each with a line.  ``team PORT`` starts a
+new team; the answer contains the port, the join code, and an operator's token and ticket; vaio and pi accept each
+other's sessions.  ``end`` closes its page.  The other commands change the team:
+
+``gone NAME``, ``back NAME``, ``status NAME STATUS``, ``name NAME``: the name of the node that serves the page, ``pages
+NODE=URL ...``: the web nodes, starting with this one, ``strange FILE``: devices and tasks with the texts of this JSON
+list, ``session SECONDS``: the duration of a session, ``place NAME KEY=NUMBER ...``: the position that a device
+reports, ``outdoors``: no simulator, ``crowd COUNT``: this number of devices, three of them with cameras.
+
+The program ends at the end of its input.
 """
 
 from __future__ import annotations
@@ -54,7 +56,7 @@ HUES = {"dog1": (70, 90, 150), "dog2": (70, 150, 90), "dog3": (150, 100, 70)}
 
 
 def dog(number: int, status: str, task: str, started: float) -> dict[str, Any]:
-    """The record of one dog."""
+    """Return the record of one dog."""
     return {
         "uuid": f"{number:02x}" * 16,
         "name": f"dog{number}",
@@ -78,7 +80,7 @@ def dog(number: int, status: str, task: str, started: float) -> dict[str, Any]:
 
 
 def why() -> dict[str, Any]:
-    """Two decisions: dog3's was overtaken when dog2 came near, and dog3 knew nothing of it."""
+    """Return two decisions: dog3's is followed by dog2's, of which dog3 does not know."""
     costs = {"dog2": 0.62, "dog1": 1.04, "dog3": 1.37}
     reports = [{"agent": f"0{name[-1]}" * 16, "name": name, "cost": cost, "more": ""} for name, cost in costs.items()]
     first = {
@@ -116,7 +118,7 @@ def why() -> dict[str, Any]:
 
 
 class Team:
-    """What the front door would hand in: the records, and pictures from nowhere."""
+    """The parts that the service normally provides: the records, and generated camera frames."""
 
     def __init__(self) -> None:
         now = time.time()
@@ -150,7 +152,7 @@ class Team:
         ]
 
     def read(self) -> State:
-        """The state as it is now; made once a second, or when something was ordered."""
+        """Return the state, updated each second and after each command."""
         now = self.version, int(time.time()), self.halts.is_halted()
         if self._made[0] != now:
             self._made = now, self._state()
@@ -179,7 +181,7 @@ class Team:
         return {**state, "halted": self.halts.is_halted()}
 
     def be_strange(self, words: list[str]) -> None:
-        """A device, a task and a decision of each of ``words``, with them wherever others' words are shown."""
+        """Create a device, a task and a decision for each of ``words``, with this text in each text field."""
         now = time.time()
         self.batch += 1
         self.devices, self.tasks = [], []
@@ -210,7 +212,7 @@ class Team:
         self._departed = Departed()
 
     def be_many(self, count: int) -> None:
-        """More dogs, up to ``count``, most of which only listen."""
+        """Add idle dogs up to ``count``."""
         now = time.time()
         for number in range(len(self.devices) + 1, count + 1):
             more = {"name": f"unit{number}", "uuid": f"{number:032x}", "joined": number, "kind": "turtlebot"}
@@ -218,7 +220,7 @@ class Team:
             self.devices.append({**dog(number % 250, "IDLE", "", now), **more, "capabilities": able})
 
     def watch(self, uuid: str, on_frame: OnFrame) -> Any:
-        """Pictures of a floor, a wall and a red ball that rolls, ``FPS`` a second."""
+        """Send frames of a floor, a wall and a rolling red ball, ``FPS`` per second."""
         number = int(uuid[:2], 16)
         seq = 0
         running = True
@@ -270,7 +272,7 @@ CATALOGUE = [
 
 
 class Orders(LineReceiver):
-    """What the test writes on the child's input."""
+    """Executes the test's commands on the standard input."""
 
     delimiter = b"\n"
 
@@ -281,7 +283,7 @@ class Orders(LineReceiver):
     _pages: list[Page]
 
     def lineReceived(self, line: bytes) -> None:
-        """Do one order and answer, so that the test knows that it was done."""
+        """Execute one command and answer it, so that the test knows its end."""
         verb, *rest = line.decode().split()
         if verb == "team":
             self._begin(int(rest[0]))
@@ -293,7 +295,7 @@ class Orders(LineReceiver):
             self.sendLine(line)
 
     def _begin(self, port: int) -> None:
-        """Serve a new team, and say where it is and how to come in."""
+        """Serve a new team, and answer with its port and credentials."""
         self._team = team = Team()
         pages = Fallbacks()
         self._pages = pages.pages
@@ -340,7 +342,7 @@ class Orders(LineReceiver):
 
 
 def board(team: Team) -> Board:
-    """What the page can ask for: twins in memory, so that every order is taken and none does harm."""
+    """Return the page's services: fakes in memory that accept each order."""
     desk = MemoryDesk(CATALOGUE, team.yard)
     able = [{"uuid": f"{n:02x}" * 16, "name": f"dog{n}", "busy": "Patrol the yard" * (n == 2)} for n in (1, 2)]
     desk.frames = team
@@ -356,21 +358,21 @@ def board(team: Team) -> Board:
 
 
 class TeamSessions(SignedSessions):
-    """Sessions with tokens for gateways alone, whoever is listed."""
+    """Sessions with tokens for gateways only."""
 
     def passes(self, who: Visitor, nodes: Iterable[str], now: float) -> dict[str, Token]:
-        """Those of gateways."""
+        """Return the tokens for gateways."""
         gateways = {key_of(name).node_id.hex() for name in GATEWAYS}
         return super().passes(who, [node for node in nodes if node in gateways], now)
 
 
 def checked(text: str, password: str) -> Deferred[Any]:
-    """Whether it is the password, worked out on a thread."""
+    """Check a password on a thread."""
     return deferToThread(is_password, text, password)
 
 
 def network() -> Any:
-    """Two that know each other and a third, which does not answer."""
+    """Return the view of a network: two nodes know each other, and a third does not answer."""
     uuids = {n: f"0{n}" * 16 for n in (1, 2, 3)}
 
     def view(others: tuple[int, ...], lookups: list[Any]) -> dict[str, Any]:
@@ -389,7 +391,7 @@ def network() -> Any:
 
 
 def links() -> Any:
-    """The page's node reaches three in three ways; one was put out, and a code was no good."""
+    """Return the links of the page's node: three path kinds, a revoked member and a rejected join code."""
     vaio, uuids = "0a" * 16, {n: f"0{n}" * 16 for n in (1, 2, 3)}
 
     def way(n: int, kind: str, score: int | None, rtt: float | None = None, by: str = "") -> dict[str, Any]:
@@ -421,7 +423,7 @@ def links() -> Any:
 
 
 def membership() -> Any:
-    """A closed team; the certificate of one member is about to expire."""
+    """Return a closed team; the certificate of one member expires soon."""
     now = time.time()
     members = [
         {
@@ -439,7 +441,7 @@ def membership() -> Any:
 
 
 def inventory() -> Any:
-    """A handful of records."""
+    """Return an inventory of a few records."""
     newest = [["devices", "dog1", 540, "leased"], ["tasks", "t1", 310, "team"]]
     return {
         "records": 9,

@@ -1,4 +1,4 @@
-"""What an operator does on the page, in a real browser: by touch, by mouse and by keyboard alone."""
+"""Tests of an operator's actions on the page in a real browser: by touch, by mouse and by keyboard."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ class ActionPageTests(PageCase):
     timeout = 170
 
     def test_stop_from_everywhere(self) -> None:
-        """One touch stops the team, wherever the page is scrolled and before an open device; another lets it go on."""
+        """One touch stops the team from each scroll position and dialog, and another one releases it."""
         page = self.opened(PHONE)
         corner = page.locator(".stop").bounding_box()
         page.locator(".stop").tap()
@@ -35,7 +35,7 @@ class ActionPageTests(PageCase):
         self.assertEqual(self.faults, [])
 
     def test_stop_by_keyboard(self) -> None:
-        """With the Tab and Enter keys alone the team is stopped and let go on; the stop is near the beginning."""
+        """The Tab and Enter keys suffice to stop and release the team; the stop button is near the start."""
         page = self.opened(DESK)
         page.keyboard.press("Tab")
         page.keyboard.press("Tab")
@@ -48,7 +48,7 @@ class ActionPageTests(PageCase):
         self.told(page, "The team is released.")
 
     def test_ask_before_assigning(self) -> None:
-        """Who could take the chosen task and who not, and why, stands below it before it is assigned."""
+        """Before a task is assigned, the page shows the devices that can execute it, and reasons for the others."""
         page = self.opened(PHONE)
         self.view(page, "tasks")
         page.locator(".preview [data-can=can]", has_text="dog1, dog2 (now: Patrol the yard)").wait_for()
@@ -57,7 +57,7 @@ class ActionPageTests(PageCase):
         page.locator(".preview [data-can=nobody]", has_text="No device here can take it").wait_for()
 
     def test_assign_to_a_group(self) -> None:
-        """By touch and by keyboard a task is put into a group, after its preview has said what it is divided with."""
+        """A task is added to a group by touch and by keyboard; the preview lists the tasks of the group."""
         for screen, type_on in ((PHONE, False), (DESK, True)):
             page = self.opened(screen)
             self.view(page, "tasks")
@@ -85,7 +85,7 @@ class ActionPageTests(PageCase):
             self.sound(page)
 
     def test_lift_a_robot(self) -> None:
-        """A robot is dragged elsewhere, moved by the arrow keys and turned by a click or Enter; the target stays."""
+        """A robot is moved by dragging and arrow keys, and turned by a click or Enter; the target stays."""
         page = self.opened(DESK)
         at = self.floor(page)
         page.locator(".dog .grip").nth(2).wait_for(state="attached")
@@ -115,7 +115,7 @@ class ActionPageTests(PageCase):
         self.assertEqual(self.faults, [])
 
     def test_lift_a_robot_by_touch(self) -> None:
-        """A finger on a robot or the target takes it along, and scrolls nothing meanwhile; a tap turns a robot."""
+        """A finger on a robot or the target moves it without scrolling; a tap turns a robot."""
         page = self.opened(PHONE)
         page.locator(".dog .grip").nth(2).wait_for(state="attached")
         self.view(page, "map")
@@ -150,7 +150,7 @@ class ActionPageTests(PageCase):
         self.assertEqual(self.faults, [])
 
     def test_change_settings(self) -> None:
-        """A device's settings are read, changed and saved by keyboard; what is no table is said so."""
+        """A device's settings are shown, changed and saved by keyboard; invalid ones are refused with the reason."""
         page = self.opened(PHONE)
         page.locator(".device").first.tap()
         name = page.locator("[name=description]")
@@ -173,7 +173,7 @@ class ActionPageTests(PageCase):
         self.assertEqual(self.faults, [])
 
     def test_be_accessible(self) -> None:
-        """Stopped, on phone and desk, light and dark, axe finds nothing and nothing is cut off or too small."""
+        """On phone and desktop, in light and dark, the page of a stopped team has no accessibility violation."""
         for screen in (PHONE, DESK):
             page = self.opened(screen)
             page.locator(".preview li").first.wait_for(state="attached")

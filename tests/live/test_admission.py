@@ -1,4 +1,4 @@
-"""A closed team of real processes: made, joined by a code over UDP, and left again."""
+"""Tests of a closed team of real processes: created, joined with a code over UDP, and left."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from tests.live.node import PATIENCE_S, NodeCase
 
 class ClosedTeamTests(NodeCase):
     def told(self, *words: str, code: int = 0) -> Any:
-        """What ``swarm WORDS --json`` answers; where it is refused, what it complains of."""
+        """Return the answer of ``swarm WORDS --json``, or its error output if it fails with ``code``."""
         done = self.swarm(*words, "--json")
         self.assertEqual(done.returncode, code, done.stderr)
         return json.loads(done.stdout) if code == 0 else done.stderr
 
     def test_made_joined_and_left(self) -> None:
-        """From nothing to a team of two by four commands; a used code and a revoked member are refused by name."""
+        """Four commands create a team of two; a used code and a revoked member are refused with the reason."""
         [port] = free("udp", "127.0.0.1", 1)
         team = self.told("init", "yard", "--first", "vaio", "--at", f"127.0.0.1:{port}")
         self.node("--config", team["settings"]).says("vaio joined")

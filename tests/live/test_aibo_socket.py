@@ -1,4 +1,4 @@
-"""An emulated dog and its driver over real loopback sockets, pictures over TCP and over UDP."""
+"""Tests of an emulated dog and its driver over real loopback sockets, with frames over TCP and UDP."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from tests.webnode.picture import jpeg
 
 
 def free_ports() -> dict[str, int]:
-    """Numbers that nobody uses at the moment, one for each of the dog's ports."""
+    """Return an unused port number for each of the dog's ports."""
     return dict(zip(EMULATED, free("tcp", "127.0.0.1", len(EMULATED)), strict=True))
 
 
 class AiboSocketTests(TestCase):
-    """The whole way, socket to socket."""
+    """Driver and emulator over sockets."""
 
     timeout = 30
 
     async def test_drives_and_films(self) -> None:
-        """Over either transport a dog connects, films, walks, stops, survives a reboot, and leaves its ports free."""
+        """Over both transports a dog connects, sends frames, walks, stops, survives a reboot and frees its ports."""
         for transport in ("tcp", "udp"):
             await self._drive(transport)
 

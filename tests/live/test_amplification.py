@@ -1,4 +1,4 @@
-"""S8: nobody gets more bytes out of a node than he put in, before he has proved his address."""
+"""S8: a node sends no more bytes than it received to an address that has not proved itself."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ PAUSE_S = 0.002
 
 
 class AmplificationTests(NamespaceCase):
-    """A node at ``pub``, a member that joined it, and a stranger who has recorded everything and makes up more."""
+    """A node at ``pub``, a member that joined it, and an attacker that sends recorded and random datagrams."""
 
     def test_a_stranger_gets_no_more_than_he_sends(self) -> None:
-        """Recordings sent again from elsewhere, and noise of every first byte and length, bring back fewer bytes."""
+        """Recorded datagrams from another address, and random ones with each first byte, cause fewer bytes back."""
         folder = Path(self.mktemp()).absolute()
         folder.mkdir(parents=True)
         with Internet([Site("a", Kind.PORT), Site("b", Kind.PORT), Site("stranger", Kind.NONE)]) as net:
@@ -61,10 +61,10 @@ class AmplificationTests(NamespaceCase):
                     await asyncio.sleep(0.05)
             traffic = seen.from_host(net.address("stranger1"))
             self.assertEqual(traffic.received, len(sent))
-            # Something came back, so that there was something to count.
+            # Some answers arrived, so the comparison is meaningful.
             self.assertGreater(traffic.sent, 0)
             self.assertLessEqual(traffic.amplification, 1.0)
-            # Each datagram has a port of its own: no answer was paid for by another question.
+            # Each datagram has a separate port, so no answer is covered by another request's bytes.
             for peer, each in seen.traffic.items():
                 if peer.startswith(net.address("stranger1") + ":"):
                     self.assertLessEqual(each.amplification, 1.0)

@@ -1,4 +1,4 @@
-"""Calls in processes of their own."""
+"""Tests of calls in child processes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from sim.team.scale.apart import apart
 
 
 class Ended(Exception):
-    """A signal has come."""
+    """A signal has arrived."""
 
 
 def ended(*signal: Any) -> None:
@@ -23,7 +23,7 @@ def ended(*signal: Any) -> None:
 
 class ApartTests(SynchronousTestCase):
     def test_returns_and_raises(self) -> None:
-        """What a call returns and raises arrives here, and what it changes does not."""
+        """Results and exceptions of the call reach the parent, and changes of variables do not."""
         changed: list[int] = []
 
         def call() -> int:
@@ -36,12 +36,12 @@ class ApartTests(SynchronousTestCase):
             apart(lambda: int("none"), ValueError)
 
     def test_ends_without_a_word(self) -> None:
-        """A process that ends before it has answered is told of, with its exit code."""
+        """A child process that ends without an answer raises an error with its exit code."""
         with self.assertRaisesRegex(RuntimeError, "exit code 7"):
             apart(lambda: os._exit(7))
 
     def test_ended_with_who_waits_for_it(self) -> None:
-        """Who is ended while it waits ends the call as well, which can say so before it goes."""
+        """If the waiting parent is interrupted, the call is ended as well, and its exception arrives."""
         ready, told = os.pipe()
         self.addCleanup(os.close, ready)
         self.addCleanup(os.close, told)

@@ -1,4 +1,4 @@
-"""Real ``twistd`` processes that are given bad input, and one that waits for a bootstrap that is not up."""
+"""Tests of real ``twistd`` processes with invalid input, and of one without its bootstrap node."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from tests.live.node import PATIENCE_S, NodeCase
 
 
 class BadInputTests(NodeCase):
-    """One line on stderr, exit code 2, no traceback; ``tests.swarmnode.test_plugin`` shows what each line says."""
+    """Invalid input gives one line on stderr and exit code 2; ``tests.swarmnode.test_plugin`` checks each line."""
 
     def refused(self, *arguments: str) -> str:
-        """The line that a node is refused with."""
+        """Return the error line of a refused node."""
         child = self.popen(*arguments)
         self.addCleanup(child.kill)
         output, errors = child.communicate(timeout=PATIENCE_S)
@@ -24,17 +24,17 @@ class BadInputTests(NodeCase):
         return errors.strip()
 
     def assert_says(self, line: str, *parts: str) -> None:
-        """The line has each part."""
+        """Check that the line contains each part."""
         for part in ("swarm-node: ", *parts):
             self.assertIn(part, line)
 
     def test_unknown_key(self) -> None:
-        """What is wrong in the file is said before anything is started: file, key, nearest key."""
+        """An unknown key is reported before the start, with file, key and the nearest known key."""
         path = self.file('[node]\nname = "a"\nteam_key = "t"\nprot = 7000\n')
         self.assert_says(self.refused("--config", path), path, "[node] prot", "the nearest is port")
 
     def test_ports_in_use(self) -> None:
-        """A UDP port, and a TCP port of the page, that another program holds: file, key, another port or 0."""
+        """A used UDP port, or TCP port of the page, is reported with file, key and a remedy."""
         for kind, key, text in (
             (socket.SOCK_DGRAM, "[node] port", "port = {}\n"),
             (socket.SOCK_STREAM, "[web] port", 'roles = ["web"]\n[web]\nport = {}\n'),
@@ -49,7 +49,7 @@ class BadInputTests(NodeCase):
             self.assert_says(line, path, key, str(port), "choose another port, or 0")
 
     def test_address_of_another_machine(self) -> None:
-        """An address that this machine has not: file, and an address to be given, not a port."""
+        """An address of another machine is reported with the file and a remedy that does not suggest another port."""
         for text, key in (
             ('[node]\nname = "a"\nteam_key = "t"\nhost = "192.0.2.1"\n', "[node]"),
             ('[node]\nname = "a"\nteam_key = "t"\nroles = ["web"]\n[web]\nhost = "192.0.2.1"\nport = 0\n', "[web]"),
@@ -61,10 +61,10 @@ class BadInputTests(NodeCase):
 
 
 class UnreachableBootstrapTests(NodeCase):
-    """A bootstrap that is not up is no error."""
+    """A missing bootstrap node is no error."""
 
     def test_unreachable_bootstrap_is_tried_again(self) -> None:
-        """A node whose bootstrap does not answer says so, tries again, and ends cleanly within 2 s of SIGTERM."""
+        """A node without an answer from its bootstrap node logs this, retries, and ends within 2 s of SIGTERM."""
         with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as silent:
             silent.bind(("127.0.0.1", 0))
             port = silent.getsockname()[1]
@@ -84,7 +84,7 @@ class UnreachableBootstrapTests(NodeCase):
             began = time.monotonic()
             output, errors = child.communicate(timeout=PATIENCE_S)
         self.assertLess(time.monotonic() - began, 2.0)
-        # After an orderly end Twisted lets the signal have its way, so that a shell sees what ended the program.
+        # After an orderly end Twisted raises the signal again, so that a shell sees the cause of the end.
         self.assertEqual((child.returncode, errors), (-signal.SIGTERM, ""), output)
         self.assertIn("Server Shut Down", output)
         self.assertNotIn("Traceback", output)

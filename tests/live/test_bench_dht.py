@@ -1,4 +1,4 @@
-"""A small run of the comparison of peer-to-peer libraries: real processes, real sockets, this library alone."""
+"""Tests of the comparison of peer-to-peer libraries: a small run of this library with real processes and sockets."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ class BenchDhtTests(SynchronousTestCase):
         self.folder = Path(folder.name)
 
     def bench(self, *arguments: str) -> subprocess.CompletedProcess[str]:
-        """A whole run."""
+        """Run the benchmark."""
         command = [sys.executable, "-m", "benchmarks.dht", *arguments]
         return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=LIMIT_S)
 
     def test_three_nodes_are_measured(self) -> None:
-        """Three nodes join, keep and find everything; the table, the JSON and the picture are written."""
+        """Three nodes join, store and find all values; the table, the JSON file and the figure are written."""
         out, plot = self.folder / "out.json", self.folder / "plot.svg"
         small = ["--nodes", "3", "--peers", "swarm", "--seconds", "0.3", "--out", str(out), "--plot", str(plot)]
         ran = self.bench(*small)
@@ -47,7 +47,7 @@ class BenchDhtTests(SynchronousTestCase):
         self.assertIn("swarm-memory", plot.read_text())
 
     def test_an_unknown_peer_is_refused(self) -> None:
-        """A name that is no peer ends in one line that says which there are."""
+        """An unknown library is refused with one line that lists the known ones."""
         ran = self.bench("--peers", "gnutella")
         self.assertEqual(ran.returncode, 2)
         self.assertIn("gnutella is unknown; choose from swarm-sqlite", ran.stderr)

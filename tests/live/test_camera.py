@@ -1,4 +1,4 @@
-"""The camera's real thread, over a lens that makes it wait, and a real video through OpenCV."""
+"""Tests of the camera's real thread with a blocking source, and of a real video through OpenCV."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ reactor: Any = running
 
 
 class SlowLens:
-    """A source that is lost once, and blocks while ``gate`` is closed."""
+    """A source that fails once, and blocks while ``gate`` is closed."""
 
     def __init__(self) -> None:
         self.gate = threading.Event()
@@ -44,12 +44,12 @@ class SlowLens:
 
 
 class LiveCameraTests(TestCase):
-    """A real thread, real time."""
+    """A real thread in real time."""
 
     timeout = 30
 
     async def test_camera_never_holds_the_reactor_up(self) -> None:
-        """A camera that blocks does so in its own thread; one that is lost comes back; the end frees it."""
+        """A blocking camera blocks only its thread, a lost one is opened again, and ``disconnect`` ends the thread."""
         lens = SlowLens()
         film = ThreadFilm(lens, reactor.callFromThread)
         driver = CameraDriver(checked({"fps": 30}), film, reactor, "cam")
@@ -70,7 +70,7 @@ class LiveCameraTests(TestCase):
         self.assertEqual(lens.closed, 2)
 
     def test_shows_a_video_by_the_clock(self) -> None:
-        """A video's pictures come whole, reduced to the wanted size, and begin again at its end."""
+        """A video's frames are complete, scaled to the wanted size, and repeat after its end."""
         import cv2
         import numpy
 

@@ -1,4 +1,4 @@
-"""Test of a live node whose wall clock is stepped: no timer, lease or TTL moves (R5)."""
+"""Tests of a running node during a step of the wall clock: no timer, lease or TTL changes (R5)."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ print(json.dumps({"seen": seen, "beats": beats, "wrong": wrong}))
 
 class ClockStepTest(SynchronousTestCase):
     def test_steps(self) -> None:
-        """A lease is kept through a step of the wall clock and ends in its time; no timer is late or early."""
+        """A lease survives a step of the wall clock and expires in time, and all timers run on time."""
         children = []
         for step in STEPS:
             folder = Path(self.mktemp())
@@ -111,7 +111,7 @@ class ClockStepTest(SynchronousTestCase):
             self.assertGreater(gone[0] - after[0][0], 0.3, step)
 
     def test_nobody_asks_the_wall(self) -> None:
-        """No module of the library, the drivers or the agents asks for the time of day: who needs it is handed it."""
+        """No module of the library, the drivers or the agents reads the wall clock; it is passed as an argument."""
         asking = []
         for room in ("formats", "middleware", "drivers", "agents"):
             for path in sorted((ROOT / room).rglob("*.py")):

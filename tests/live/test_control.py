@@ -1,4 +1,4 @@
-"""A real node asked through its control socket by the real ``swarm`` command, before and after a SIGKILL."""
+"""Tests of a real node with its control socket and the real ``swarm`` command, before and after a SIGKILL."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from tests.live.until import until
 
 class ControlTests(NodeCase):
     def joined(self, *flags: str) -> Node:
-        """A node that has joined."""
+        """Return a node that has joined."""
         node = self.node(*(flags or ("--name", "a", "--store", "a.sqlite", "--team-key-file", self.key_file())))
         node.says("joined")
         return node
 
     def said(self, *words: str) -> str:
-        """What ``swarm WORDS`` prints, without trouble."""
+        """Return the output of ``swarm WORDS``, which must succeed."""
         ran = self.swarm(*words)
         self.assertEqual((ran.returncode, ran.stderr), (0, ""), ran.stdout)
         return ran.stdout
 
     def test_shell_and_node_talk(self) -> None:
-        """Values, tuples, keywords and methods through the shell; a SIGKILL later the values are there again."""
+        """Values, tuples, keywords and methods work through the shell, and the values survive a SIGKILL."""
         self.assertIn("no node runs", self.swarm("dht", "get", "a").stderr)
         node = self.joined()
         self.assertIn("1 replicas", self.said("dht", "put", "colour", "red"))
@@ -42,7 +42,7 @@ class ControlTests(NodeCase):
         self.assertIn("red", self.said("dht", "get", "colour"))
 
     def test_operator_pushes_to_a_running_node(self) -> None:
-        """A node that trusts its own operator runs what is pushed, shows it, goes back, and has it after a SIGKILL."""
+        """A node that trusts its operator runs a pushed module, rolls it back, and keeps it over a SIGKILL."""
         node = self.joined()
         key = json.loads(self.said("deploy", "keys", "--json"))["a"]
         node.kill()
@@ -64,5 +64,5 @@ class ControlTests(NodeCase):
         self.assertIn("the team has no task", self.swarm("why", "last").stderr)
 
     def shows(self, words: str) -> None:
-        """Wait until ``swarm deploy status`` says so."""
+        """Wait until ``swarm deploy status`` shows this."""
         until(lambda: words in self.swarm("deploy", "status").stdout)

@@ -1,4 +1,4 @@
-"""A team of two thousand: the page shows it, finds what is looked for, and keeps up."""
+"""Tests of the page with two thousand devices: display, filter and updates."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ CHANGE = """async () => {
 
 class CrowdTests(PageCase):
     def test_show_two_thousand(self) -> None:
-        """Two thousand devices stand there soon, one that changes costs little, and a filter finds the few."""
+        """Two thousand devices are shown in time, a changed one is updated fast, and a filter finds some of them."""
         self.team.order(f"crowd {COUNT}")
         for screen in (PHONE, DESK):
             page = self.tab(screen)
@@ -46,7 +46,7 @@ class CrowdTests(PageCase):
             page.context.close()
 
     def find(self, page: Any) -> None:
-        """Look for some by words, and for none."""
+        """Filter the devices by words, and by words without a match."""
         page.locator("#filter").fill("gripper turtle")
         page.locator("#count", has_text=f"40 of {COUNT}").wait_for()
         self.assertEqual(page.locator("#devices > li").count(), 40)

@@ -1,6 +1,6 @@
-"""The dead man's switch with real processes: a program that drives an emulated robot is frozen, killed and interrupted.
+"""Tests of the dead man's switch with real processes: a program that drives an emulated robot is frozen or killed.
 
-The robots are in this process, behind real sockets and pseudo-terminals; whoever drives them is not.
+The robots are in this process, behind real sockets and pseudo-terminals; the driving program is a child process.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ LATE_S = 0.4
 
 @dataclass
 class TimedBody(MemoryBody):
-    """A body that keeps when it was told what."""
+    """A base that records its motions with their times."""
 
     told: list[tuple[float, tuple[float, float, float]]] = field(default_factory=list)
 
@@ -64,13 +64,13 @@ class TimedBody(MemoryBody):
         return any(self.motion)
 
     def rested_at(self) -> float:
-        """When it came to rest for the last time."""
+        """Return the time of the last stop."""
         moving = [place for place, (_, motion) in enumerate(self.told) if any(motion)]
         return self.told[moving[-1] + 1][0]
 
 
 def is_alive(pid: int) -> bool:
-    """Whether there is such a process, zombies aside."""
+    """Return whether the process exists and is no zombie."""
     try:
         state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
     except OSError:
@@ -79,13 +79,13 @@ def is_alive(pid: int) -> bool:
 
 
 def ignores_signals(pid: int) -> bool:
-    """Whether a process has come so far that it ignores SIGTERM."""
+    """Return whether the process has reached the point at which it ignores SIGTERM."""
     status = Path(f"/proc/{pid}/status").read_text()
     return bool(int(status.partition("SigIgn:")[2].split()[0], 16) >> (signal.SIGTERM - 1) & 1)
 
 
 class Puppeteer:
-    """Starts and reads the program that drives, in a session of its own."""
+    """Starts the driving program in a new session and reads its output."""
 
     def __init__(self, path: str, kind: str, options: dict[str, object]) -> None:
         self._path = Path(path)
@@ -96,7 +96,7 @@ class Puppeteer:
             )
 
     async def said(self, word: str, count: int = 1) -> list[str]:
-        """Wait for the line that begins with this word for the so-manieth time; what it says."""
+        """Wait for the line number ``count`` that starts with this word, and return the rest of it."""
         found: list[list[str]] = []
 
         def is_said() -> bool:
@@ -113,7 +113,7 @@ class Puppeteer:
         self.process.stdin.flush()
 
     async def switch(self) -> tuple[int, float]:
-        """The process of its switch, and how often that halted the robot."""
+        """Return the process id of the switch and its number of halts."""
         count = self._path.read_text().count("switch") + 1
         self.tell("switch")
         pid, halts = await self.said("switch", count)
@@ -128,7 +128,7 @@ class Puppeteer:
 
 
 class DeadManCase(TestCase):
-    """One robot, whose driver may be frozen."""
+    """A test case with one robot and a driving program that may be frozen."""
 
     timeout = 60
 
@@ -142,21 +142,21 @@ class DeadManCase(TestCase):
             one.end()
 
     async def driven(self, kind: str, **options: object) -> Puppeteer:
-        """One that drives the robot, connected and enabled."""
+        """Return a driving program that is connected and enabled."""
         puppeteer = Puppeteer(self.mktemp(), kind, options)
         self.puppeteers.append(puppeteer)
         await puppeteer.said("ready")
         return puppeteer
 
     async def walking(self, puppeteer: Puppeteer, seconds: float, count: int = 1) -> float:
-        """Have it walk; until when it may."""
+        """Let the robot walk, and return the deadline."""
         puppeteer.tell(f"walk {seconds}")
         (deadline,) = await puppeteer.said("walking", count)
         await until(lambda: self.body.is_moving)
         return float(deadline)
 
     async def freeze(self, puppeteer: Puppeteer, permitted: float = 0.5) -> None:
-        """Freeze it while the robot moves; it stands in time, and moves again only by a new permit."""
+        """Freeze the program during a motion: the robot stops in time, and moves again only by a new permit."""
         deadline = await self.walking(puppeteer, permitted)
         puppeteer.process.send_signal(signal.SIGSTOP)
         await wait(deadline - now() + 0.5)
@@ -172,7 +172,7 @@ class DeadManCase(TestCase):
         await until(lambda: not self.body.is_moving, 2.0)
 
     async def kill(self, puppeteer: Puppeteer) -> None:
-        """Kill it while the robot moves: it stands at once, and the switch is gone within a second."""
+        """Kill the program during a motion: the robot stops at once, and the switch ends within a second."""
         pid, _ = await puppeteer.switch()
         await self.walking(puppeteer, 5.0)
         killed = now()
@@ -203,7 +203,7 @@ class Wire:
         self.far.close()
 
     def heard(self) -> bytes | None:
-        """What the robot has heard since the last time; None where the link is closed."""
+        """Return the data that has arrived at the robot, or None if the link is closed."""
         try:
             return self.far.recv(1 << 20) or None
         except BlockingIOError:
@@ -225,7 +225,7 @@ class KeeperTests(TestCase):
         self.wire.close()
 
     async def test_halts_and_counts(self) -> None:
-        """It says the halt three times when the time is over, and the keeper counts one."""
+        """At the deadline the switch sends the halt three times, and the keeper counts one halt."""
         self.keeper.guard(LastWord(b"halt", self.wire))
         self.keeper.until(0.2)
         await wait(0.15)
@@ -235,7 +235,7 @@ class KeeperTests(TestCase):
         self.assertEqual(self.keeper.halts, 1)
 
     async def test_stays_armed_until_the_halt_has_left(self) -> None:
-        """Rest disarms it, but not while the link still has the halt to send."""
+        """``rest`` disarms the switch only after the link has sent the driver's halt."""
         self.keeper.guard(LastWord(b"halt", self.wire))
         self.keeper.until(0.2)
         self.keeper.rest()
@@ -249,7 +249,7 @@ class KeeperTests(TestCase):
         self.wire.is_busy = False
 
     async def test_lets_go_of_the_link(self) -> None:
-        """A link that the driver has left, and closed, is closed at the robot's end as well."""
+        """A link that the driver has released and closed is also closed at the robot's end."""
         self.keeper.guard(LastWord(b"halt", self.wire))
         await wait(0.1)
         self.wire.near.close()
@@ -258,7 +258,7 @@ class KeeperTests(TestCase):
         await until(lambda: self.wire.heard() is None, 1.0)
 
     async def test_leaves_no_timer_once_closed(self) -> None:
-        """A link that is lost after the keeper was closed starts nothing: the reactor would find it unclean."""
+        """The loss of a link after ``close`` starts no timer."""
         self.keeper.guard(LastWord(b"halt", self.wire))
         self.keeper.until(1.0)
         await self.keeper.close()
@@ -266,7 +266,7 @@ class KeeperTests(TestCase):
         self.keeper.leave()
 
     async def test_finishes_a_halt_that_left_in_part(self) -> None:
-        """A halt of which the link took a part is finished before it is said anew."""
+        """A halt that was sent in part is completed before it is repeated."""
         self.wire.near.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4608)
         halt = bytes(range(250)) * 40
         self.keeper.guard(LastWord(halt, self.wire))
@@ -280,7 +280,7 @@ class KeeperTests(TestCase):
         self.assertEqual(said[len(halt) :], halt[: len(said) - len(halt)])
 
     async def test_replaces_one_that_does_not_listen(self) -> None:
-        """A process that is stopped fills its socket; it is killed and replaced, and the keeper never waits for it."""
+        """A stopped process with a full socket is killed and replaced, without a wait of the keeper."""
         self.keeper.guard(LastWord(b"halt", self.wire))
         first = self.keeper.pid
         assert first is not None
@@ -295,7 +295,7 @@ class KeeperTests(TestCase):
         await until(lambda: self.wire.heard() == b"halt", 1.0)
 
     async def test_names_what_cannot_be_started(self) -> None:
-        """Where none can be started, or all end at once, this is said once, and it is tried again until one does."""
+        """If no switch can be started, or each one ends at once, this is logged once and retried."""
         for program, words in (
             ("/nowhere/python", "no dead man's switch yet"),
             ("/bin/false", "starting another one"),
@@ -319,7 +319,7 @@ class KeeperTests(TestCase):
             self.wire.heard()
 
     async def test_ends_at_any_moment(self) -> None:
-        """Closed before it was started, just after, or while one is replaced, nothing is left, twice or not."""
+        """A keeper that is closed before, during or after a start, once or twice, leaves no process."""
         for stage in range(4):
             keeper = Keeper("robot", reactor)
             if stage:
@@ -330,7 +330,7 @@ class KeeperTests(TestCase):
                 os.kill(pid or 0, signal.SIGKILL)
                 await until(lambda keeper=keeper: keeper.pid is None, 1.0)  # type: ignore[misc]
             elif stage == 3:
-                os.kill(pid or 0, signal.SIGSTOP)  # which hears of no end
+                os.kill(pid or 0, signal.SIGSTOP)  # which does not receive the end
             await keeper.close()
             await keeper.close()
             self.assertFalse(pid and Path(f"/proc/{pid}").exists())
@@ -338,7 +338,7 @@ class KeeperTests(TestCase):
 
 
 class AiboDeadManTests(DeadManCase):
-    """An AIBO, which by itself would walk on for three seconds."""
+    """An AIBO, which without a switch walks on for three seconds."""
 
     def setUp(self) -> None:
         super().setUp()
@@ -356,11 +356,11 @@ class AiboDeadManTests(DeadManCase):
         await self.server.stop()
 
     async def test_frozen(self) -> None:
-        """Its program is stopped (SIGSTOP): it stands soon after the deadline, and goes on only by a new permit."""
+        """If the program is stopped (SIGSTOP), the dog stops after the deadline until it gets a new permit."""
         await self.freeze(await self.driven("aibo", **self.options))
 
     async def test_killed(self) -> None:
-        """Its program is killed: it stands at once, and nothing is left of the switch."""
+        """If the program is killed, the dog stops at once, and the switch ends."""
         await self.kill(await self.driven("aibo", **self.options))
 
     async def test_interrupted(self) -> None:
@@ -378,7 +378,7 @@ class AiboDeadManTests(DeadManCase):
         self.assertFalse(Path(f"/proc/{pid}").exists())
 
     async def test_replaced(self) -> None:
-        """A switch that is killed is replaced while the dog walks, and the new one does what the old one would."""
+        """A killed switch is replaced during a walk, and the new one halts the dog in time."""
         puppeteer = await self.driven("aibo", **self.options)
         first, _ = await puppeteer.switch()
         deadline = await self.walking(puppeteer, 2.0)
@@ -394,7 +394,7 @@ class AiboDeadManTests(DeadManCase):
         puppeteer.process.send_signal(signal.SIGCONT)
 
     async def test_lost_link(self) -> None:
-        """The switch lets go of a link that is lost, or the dog would take no new one; and guards the new one."""
+        """The switch releases a lost link, as the dog accepts one client, and guards the next one."""
         puppeteer = await self.driven("aibo", **self.options)
         self.dog.reboot()
         await wait(2.5)
@@ -402,7 +402,7 @@ class AiboDeadManTests(DeadManCase):
 
 
 class Create2DeadManTests(DeadManCase):
-    """A Create 2 on a cable, which by itself would drive on for ever."""
+    """A Create 2 on a serial port, which without a switch drives on."""
 
     if not HAS_SERIAL:
         skip = "needs the extra serial"
@@ -418,20 +418,20 @@ class Create2DeadManTests(DeadManCase):
         self.robot.stop()
 
     async def test_frozen(self) -> None:
-        """Its program is stopped: it stands soon after the deadline."""
+        """If the program is stopped, the robot stops after the deadline."""
         await self.freeze(await self.driven("create2", port=self.port.path))
 
     async def test_killed(self) -> None:
-        """Its program is killed: it stands at once, and the port is free for the next."""
+        """If the program is killed, the robot stops at once, and the port is free."""
         await self.kill(await self.driven("create2", port=self.port.path))
         await self.driven("create2", port=self.port.path)
 
 
 class BittleDeadManTests(DeadManCase):
-    """A Bittle, which by itself would walk on for ever."""
+    """A Bittle, which without a switch walks on."""
 
     async def test_frozen_on_a_cable(self) -> None:
-        """Its program is stopped: it stands soon after the deadline."""
+        """If the program is stopped, the dog stops after the deadline."""
         if not HAS_SERIAL:
             raise SkipTest("needs the extra serial")
         robot = Bittle(self.body, CLOCK, Random(1))
@@ -444,7 +444,7 @@ class BittleDeadManTests(DeadManCase):
             robot.stop()
 
     async def test_frozen_over_wifi(self) -> None:
-        """Over HTTP the switch asks by a connection of its own, whichever board there is."""
+        """Over HTTP the switch opens a separate connection, for both boards."""
         for board in ("biboard", "nyboard"):
             robot = Bittle(self.body, CLOCK, Random(1), board=board)
             listening = REACTOR.listenTCP(0, TcpLinkFactory(robot.accept_http), interface="127.0.0.1")
@@ -459,17 +459,17 @@ class BittleDeadManTests(DeadManCase):
 
 
 class Restless(RosbridgeRobot):
-    """One whose base has no time-out, as few have."""
+    """A robot without a timeout in its base."""
 
     def _on_no_command(self) -> None:
-        """Go on."""
+        """Move on."""
 
 
 class RosbridgeDeadManTests(DeadManCase):
-    """A ROS robot whose base has no time-out."""
+    """A ROS robot without a timeout in its base."""
 
     async def test_frozen(self) -> None:
-        """Its program is stopped: it stands soon after the deadline."""
+        """If the program is stopped, the robot stops after the deadline."""
         robot = Restless(CLOCK, self.body, Random(1))
         robot.start()
         listening = REACTOR.listenTCP(0, TcpLinkFactory(robot.accept), interface="127.0.0.1")

@@ -1,4 +1,4 @@
-"""The real demonstration, six processes and the page, driven by taps in Chromium and looked at on a desk."""
+"""Tests of the real demonstration, with six processes and the page, used by touch and on a desktop in Chromium."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ STANDING_MS = 6000.0
 
 class DemonstrationPageTests(DemonstrationPageCase):
     def fits(self, page: Any) -> None:
-        """The page is sound, and nothing is cut off in its own box."""
+        """Check the page's accessibility, and that no content is cut off."""
         self.sound(page)
         cut = page.evaluate(
             "[...document.querySelectorAll('button, select, dialog, .badge, .device, li, dd')]"
@@ -50,14 +50,14 @@ class DemonstrationPageTests(DemonstrationPageCase):
         self.assertEqual(cut, [], page.url)
 
     def test_be_driven_and_looked_at(self) -> None:
-        """A phone drives the team by taps alone; a desk shows its devices, cameras and map while the dogs search."""
+        """A phone controls the team by touch, and a desktop shows devices, cameras and map during a search."""
         phone = self.opened(PHONE)
         self.drive(phone)
         phone.context.close()
         self.look(self.opened(DESK))
 
     def drive(self, page: Any) -> None:
-        """Run the demo, stop it and let it go on, open a device, write to it, disconnect it, move the target."""
+        """Run the demo, stop and release it, open a device, send it a message, disconnect it, and move the target."""
         self.fits(page)
         page.get_by_role("button", name="Run Demo").tap()
         self.stop(page)
@@ -94,7 +94,7 @@ class DemonstrationPageTests(DemonstrationPageCase):
         floor = page.locator(".floor")
         floor.scroll_into_view_if_needed()
         box = floor.bounding_box()
-        # A place where a dog stands is refused; three dogs cannot stand in four corners.
+        # A position with a dog is refused; three dogs cannot occupy four corners.
         for right, down in ((0.15, 0.15), (0.85, 0.15), (0.15, 0.85), (0.85, 0.85)):
             with page.expect_response("**/api/v1/target"):
                 page.touchscreen.tap(box["x"] + right * box["width"], box["y"] + down * box["height"])
@@ -105,7 +105,7 @@ class DemonstrationPageTests(DemonstrationPageCase):
             self.fail(page.locator("#line").inner_text())
 
     def stop(self, page: Any) -> None:
-        """Stop, pressed while dogs search, has all three stand at once and for 3 s; then they go on."""
+        """A stop during the search halts all three dogs at once and for 3 s; after the release they continue."""
         seen = page.evaluate(STOPPED)
         self.assertLess(seen["took"], STANDING_MS, seen)
         self.assertEqual(seen["moved"], 0)
@@ -115,7 +115,7 @@ class DemonstrationPageTests(DemonstrationPageCase):
         page.locator(".halted").wait_for(state="hidden")
 
     def look(self, page: Any) -> None:
-        """See devices in the order of joining, three cameras whose views move as the dogs search, and the map."""
+        """The page shows devices in joining order, three cameras with changing views, and the map."""
         devices = self.demo.api("devices")
         self.assertEqual(page.locator(".device b").all_inner_texts(), [device["name"] for device in devices])
         joined = [device["joined"] for device in devices]
@@ -128,7 +128,7 @@ class DemonstrationPageTests(DemonstrationPageCase):
         page.locator(".device[data-state=SEARCHING]").first.wait_for()
         views = [page.evaluate(SMALL, index) for index in range(3)]
         for index, before in enumerate(views):
-            for _ in range(40):  # a dog may look at much the same again for a moment
+            for _ in range(40):  # a dog may see almost the same for some time
                 page.wait_for_timeout(250)
                 differ = sum(abs(a - b) for a, b in zip(before, page.evaluate(SMALL, index), strict=True)) / len(before)
                 if differ > MOVED:

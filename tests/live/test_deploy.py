@@ -1,4 +1,4 @@
-"""The page about deployment, word by word: its blocks are run on computers that are network namespaces."""
+"""Tests of the deployment page: its code blocks run on computers that are network namespaces."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ Block = tuple[str, bool, list[str]]
 
 
 class DeployTests(NamespaceCase):
-    """A computer has the name that the page gives it, a home of its own, and nothing that the page does not give it."""
+    """Each computer has its name from the page, a separate home directory, and only the page's files."""
 
     def setUp(self) -> None:
         super().setUp()
-        # Trial's own folders are deeper than the path of a socket may be.
+        # Trial's folders are deeper than the maximum length of a socket's path.
         self.folder = Path(tempfile.mkdtemp())
         self.addCleanup(shutil.rmtree, self.folder)
         self.programs = self.folder / "bin"
@@ -56,27 +56,27 @@ class DeployTests(NamespaceCase):
         self.nodes: dict[str, subprocess.Popen[bytes]] = {}
 
     def blocks(self, first: str, last: str) -> Iterator[Block]:
-        """Computer, whether its node is to be ended before, and lines, from one heading of the page to another."""
+        """Yield computer, whether its node ends before, and lines, for the blocks between two headings."""
         text = PAGE.read_text(encoding="utf-8")
         part = text[text.index(f"## {first}") : text.index(f"## {last}") if last else len(text)]
         for name, again, lines in BLOCK.findall(part):
             yield name, bool(again), lines.splitlines()
 
     def home(self, name: str) -> Path:
-        """The home of a computer."""
+        """Return the home directory of a computer."""
         path = self.folder / name
         path.mkdir(exist_ok=True)
         return path
 
     def surroundings(self, name: str) -> dict[str, str]:
-        """The environment of whoever sits at a computer."""
+        """Return the environment of a user at a computer."""
         home = self.home(name)
         inherited = {key: value for key, value in environment().items() if not key.startswith(("SWARM_", "XDG_"))}
         here = {"HOME": str(home), "XDG_RUNTIME_DIR": str(home), "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
         return {**inherited, **here, "PATH": f"{self.programs}:{inherited['PATH']}"}
 
     def follow(self, net: Internet, places: dict[str, str], blocks: Iterable[Block]) -> dict[str, str]:
-        """Do what the page says; returns what each line last said, by computer and line."""
+        """Run the blocks; return the last output of each line, by computer and line."""
         said: dict[str, str] = {}
         for name, again, lines in blocks:
             host = places[name]
@@ -96,7 +96,7 @@ class DeployTests(NamespaceCase):
         return said
 
     def meant(self, line: str, name: str, net: Internet) -> str:
-        """A line of the page with the code and the addresses that are real here."""
+        """Return a line of the page with the real code and addresses."""
         if "swarm join " in line:
             line = CODE.sub(self.codes[name], line)
         if "w1" in net.hosts:
@@ -104,7 +104,7 @@ class DeployTests(NamespaceCase):
         return line.replace(RENTED, net.address(PUB))
 
     def run_line(self, net: Internet, host: str, name: str, line: str) -> str:
-        """What a line says, which must succeed."""
+        """Run a line, which must succeed, and return its output."""
         done = subprocess.run(
             net.command(host, ["sh", "-c", line]),
             cwd=self.home(name),
@@ -117,7 +117,7 @@ class DeployTests(NamespaceCase):
         return done.stdout
 
     def start(self, net: Internet, host: str, name: str, line: str) -> None:
-        """Start a node, and wait until it is in its team."""
+        """Start a node, and wait until it has joined its team."""
         log = self.home(name) / "log"
         with open(log, "wb") as file:
             options = {"cwd": self.home(name), "env": self.surroundings(name), "stdout": file, "stderr": file}
@@ -125,11 +125,11 @@ class DeployTests(NamespaceCase):
         until(lambda: " joined as number " in log.read_text(), told=self.logs)
 
     def logs(self) -> str:
-        """What all nodes have said."""
+        """Return the logs of all nodes."""
         return "\n".join(f"-- {path.parent.name}\n{path.read_text()}" for path in self.folder.glob("*/log"))
 
     def test_three_laptops(self) -> None:
-        """Three laptops behind one router become a team by the lines of the page, and its page opens on another one."""
+        """The page's lines make a team of three laptops behind one router, and its web page opens on another laptop."""
         with Internet([Site("w", Kind.PORT, hosts=3)]) as net:
             places = {"vaio": "w1", "dog1": "w2", "dog2": "w3"}
             said = self.follow(net, places, self.blocks("Three laptops on one Wi-Fi", "Over the internet"))
@@ -141,14 +141,14 @@ class DeployTests(NamespaceCase):
             self.assertEqual(self.run_line(net, "w2", "dog1", command).strip(), "200")
 
     def test_over_the_internet(self) -> None:
-        """A rented computer with a firewall, laptops behind routers, one of which blocks UDP; and all that follows."""
+        """The page's lines work for a rented computer with a firewall and laptops behind routers, one without UDP."""
         sites = [Site("o", Kind.PORT), Site("h", Kind.PORT), Site("u", Kind.NOUDP)]
         with Internet(sites) as net:
             net.room(PUB).run(f"nft -f - <<'END'\n{FIREWALL}\nEND\n")
             places = {"boss": "o1", "host1": PUB, "cam1": "h1", "cam2": "u1"}
             making, *rest = self.blocks("Over the internet", "")
             self.follow(net, places, [making])
-            for ending in ("toml", "membership"):  # by scp, on the page
+            for ending in ("toml", "membership"):  # with scp in the page
                 shutil.move(self.home("boss") / f"host1.{ending}", self.home("host1"))
             said = self.follow(net, places, rest)
             gone = self.home("cam2") / "log"

@@ -1,4 +1,4 @@
-"""The doctor in an internet of namespaces: each cause is made for real, and named."""
+"""Tests of ``swarm doctor`` in an internet of namespaces: each cause is created and must be named."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ while True:
 
 
 class DoctorCase(NamespaceCase):
-    """An internet with nodes, and a doctor."""
+    """An internet with nodes, and the doctor."""
 
     net: Internet
 
@@ -52,7 +52,7 @@ class DoctorCase(NamespaceCase):
         self.folder.mkdir()
 
     def settings(self, name: str, host: str, known: Sequence[str] = (), **others: object) -> Path:
-        """The settings of a node."""
+        """Write the settings of a node."""
         node = {"name": name, "host": host, "port": 8484, "team_key": TEAM, "known_nodes": list(known), **others}
         lines = "".join(f"{key} = {json.dumps(value)}\n" for key, value in node.items())
         file = self.folder / f"{name}.toml"
@@ -61,7 +61,7 @@ class DoctorCase(NamespaceCase):
         return file
 
     def node(self, at: str, settings: Path) -> subprocess.Popen[Any]:
-        """Run a node at a host until it has its control socket."""
+        """Run a node at a host until it has a control socket."""
         log = open(settings.with_suffix(".log"), "w", encoding="utf-8")  # noqa: SIM115 (the process has it)
         self.addCleanup(log.close)
         home = self.home(settings)
@@ -72,7 +72,7 @@ class DoctorCase(NamespaceCase):
         return process
 
     def home(self, settings: Path) -> Path:
-        """Where the control socket of a node lies: hosts of namespaces share their disk."""
+        """Return the folder of a node's control socket, as the hosts share one disk."""
         home = Path("/tmp") / f"doctor-{abs(hash((str(self.folder), settings.stem))) % 10**9}"
         if not home.exists():
             home.mkdir(mode=0o700)
@@ -80,14 +80,14 @@ class DoctorCase(NamespaceCase):
         return home
 
     def emptied(self, home: Path) -> None:
-        """Take away a folder of sockets."""
+        """Remove a folder of sockets."""
         self.net.close()
         for file in sorted(home.rglob("*"), reverse=True):
             file.rmdir() if file.is_dir() else file.unlink()
         home.rmdir()
 
     def asked(self, at: str, settings: Path, late: float = 0.0) -> Mapping[str, Any]:
-        """What the doctor says at a host."""
+        """Return the doctor's findings at a host."""
         words = ["env", f"XDG_RUNTIME_DIR={self.home(settings)}", sys.executable, "-c", DOCTOR, str(late)]
         done = self.net.run(at, [*words, "--json", str(settings)], timeout=LIMIT_S)
         self.assertIn(done.returncode, (0, 1), done.stderr)
@@ -96,15 +96,15 @@ class DoctorCase(NamespaceCase):
         return said
 
     def causes(self, at: str, settings: Path, late: float = 0.0) -> list[str]:
-        """The names of what the doctor found."""
+        """Return the names of the causes that the doctor found."""
         return [finding["cause"] for finding in self.asked(at, settings, late)["findings"]]
 
 
 class WayTests(DoctorCase):
-    """What lies between a node and those on the internet."""
+    """Causes between a node and the internet."""
 
     def test_routers_and_firewalls(self) -> None:
-        """Each kind of router is named by who is behind it, a firewall against UDP too, and a cut as no bootstrap."""
+        """Each kind of router and a firewall against UDP are named by the nodes behind them, a cut as no bootstrap."""
         net = self.net = self.internet(
             Site("c", Kind.PORT), Site("s", Kind.SYM), Site("n", Kind.NOUDP), Site("o", Kind.NONE), Site("x", Kind.PORT)
         )
@@ -120,7 +120,7 @@ class WayTests(DoctorCase):
 
 
 class LanTests(DoctorCase):
-    """What goes wrong on one LAN."""
+    """Causes on a LAN."""
 
     def setUp(self) -> None:
         super().setUp()
@@ -130,7 +130,7 @@ class LanTests(DoctorCase):
         self.own = self.settings("own", net.address("a1"), [self.other])
 
     def test_well(self) -> None:
-        """Two nodes that were told nothing of each other meet; the doctor finds nothing, and the link is good."""
+        """Two nodes without known nodes find each other; the doctor finds no cause, and the link is good."""
         settings = self.settings("own", self.net.address("a1"))
         self.node("a1", settings)
         said = self.asked("a1", settings)
@@ -139,13 +139,13 @@ class LanTests(DoctorCase):
         self.assertGreaterEqual(said["links"][0]["score"], 80)
 
     def test_one_of_no_team_finds_whom_to_ask(self) -> None:
-        """Who is of no team yet learns by a HAIL to all on the LAN where nodes are."""
+        """A machine without a team finds the nodes on its LAN by discovery."""
         program = "from swarmnode.doctor.measure import on_lan; print(*[each.address for each in on_lan()])"
         done = self.net.run("a1", [sys.executable, "-c", program], timeout=LIMIT_S)
         self.assertEqual((done.stdout.strip(), done.stderr), (self.other, ""))
 
     def test_multicast_blocked(self) -> None:
-        """A LAN that carries no multicast is named, though the node is reached by its address."""
+        """A LAN without multicast is named, although the node is reachable by its address."""
         self.assertEqual(self.causes("a1", self.own), [])
         for port in ("h1", "h2"):
             self.net.room("a-gw").run(f"ip link set {port} type bridge_slave mcast_flood off mcast_router 0\n")
@@ -153,25 +153,25 @@ class LanTests(DoctorCase):
         self.assertEqual(self.causes("a1", self.own), ["multicast-blocked"])
 
     def test_firewall_of_this_machine(self) -> None:
-        """A firewall here that lets no multicast in is named as this machine's."""
+        """A local firewall that blocks multicast is named as this machine's."""
         self.net.room("a1").run(_DROP.format(port=8483))
         said = self.asked("a1", self.own)["findings"]
         self.assertEqual([finding["cause"] for finding in said], ["multicast-blocked"])
         self.assertIn("This machine", said[0]["what"])
 
     def test_firewall_of_the_other(self) -> None:
-        """A firewall of the neighbour that drops its port is named as the neighbour's."""
+        """A neighbour's firewall that blocks its port is named as the neighbour's."""
         self.net.room("a2").run(_DROP.format(port=8484))
         self.assertIn("peer-firewall", self.causes("a1", self.own))
 
     def test_client_isolation(self) -> None:
-        """An access point that keeps its clients from each other is named."""
+        """Client isolation at the access point is named."""
         for port in ("h1", "h2"):
             self.net.room("a-gw").run(f"ip link set {port} type bridge_slave isolated on\n")
         self.assertEqual(self.causes("a1", self.own), ["client-isolation"])
 
     def test_settings_and_clock(self) -> None:
-        """No node at a port, an own address that cannot be, another team, and a clock that is behind are named."""
+        """A port without a node, an impossible host, another team and a slow clock are named."""
         own, other = self.net.address("a1"), self.net.address("a2")
         nobody = self.settings("own", own, [f"{other}:9999"], lan=False)
         self.assertEqual(self.causes("a1", nobody), ["nobody-listens"])
@@ -183,7 +183,7 @@ class LanTests(DoctorCase):
         self.assertEqual(self.causes("a1", settings, late=3600.0), ["clock-off"])
 
     def test_version(self) -> None:
-        """A node of another version of the protocol is named."""
+        """A node with another protocol version is named."""
         words = [sys.executable, "-c", OTHER_VERSION, self.net.address("a2"), "8499"]
         process = self.net.start("a2", words, stdout=subprocess.PIPE, text=True)
         assert process.stdout is not None
@@ -192,7 +192,7 @@ class LanTests(DoctorCase):
         self.assertEqual(self.causes("a1", settings), ["version-skew"])
 
     def test_machine(self) -> None:
-        """A port that is held, a store that cannot be, and settings that others can read are named, all at once."""
+        """A used port, an impossible store and readable settings are named together."""
         settings = self.settings("taken", self.net.address("a2"), [], store="nowhere/a.sqlite", lan=False)
         settings.chmod(0o644)
         self.assertEqual(self.causes("a2", settings), ["port-in-use", "store-unwritable", "key-readable"])

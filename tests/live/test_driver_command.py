@@ -1,4 +1,4 @@
-"""``swarm driver`` as a process, against an emulated dog on real sockets, with a pseudo-terminal for its keys."""
+"""Tests of ``swarm driver`` as a process, with an emulated dog on real sockets and a pseudo-terminal for its keys."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ COMMAND = [sys.executable, "-c", "import sys; from swarmnode.command import main
 
 
 class DriverCommandTests(TestCase):
-    """The command, the sockets and the terminal are real; the dog is not."""
+    """Command, sockets and terminal are real; the dog is emulated."""
 
     timeout = 60
 
     def setUp(self) -> None:
-        """A dog on ports of this machine."""
+        """Start a dog on ports of this machine."""
         clock = IReactorTime(reactor)
         self.body = MemoryBody(jpeg=JPEG, values={"power.level": 0.8})
         ports = free_ports()
@@ -52,14 +52,14 @@ class DriverCommandTests(TestCase):
         self.addCleanup(self.folder.cleanup)
 
     def started(self, *words: str, **more: Any) -> subprocess.Popen[bytes]:
-        """The command with these words, which is ended with the test."""
+        """Start the command with these words; it is killed after the test."""
         child = subprocess.Popen([*COMMAND, *words, *self.robot], cwd=ROOT, **more)
         self.addCleanup(child.wait)
         self.addCleanup(child.kill)
         return child
 
     async def ended(self, child: subprocess.Popen[bytes], seconds: float = 20.0) -> int:
-        """The exit code of a child, once it has ended."""
+        """Wait for the end of a child, and return its exit code."""
         until = IReactorTime(reactor).seconds() + seconds
         while child.poll() is None and IReactorTime(reactor).seconds() < until:
             await wait(0.02)
@@ -74,7 +74,7 @@ class DriverCommandTests(TestCase):
         self.assertGreater(self.body.motion[0], 0.03)
 
     async def test_probe_and_monitor(self) -> None:
-        """Probe says what came over TCP, monitor saves the dog's picture; a port where nothing listens is named."""
+        """``probe`` prints the data over TCP, ``monitor`` saves a frame, and a closed port is reported."""
         out = Path(self.folder.name) / "out"
         with out.open("wb") as file:
             self.assertEqual(await self.ended(self.started("probe", "--seconds", "1", stdout=file)), 0)
@@ -90,7 +90,7 @@ class DriverCommandTests(TestCase):
         self.assertIn("! 127.0.0.1:1: nothing listens at this port", out.read_text())
 
     async def test_interrupted(self) -> None:
-        """Ctrl-C ends monitor and drive in order: without a traceback, the dog at rest, its motors off."""
+        """Ctrl-C ends ``monitor`` and ``drive`` without a traceback, with the dog at rest and its motors off."""
         out = Path(self.folder.name) / "out"
         with out.open("wb") as file:
             child = self.started("monitor", stdout=file, stderr=file)
@@ -110,7 +110,7 @@ class DriverCommandTests(TestCase):
         self.assertNotIn("Traceback", os.read(ours, 65536).decode())
 
     async def test_drive(self) -> None:
-        """Keys in a terminal move the dog; let go, it stands; x ends, and the terminal is as it was before."""
+        """Keys in a terminal move the dog, which stops without keys; x ends the command and restores the terminal."""
         ours, theirs = pty.openpty()
         self.addCleanup(os.close, ours)
         self.addCleanup(os.close, theirs)

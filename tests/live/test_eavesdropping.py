@@ -1,4 +1,4 @@
-"""S11: what an ear on the interface can read of a team that names things, says where they are, and talks."""
+"""S11: the data that a network capture can read of a team that sends names, positions and messages."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ PLACE = b'{"x": 12.345678, "y": -7.891011}'
 
 
 class EavesdroppingTests(TestCase):
-    """Two nodes of a closed team on loopback, and a socket that hears all of it."""
+    """Two nodes of a closed team on loopback, and a raw socket that captures all traffic."""
 
     def setUp(self) -> None:
-        """Listen before anything is said."""
+        """Start the capture before any node starts."""
         try:
             self.ear = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(EVERYTHING))
         except PermissionError as error:
@@ -54,7 +54,7 @@ class EavesdroppingTests(TestCase):
         self.papers: list[Membership] = []
 
     def node(self, paper: Membership, known: list[Address]) -> tuple[EntangledNode, Deferred[None]]:
-        """A node of that membership, and when it has joined."""
+        """Return a node with this membership, and a Deferred that fires when it has joined."""
         self.papers.append(paper)
         dice, store = random.SystemRandom(), MemoryStore()
         team = Team(MemoryMembership(paper), store, time.time, dice)
@@ -77,7 +77,7 @@ class EavesdroppingTests(TestCase):
         return node, node.join(known)
 
     def heard(self, ports: set[int]) -> list[bytes]:
-        """The datagrams from and to those ports."""
+        """Return the captured datagrams from and to these ports."""
         found: list[bytes] = []
         while True:
             try:
@@ -90,7 +90,7 @@ class EavesdroppingTests(TestCase):
 
     @inlineCallbacks
     def test_nothing_is_readable(self) -> Generator[Deferred[Any], Any, None]:
-        """Neither names nor tasks, positions, words, keys, passes or secrets can be read; what is in the open can."""
+        """No name, task, position, message, key, certificate or secret is readable; public data is."""
         dice = random.SystemRandom()
         signer = drawn("kennel", dice)
         first = signer.founded("hedgehog", ("device", "bootstrap", "gateway"), time.time(), dice)
@@ -116,7 +116,7 @@ class EavesdroppingTests(TestCase):
             public = paper.identity.public
             secret += [paper.seed, public, node_id(public), paper.shown[:40], paper.shown[-40:]]
         self.assertEqual([each for each in secret if each in whole or each.hex().encode() in whole], [])
-        # The ear is not deaf: who hails is told the fingerprint of the team in the open.
+        # The capture works: a discovery reply contains the team's fingerprint unencrypted.
         yield two.endpoint.hail(one.contact.address)
         yield deferLater(reactor, 0.1, lambda: None)
         fingerprint = one.endpoint.door.fingerprint

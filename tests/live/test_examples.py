@@ -18,15 +18,15 @@ PATIENCE = 30.0
 
 
 def free_port() -> int:
-    """A UDP port that nobody holds just now."""
+    """Return an unused UDP port."""
     return free("udp", "127.0.0.1", 1)[0]
 
 
 class ExamplesTests(TestCase):
-    """What a newcomer types first."""
+    """The examples in the documentation."""
 
     def start(self, name: str, *words: object) -> subprocess.Popen[str]:
-        """Start an example, which is ended after the test, or when it takes too long."""
+        """Start an example, which is killed after the test or a timeout."""
         process = subprocess.Popen(
             [sys.executable, str(ROOT / "examples" / f"{name}.py"), *map(str, words)],
             stdin=subprocess.PIPE,
@@ -46,18 +46,18 @@ class ExamplesTests(TestCase):
         return process
 
     def line(self, process: subprocess.Popen[str]) -> str:
-        """The next line that a process prints, or an empty one where it ended."""
+        """Return the next line that a process prints, or an empty string at its end."""
         assert process.stdout is not None
         return process.stdout.readline().strip()
 
     def say(self, process: subprocess.Popen[str], text: str) -> None:
-        """Type a line."""
+        """Send a line to a process."""
         assert process.stdin is not None
         process.stdin.write(text + "\n")
         process.stdin.flush()
 
     def test_readme(self) -> None:
-        """The program of the README prints the value that its second node reads."""
+        """The program in the README prints the value that its second node reads."""
         (program,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
         command = [sys.executable, "-c", program]
         environment = {**os.environ, "PYTHONPATH": str(ROOT)}
@@ -65,7 +65,7 @@ class ExamplesTests(TestCase):
         self.assertEqual((ran.stdout, ran.returncode), ("[b'red']\n", 0), ran.stderr)
 
     def test_keyvalue(self) -> None:
-        """What one process stores another one reads."""
+        """A process reads the value that another one stores."""
         first, second = free_port(), free_port()
         self.start("keyvalue", first)
         known = f"127.0.0.1:{first}"
@@ -73,7 +73,7 @@ class ExamplesTests(TestCase):
         self.assertEqual(self.line(self.start("keyvalue", free_port(), known, "colour")), "red")
 
     def test_chat(self) -> None:
-        """A line typed by one is read by the other, and back, without what would move the cursor."""
+        """Each of two chats prints the other's lines, without control characters."""
         first = free_port()
         ann = self.start("chat", "--port", first, "ann")
         self.assertEqual(self.line(ann), "here: ann")
@@ -85,8 +85,8 @@ class ExamplesTests(TestCase):
         self.assertEqual(self.line(bob), "ann: hel [2Jlo")
 
     def test_workqueue(self) -> None:
-        """All jobs are done though a worker dies over its first one."""
-        # As many as leave the second worker time to start on a busy machine, while the first one works.
+        """All jobs are done although a worker dies during its first one."""
+        # The number of jobs leaves the second worker time to start on a loaded machine.
         first, jobs = free_port(), 30
         boss = self.start("workqueue", "--port", first, "boss", jobs)
         self.assertEqual(self.line(boss), f"jobs are put: {jobs}")

@@ -1,4 +1,4 @@
-"""Both experiments of the thesis, with dogs behind routers: a run of ``make demo NAT=1``."""
+"""Tests of both experiments of the thesis with dogs behind routers: a run of ``make demo NAT=1``."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ WORDS = (b"red target", b"EXECUTING", b"capabilities", b"camera")
 
 
 class ExperimentsBehindRoutersTests(NamespaceCase):
-    """dog1 behind a port restricted router, dog2 behind a symmetric one, dog3 on the LAN of the bootstrap."""
+    """dog1 is behind a port restricted router, dog2 behind a symmetric one, dog3 on the LAN of the bootstrap node."""
 
     def test_both_experiments_hold(self) -> None:
-        """The nearest dog comes, another one when that is lost, as the page tells; who listens reads nothing."""
+        """The nearest dog acts, after its failure another one, as the page shows; a capture contains no plain text."""
         folder = Path(self.mktemp()).absolute()
         report = folder.parent / "report.json"
         folder.parent.mkdir(parents=True, exist_ok=True)
@@ -33,7 +33,7 @@ class ExperimentsBehindRoutersTests(NamespaceCase):
         verdicts = json.loads(report.read_text())
         self.assertIn("takeover", json.dumps(verdicts))
         self.assertEqual(ran.stdout.count("PASS"), 2, ran.stdout)
-        # The page was asked for without TLS, which shows that words in the open would have been found.
+        # The page was requested without TLS, which shows that plain text would be found.
         self.assertEqual(readable(record.read_bytes(), WORDS), list(WORDS))
         datagrams = [held for _, _, held in datagrams_of(record)]
         self.assertGreater(len(datagrams), 500)

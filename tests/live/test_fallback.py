@@ -1,4 +1,4 @@
-"""Never alone: the page goes on with another web node when the one that serves it dies, freezes or is shut."""
+"""Tests of the page's fallback to another web node when its node dies, freezes or stops."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class FallbackTests(BrowserCase):
         self.assertEqual(self.faults, [])
 
     def served(self, name: str, page: Any = None) -> None:
-        """Wait until the page is served by ``name``, live, with its three cameras."""
+        """Wait until the page is served by ``name``, live, with three cameras."""
         page = page or self.page
         self.wait_for_node(page, name)
         page.locator(CAMERAS).nth(2).wait_for()
@@ -53,7 +53,7 @@ class FallbackTests(BrowserCase):
         self.wait_for_node(self.page, "pi")
 
     def test_go_on_after_a_crash(self) -> None:
-        """SIGKILL: the page is live at the other node, in the same view, and sends its orders there."""
+        """After a SIGKILL the page is live at the other node, in the same view, and sends its requests there."""
         self.opened()
         self.page.locator(".device", has_text="dog2").dblclick()
         self.page.locator("#d-text").fill("half a sentence")
@@ -69,7 +69,7 @@ class FallbackTests(BrowserCase):
         self.page.locator(".device[data-state=IDLE]", has_text="dog3").wait_for()
 
     def test_go_on_after_a_freeze(self) -> None:
-        """SIGSTOP: the page changes over, though a frozen node still accepts connections; the other does the order."""
+        """After a SIGSTOP, with connections still accepted, the page sends the request to the other node."""
         self.opened()
         os.kill(self.pid(0), signal.SIGSTOP)
         self.page.get_by_role("button", name="Run Demo").click()
@@ -78,7 +78,7 @@ class FallbackTests(BrowserCase):
         self.served("pi")
 
     def test_go_past_an_impostor(self) -> None:
-        """A page that is listed and has no token, as its node is no gateway, is asked nothing; no URL has a token."""
+        """A listed web node that is no gateway gets no requests and no token, and no URL contains a token."""
         eve = Team()
         self.addCleanup(eve.end)
         eve.order("name eve")
@@ -101,7 +101,7 @@ class FallbackTests(BrowserCase):
             self.assertEqual(strays, [])
 
     def test_new_task_is_asked_for_again(self) -> None:
-        """A task that is asked of a node which is frozen is asked of the other, by the same name for the wish."""
+        """A task sent to a frozen node is sent to the other one, with the same idempotency key."""
         self.opened()
         keys: list[str] = []
 
@@ -119,7 +119,7 @@ class FallbackTests(BrowserCase):
         self.assertEqual((len(keys), len(set(keys))), (2, 1))
 
     def test_keep_all_or_nothing(self) -> None:
-        """A file that comes alone is not kept, or half a page would open once its node is gone; all of them are."""
+        """A single file is not cached, as the page would open without its other files; the complete page is."""
         self.opened()
         self.page.evaluate(KEPT)
         held = "async () => (await (await caches.open('swarm.shell')).keys()).length"
@@ -132,9 +132,9 @@ class FallbackTests(BrowserCase):
         self.assertEqual(self.page.evaluate(held), 0)
 
     def test_open_while_the_node_is_gone(self) -> None:
-        """Where the browser keeps the page, it opens at the address of a node that is gone, and finds the other."""
+        """A cached page opens at the URL of a failed node, and finds the other one."""
         self.opened()
-        # The page itself is kept with all its files or not at all.
+        # The page is cached with all its files or not at all.
         self.page.evaluate(KEPT)
         os.kill(self.pid(0), signal.SIGKILL)
         self.page.reload()
@@ -148,12 +148,12 @@ class FallbackTests(BrowserCase):
 
 
 class DemonstrationFallbackTests(DemonstrationPageCase):
-    """Experiment 2 of the thesis with the real team, and its web node lost on top."""
+    """Experiment 2 of the thesis with the real team, and in addition the failure of its web node."""
 
     options = ("--web-port", "0")
 
     def test_experiment_2_and_the_web_node(self) -> None:
-        """The dog on its way is killed and the page's node frozen: page and task go on; then the other one crashes."""
+        """The acting dog is killed and the page's node frozen; page and task continue, then the other node dies."""
         page = self.opened(DESK)
         page.locator("#reserve", has_text="pi").wait_for()
         page.get_by_role("button", name="Run Demo").click()

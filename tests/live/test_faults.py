@@ -1,4 +1,4 @@
-"""Faults on the page in a real browser: who may let a device fail does so by touch and by keyboard."""
+"""Tests of fault injection on the page in a real browser, by touch and by keyboard."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from tests.live.page import DESK, PHONE, TABLET, PageCase
 
 class FaultPageTests(PageCase):
     def opened(self, screen: dict[str, Any], scheme: Any = "light", has_clock: bool = False) -> Any:
-        """The page with dog2 open, and its faults there."""
+        """Return the page with dog2's dialog and its faults."""
         page = super().opened(screen, scheme, has_clock)
         page.evaluate("location.hash = 'device/' + '02'.repeat(16)")
         page.locator(".fault-buttons button").first.wait_for()
         return page
 
     def test_let_it_fail(self) -> None:
-        """A tap lets a device fail for the seconds that were said; its clock runs there and on the list of all."""
+        """A tap injects a fault for the given seconds; its timer is shown in the dialog and on the list."""
         page = self.opened(PHONE)
         page.locator("#f-seconds").fill("30")
         page.get_by_role("button", name="Cut radio").tap()
@@ -30,7 +30,7 @@ class FaultPageTests(PageCase):
         page.context.close()
 
     def test_by_keyboard(self) -> None:
-        """With the keyboard alone: Tab reaches each button, Enter lets the device fail, no seconds let nothing."""
+        """By keyboard, Tab reaches each button and Enter injects the fault; without seconds nothing happens."""
         page = self.opened(DESK)
         page.locator("#f-seconds").focus()
         page.keyboard.press("Tab")
@@ -46,7 +46,7 @@ class FaultPageTests(PageCase):
         self.assertEqual(page.locator("#place-device .fault").count(), 1)
 
     def test_be_accessible(self) -> None:
-        """On phone, tablet and desk, light and dark, axe finds nothing, and no button is small or cut off."""
+        """On phone, tablet and desktop, light and dark, axe finds no violation, and no button is small or cut off."""
         for screen in (PHONE, TABLET, DESK):
             page = self.opened(screen)
             if screen is PHONE:

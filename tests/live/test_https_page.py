@@ -1,4 +1,4 @@
-"""The page over TLS in a real browser that trusts the team's certificates: a secure context, which stays one."""
+"""Tests of the page over TLS in a real browser that trusts the team's certificates."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class HttpsPageTests(BrowserCase, NodeCase):
         skip = f"THE PAGE OVER TLS IS NOT TESTED IN A BROWSER: missing {'; '.join(MISSING)}"
 
     def test_stay_secure_when_the_node_is_lost(self) -> None:
-        """The page has camera and service worker within reach, and goes on at another node's https, never at http."""
+        """The page has camera and service worker, and changes to another node's HTTPS, never to HTTP."""
         first = SecureNode(self, "vaio")
         second = SecureNode(self, "pi", first.address)
         pins = ",".join(pin(node.port) for node in (first, second))

@@ -1,4 +1,4 @@
-"""Inviting in a real browser: the code that a phone's camera reads, the text beside it, and what is said of https."""
+"""Tests of invitations in a real browser: the QR code, its text, and the hints on HTTPS."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class InviteTests(PageCase):
         skip = f"INVITING IS NOT TESTED IN A BROWSER: missing {'; '.join(ABSENT)}"
 
     def invite(self, page: Any) -> None:
-        """Open the dialog by keyboard alone."""
+        """Open the dialog by keyboard."""
         self.informed(page)
         page.evaluate(PHONES)
         page.evaluate("location.hash = 'more'")
@@ -29,7 +29,7 @@ class InviteTests(PageCase):
         page.locator("#invite[open]").wait_for()
 
     def read(self, page: Any, number: int = 0) -> str:
-        """What a camera reads off the screen."""
+        """Return the text of a QR code on the screen."""
         import cv2
         import numpy as np
 
@@ -38,7 +38,7 @@ class InviteTests(PageCase):
         return str(cv2.QRCodeDetector().detectAndDecode(picture)[0])
 
     def another(self, page: Any) -> None:
-        """Ask for an invitation anew: OpenCV's reader fails at one code in a hundred."""
+        """Request a new invitation, as OpenCV's reader fails at one code in a hundred."""
         before = page.locator("#i-link").input_value()
         for kind in ("viewer", "phone"):
             page.locator("#i-kind").select_option(kind)
@@ -46,7 +46,7 @@ class InviteTests(PageCase):
             before = page.locator("#i-link").input_value()
 
     def test_read_the_code(self) -> None:
-        """On each screen, light and dark, the code says what the text says; axe finds nothing, nothing is small."""
+        """On each screen, light and dark, the QR code contains the shown URL, and axe finds no violation."""
         for screen in (PHONE, TABLET, DESK):
             page = self.opened(screen)
             self.invite(page)
@@ -65,7 +65,7 @@ class InviteTests(PageCase):
             page.context.close()
 
     def test_say_what_is_missing(self) -> None:
-        """By http the camera is said to be out of reach; an address of this machine is no address for a phone."""
+        """Over HTTP a hint says that the camera is unavailable; a URL of this machine is not offered to a phone."""
         page = self.opened(PHONE)
         self.invite(page)
         self.assertFalse(page.get_by_text("Browsers do not allow the camera over http").is_visible())
@@ -81,13 +81,13 @@ class InviteTests(PageCase):
         self.assertTrue(page.locator("#i-link").input_value().startswith("http://127.0.0.1:"))
 
     def test_lead_to_the_phone(self) -> None:
-        """The link of a phone signs it in as one, leads to its view, and leaves no token in the address."""
+        """The link of a phone signs it in with this role, opens its view, and leaves no token in the URL."""
         page = self.opened(DESK)
         self.invite(page)
         link = page.locator("#i-link").input_value()
         page.get_by_role("button", name="Copy").first.click()
         page.locator("#invite [role=status]", has_text="op").wait_for()
-        # What is held down in an emergency works before the dialog, and after it.
+        # The stop button works above the dialog, and after it.
         page.get_by_role("button", name="Stop").click()
         page.locator("body[data-halted=true]").wait_for()
         page.keyboard.press("Escape")
@@ -96,7 +96,7 @@ class InviteTests(PageCase):
         page.goto("about:blank")
         phone = self.tab(PHONE)
         phone.goto(f"{self.team.url}#{link.partition('#')[2]}")
-        # The address is mended at once, the session is there only when the node has answered.
+        # The URL changes at once, the session exists only after the node's answer.
         phone.wait_for_function(
             "() => location.hash === '#phone' && "
             "JSON.parse(localStorage['swarm.sessions'] ?? '{}')[location.origin]?.token"

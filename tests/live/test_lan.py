@@ -1,4 +1,4 @@
-"""Tests of the LAN's group over real sockets: on the loopback, and between network namespaces that the test makes."""
+"""Tests of the LAN's multicast group over real sockets on the loopback interface."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ reactor: Any = _reactor
 
 
 class LoopbackTests(TestCase):
-    """Two places in the group on the loopback."""
+    """Two members of the group on loopback."""
 
     def group(
         self, host: str = "127.0.0.1", look: Any = interfaces, moved: Callable[[], None] = lambda: None
     ) -> tuple[LanMulticast, list[tuple[bytes, Address]]]:
-        """A place in the group, and what it hears."""
+        """Return a member of the group, and the list of datagrams that it receives."""
         heard: list[tuple[bytes, Address]] = []
         group = LanMulticast(reactor, host, look)
         group.listen(lambda datagram, source: heard.append((datagram, source)), moved)
@@ -32,7 +32,7 @@ class LoopbackTests(TestCase):
         return group, heard
 
     def soon(self, heard: list[Any], count: int = 1, tries: int = 200) -> Deferred[None]:
-        """Fire when so many were heard."""
+        """Return a Deferred that fires when ``count`` datagrams have arrived."""
 
         async def wait() -> None:
             for _ in range(tries):
@@ -44,7 +44,7 @@ class LoopbackTests(TestCase):
         return Deferred.fromCoroutine(wait())
 
     async def test_all_in_the_group_hear_a_call_and_can_answer(self) -> None:
-        """A call reaches every place in the group on one machine, and an answer reaches the caller."""
+        """A datagram to the group reaches each member on the machine, and an answer reaches the sender."""
         a, heard_a = self.group()
         _, heard_b = self.group()
         a.send(b"who?")
@@ -52,7 +52,7 @@ class LoopbackTests(TestCase):
         self.assertEqual(heard_b[0][0], b"who?")
         source = heard_b[0][1]
         self.assertEqual(source.host, "127.0.0.1")
-        await self.soon(heard_a)  # its own call
+        await self.soon(heard_a)  # its own datagram
         answering = reactor.listenUDP(0, DatagramProtocol(), "127.0.0.1")
         self.addCleanup(answering.stopListening)
         answering.write(b"here", tuple(source))
@@ -60,7 +60,7 @@ class LoopbackTests(TestCase):
         self.assertEqual(heard_a[1], (b"here", Address("127.0.0.1", answering.getHost().port)))
 
     async def test_a_change_is_told(self) -> None:
-        """When the interfaces change the node is told, after the first look and not at it."""
+        """A change of the interfaces is reported, but not their first reading."""
         loopback = Interface(1, "lo", ("127.0.0.1",), is_loopback=True)
         found = [[loopback], [loopback], [Interface(1, "lo", ("127.0.0.1", "::1"), is_loopback=True)]]
         changes: list[int] = []
@@ -73,12 +73,12 @@ class LoopbackTests(TestCase):
         self.assertEqual(changes, [1])
 
     def test_the_loopback_is_an_interface(self) -> None:
-        """The machine's interfaces are read, the loopback among them with its address."""
+        """The machine's interfaces are listed, including loopback with its address."""
         loopback = [each for each in interfaces() if each.is_loopback]
         self.assertIn("127.0.0.1", loopback[0].addresses)
 
     async def test_no_interface_is_no_error(self) -> None:
-        """Where there is no interface a call is lost, and closing twice does no harm."""
+        """Without an interface a datagram is lost, and ``close`` may be called twice."""
         group, heard = self.group("192.0.2.77", lambda: [])
         group.send(b"who?")
         await deferLater(reactor, 0.05)

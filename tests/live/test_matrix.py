@@ -1,4 +1,4 @@
-"""Every view on every screen: reached and used by touch and by the keyboard alone, light and dark, without a fault."""
+"""Tests of each view on each screen, opened and used by touch and by keyboard, light and dark."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class MatrixTests(PageCase):
     timeout = 170
 
     def reach(self, page: Any, view: str, is_phone: bool, by_key: bool) -> None:
-        """Go to a view as one does on that screen; a larger one shows it already."""
+        """Open a view as a user of that screen does; a larger screen shows it already."""
         for place in [*["more"] * (view in FURTHER), view] if is_phone else []:
             if by_key:
                 self.tab_to(page, f"a[href='#{place}']")
@@ -51,13 +51,13 @@ class MatrixTests(PageCase):
             self.tab_to(page, USED[view])
 
     def look_through(self, screen: dict[str, Any]) -> None:
-        """All views on one screen, by touch in the light and by keyboard in the dark, and a device."""
+        """Open all views and a device on one screen, by touch in light colours and by keyboard in dark ones."""
         for scheme, by_key in (("light", "has_touch" not in screen), ("dark", True)):
             page = self.opened(screen, scheme)
             page.locator(".preview li").first.wait_for(state="attached")
             for view in VIEWS:
                 self.reach(page, view, screen is PHONE, by_key)
-                # A larger screen shows all at once, so once is enough there.
+                # A larger screen shows all views at once, so one check suffices.
                 if screen is PHONE or view in ("network", "map"):
                     self.sound(page)
             if by_key:
@@ -72,13 +72,13 @@ class MatrixTests(PageCase):
         self.assertEqual([url for url in self.asked if not url.startswith(self.team.url)], [])
 
     def test_phone(self) -> None:
-        """On a phone."""
+        """All views work on a phone."""
         self.look_through(PHONE)
 
     def test_tablet(self) -> None:
-        """On a tablet."""
+        """All views work on a tablet."""
         self.look_through(TABLET)
 
     def test_desk(self) -> None:
-        """On a desk, where there is no touch."""
+        """All views work on a desktop without touch."""
         self.look_through(DESK)

@@ -1,4 +1,4 @@
-"""Pictures over a real network: our driver and OpenCV's own client at the emulated camera, and a server of others."""
+"""Tests of camera streams over real sockets: the driver with another server, and the emulator with OpenCV's client."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ reactor: Any = running
 
 
 class LiveMjpegTests(TestCase):
-    """Real sockets, real time."""
+    """Real sockets in real time."""
 
     timeout = 60
 
@@ -37,18 +37,18 @@ class LiveMjpegTests(TestCase):
         self.addCleanup(self.close)
 
     async def close(self) -> None:
-        """The camera is off, and its port closed."""
+        """Stop the camera and close its port."""
         self.camera.stop()
         await self.port.stopListening()
         await wait(0.05)
 
     def driver(self, port: int, **options: object) -> Driver:
-        """A driver of the camera at ``port``."""
+        """Return a driver of the camera at ``port``."""
         url = f"http://127.0.0.1:{port}/stream"
         return driver_for("camera", {"url": url, "width": 128, "height": 96, "fps": 30, **options}, "cam", reactor)
 
     async def test_watches_a_server_of_others(self) -> None:
-        """A stream that Python's own HTTP server writes, in HTTP/1.0 and without lengths, is watched."""
+        """A stream of Python's HTTP server, in HTTP/1.0 and without lengths, is read."""
 
         class Page(http.server.BaseHTTPRequestHandler):
             def do_GET(self) -> None:  # noqa: N802 (its own)
@@ -60,7 +60,7 @@ class LiveMjpegTests(TestCase):
                 self.wfile.write(b"--edge--\n")
 
             def log_message(self, *_: Any) -> None:
-                """Say nothing."""
+                """Log nothing."""
 
         server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Page)
         thread = threading.Thread(target=server.serve_forever, daemon=True)
@@ -78,7 +78,7 @@ class LiveMjpegTests(TestCase):
             thread.join(5.0)
 
     async def test_other_clients_watch_the_emulator(self) -> None:
-        """OpenCV's own client reads the emulated camera like any other, in chunks and without."""
+        """OpenCV's client reads the emulated camera with and without chunks."""
         import cv2
         import numpy
 

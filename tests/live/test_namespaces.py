@@ -1,4 +1,4 @@
-"""The internet of namespaces: what its routers and lines do to datagrams, and that nothing is left of it."""
+"""Tests of the internet of namespaces: its routers, its links, and its complete removal."""
 
 from __future__ import annotations
 
@@ -46,10 +46,10 @@ print(seen)
 
 
 class InternetTests(NamespaceCase):
-    """What ``Internet`` promises."""
+    """Behaviour of ``Internet``."""
 
     def seen(self, net: Internet, host: str) -> list[tuple[str, int] | None]:
-        """As which addresses the public host sees one socket of ``host`` at its three echoes."""
+        """Return the addresses at which three echo servers on the public host see one socket of ``host``."""
         done = net.run(host, [sys.executable, "-c", ASK, *TARGETS], timeout=LIMIT_S)
         self.assertEqual(done.returncode, 0, done.stderr)
         found: list[tuple[str, int] | None] = json.loads(
@@ -58,13 +58,13 @@ class InternetTests(NamespaceCase):
         return [None if each is None else (each[0], each[1]) for each in found]
 
     def echo(self, net: Internet) -> None:
-        """Let the public host tell everybody its address."""
+        """Start the echo servers on the public host."""
         process = net.start("pub", [sys.executable, "-c", ECHO, *TARGETS], stdout=subprocess.PIPE, text=True)
         assert process.stdout is not None
         self.assertEqual(process.stdout.readline(), "ready\n")
 
     def test_mappings_are_of_their_kind(self) -> None:
-        """One outside port for all peers, or another one for each, or none at all: as the kind of the router says."""
+        """Each kind of router maps to one outside port for all peers, to one per peer, or to none."""
         kinds = list(Kind)
         net = self.internet(*(Site(kind.value, kind) for kind in kinds))
         self.echo(net)
@@ -79,7 +79,7 @@ class InternetTests(NamespaceCase):
             self.assertEqual(len(ports), 3 if kind is Kind.SYM else 1, (kind, seen))
 
     def test_lines_lose_what_is_said(self) -> None:
-        """A cut lets nothing pass in its one direction, losses are counted, and a healed line is good again."""
+        """A cut blocks all datagrams in one direction, losses are counted, and a healed link passes all datagrams."""
         net = self.internet(Site("a", Kind.PORT))
         self.echo(net)
         self.assertNotIn(None, self.seen(net, "a1"))
@@ -92,7 +92,7 @@ class InternetTests(NamespaceCase):
         self.assertNotIn(None, self.seen(net, "a1"))
 
     def test_routers_get_another_address(self) -> None:
-        """A renumbered site is seen at its new address, and only there; a moved host behind its new router."""
+        """A renumbered site is seen only at its new address, and a moved host at its new router's."""
         net = self.internet(Site("a", Kind.PORT), Site("b", Kind.FULL))
         self.echo(net)
         before, new = net.outside("a"), net.renumber("a")
@@ -102,7 +102,7 @@ class InternetTests(NamespaceCase):
         self.assertEqual({each[0] for each in self.seen(net, "a1") if each}, {net.outside("b")})
 
     def test_captures_hold_and_count(self) -> None:
-        """A capture counts datagrams and bytes of each peer, and finds words that were sent in the open."""
+        """A capture counts datagrams and bytes per peer, and finds words that were sent unencrypted."""
         net = self.internet(Site("a", Kind.PORT))
         self.echo(net)
         file, whole = Path(self.mktemp()), Path(self.mktemp())
@@ -118,7 +118,7 @@ class InternetTests(NamespaceCase):
         self.assertIn(b"who am I", whole.read_bytes())
 
     def test_nothing_is_left(self) -> None:
-        """After an exception, and after a kill of whoever made it, no process of an internet is left."""
+        """After an exception or a kill of the creating process, no process of an internet is left."""
         program = (
             "import os, signal, sys\n"
             "from sim.namespaces.internet import Internet, Site\nfrom sim.namespaces.kind import Kind\n"
@@ -146,7 +146,7 @@ class MatrixTests(NamespaceCase):
     """A small run of ``make live-nat``."""
 
     def test_whoever_can_reach_each_other_does(self) -> None:
-        """One round of the matrix: nodes without a router meet at once, and table, JSON and picture are written."""
+        """In one round of the matrix, nodes without routers connect at once, and table, JSON and figure are written."""
         folder = Path(self.mktemp()).absolute()
         command = [sys.executable, "-m", "benchmarks.nat", "--count", "1", "--lossy", "0", "--out", str(folder)]
         ran = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)

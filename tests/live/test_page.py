@@ -1,4 +1,4 @@
-"""The page in a real browser: what an operator sees and can do, on a phone and on a desk."""
+"""Tests of the page in a real browser: the views and actions of an operator, on a phone and on a desktop."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class PageTests(PageCase):
         return list(page.locator(".device b").all_inner_texts())
 
     def test_reach_each_view(self) -> None:
-        """On a phone each view is at most two taps away and alone; keys, back and links lead there as well."""
+        """On a phone each view is shown alone after at most two taps; keys, back and links open it as well."""
         page = self.opened(PHONE)
         shown = "[...document.querySelectorAll('main section, footer')].filter(e => e.checkVisibility()).map(e => e.id)"
         for name, ways in {
@@ -78,7 +78,7 @@ class PageTests(PageCase):
         self.assertEqual(self.faults, [])
 
     def test_choose_colours(self) -> None:
-        """The page follows the system's colours; light and dark can be chosen against them, and stay chosen."""
+        """The page follows the system's colours; the choice of light or dark overrides them and is stored."""
         page = self.opened(DESK, "light")
         dark = "getComputedStyle(document.body).backgroundColor"
         before = page.evaluate(dark)
@@ -94,7 +94,7 @@ class PageTests(PageCase):
         self.assertEqual((page.evaluate(dark), page.locator("#theme").input_value()), (chosen, "dark"))
 
     def test_fill_a_wall(self) -> None:
-        """A wall may show one view alone, as large as it is; a large screen shows all of them at once."""
+        """A large screen shows all views at once, or one of them in full size."""
         page = self.opened({"viewport": {"width": 2560, "height": 1440}})
         heights = page.evaluate("[...document.querySelectorAll('main section')].map(e => e.getBoundingClientRect())")
         self.assertEqual(len([box for box in heights if box["top"] < 1440]), 7)
@@ -104,7 +104,7 @@ class PageTests(PageCase):
         self.assertGreater(page.locator("canvas").first.bounding_box()["width"], 600)
 
     def test_ask_devices(self) -> None:
-        """What is known of the network is asked only while it is looked at; what a device stores, when it is opened."""
+        """The network is queried only while its view is shown, and a device's storage when its dialog opens."""
         page = self.opened(PHONE, has_clock=True)
 
         def asks() -> bool:
@@ -128,7 +128,7 @@ class PageTests(PageCase):
         self.assertFalse(asks())
 
     def test_tell_why(self) -> None:
-        """A task says who agrees and who differs; opened, it tells each decision's rule and reports, and stays open."""
+        """A task lists agreeing and differing agents; its details show each decision's rule and reports."""
         for screen in (PHONE, DESK):
             page = self.opened(screen)
             self.view(page, "tasks")
@@ -150,7 +150,7 @@ class PageTests(PageCase):
             self.team.order("status dog1 WAITING")
 
     def test_show_cameras(self) -> None:
-        """On a desk all three cameras live; one that is scrolled away or whose device is gone is not asked for."""
+        """A desktop shows three live cameras; a camera out of view, or of an absent device, is not requested."""
         page = self.opened(DESK)
         page.locator("figure[data-camera=live]").nth(2).wait_for()
         self.team.order("gone dog2")
@@ -170,7 +170,7 @@ class PageTests(PageCase):
         phone.locator("figure[data-camera=live]").first.wait_for()
 
     def test_show_who_left(self) -> None:
-        """A device that leaves stands in its place as gone, with its age, and comes back by itself."""
+        """A device that leaves stays in its place as gone, with its age, and returns automatically."""
         page = self.opened(DESK)
         self.assertEqual(self.names(page), ["dog1", "dog2", "dog3"])
         self.team.order("gone dog1")
@@ -182,7 +182,7 @@ class PageTests(PageCase):
         page.locator(".device[data-state=WAITING]", has_text="dog1").wait_for()
 
     def test_open_a_device(self) -> None:
-        """A double click, Enter and its address open a device; a click does not; Escape, Close and back leave it."""
+        """A double click, Enter and its URL open a device, a click does not; Escape, Close and back close it."""
         page = self.opened(DESK)
         dialog = page.locator("dialog[open]")
         page.locator(".device").nth(1).click()
@@ -217,7 +217,7 @@ class PageTests(PageCase):
         self.assertEqual(self.faults, [])
 
     def test_run_the_parts_of_the_page(self) -> None:
-        """A panel stands where it belongs, for whom it is meant, is told what comes, and ends; equal rows stay two."""
+        """A panel is shown in its place and to its roles, gets events, and ends; equal rows are kept apart."""
         page = self.informed(self.opened(DESK))
         self.assertEqual(page.evaluate(TWINS), [["abab", 4], ["aba", 0], ["baa", 0]])
         page.evaluate(PANELS)
@@ -235,7 +235,7 @@ class PageTests(PageCase):
         page.locator(".device[data-state=DONE]", has_text="dog3").wait_for()
 
     def test_tell_what_happened(self) -> None:
-        """What happens is told in words, newest first: of all, of one kind, and of one device or task."""
+        """Events are listed as text, newest first: of all kinds, of one kind, and of one device or task."""
         page = self.opened(DESK)
         story = page.locator("#events li")
         page.locator("#events li", has_text="starts to observe").wait_for()
@@ -258,7 +258,7 @@ class PageTests(PageCase):
         self.assertEqual(self.faults, [])
 
     def test_give_tasks(self) -> None:
-        """On a phone a task is assigned and cancelled by a button, and the group shows its bids and whom it names."""
+        """On a phone, buttons assign and cancel a task, and the group shows its bids and the assigned agent."""
         page = self.opened(PHONE)
         page.get_by_role("button", name="Run Demo").tap()
         self.told(page, "The demo runs")
@@ -278,7 +278,7 @@ class PageTests(PageCase):
         self.assertEqual(len(set(shapes)), 3)
         self.team.order("status dog3 DONE")
         page.locator(".device[data-state=DONE]", has_text="done").wait_for()
-        # Where the events have the screen to themselves the page is scrolled, and not a list within it.
+        # If the events fill the screen, the page is scrolled, and not a list within it.
         self.view(page, "events")
         page.locator("#events li", has_text="starts to observe").wait_for()
         inside = """events => {
@@ -290,7 +290,7 @@ class PageTests(PageCase):
         self.assertLessEqual(page.locator("#events").bounding_box()["y"], 0)
 
     def test_move_the_target(self) -> None:
-        """A click, a drag and the arrow keys move the target; a button takes it away."""
+        """A click, a drag and the arrow keys move the target; a button removes it."""
         page = self.opened(DESK)
         at = self.floor(page)
         page.mouse.click(*at(2.03, 2.0))
@@ -313,7 +313,7 @@ class PageTests(PageCase):
         page.locator("#place", has_text="Target at 1.50, 1.20").wait_for()
 
     def test_survive_loss(self) -> None:
-        """A frozen node is noticed within about two seconds, a killed one at once; the page goes on when it is back."""
+        """A frozen node is detected in about two seconds, a killed one at once; the page recovers when it is back."""
         page = self.opened(DESK)
         started = time.monotonic()
         self.team.freeze()

@@ -1,4 +1,4 @@
-"""A robot on a cable with a camera board and a compass on the network: one device, as a settings file says."""
+"""Tests of a robot on a serial port with a network camera and compass: one device in the settings file."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ NODE = {"name": "vacuum"}
 
 
 class LivePartsTests(TestCase):
-    """Real sockets, a real terminal, real time."""
+    """Real sockets and a real terminal in real time."""
 
     timeout = 30
 
     @inlineCallbacks
     def test_is_one_device(self) -> Generator[Deferred[Any], Any, None]:
-        """All three are reached by their own sort of link; the camera is lost and comes back while the robot drives."""
+        """Each part has its kind of link; the camera is lost and reconnects while the robot drives."""
         body = MemoryBody(jpeg=jpeg(5), values={"compass.heading": 0.5})
         robot, camera, compass = (
             Create2(body, reactor, Random(1)),

@@ -1,6 +1,6 @@
-"""A phone in Chromium, with a fake camera, in the real demonstration: joins, finds the target, wins, is taken over.
+"""Tests of a phone in Chromium, with a fake camera, that takes part in the real demonstration.
 
-The demonstration's page is asked over https, as a phone has to, where the libraries of the extra ``tls`` are there.
+The demonstration's page is served over HTTPS, which phones need, if the libraries of the extra ``tls`` are installed.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ HIDE = """(hidden) => {
 
 
 class PhoneViewTests(BrowserCase, TeamCase):
-    """The view of a phone, over the twin of a gateway."""
+    """The view of a phone, with a fake gateway in memory."""
 
     def opened(self, screen: Any = PHONE, base: str = "", may_film: bool = True) -> Any:
         page = self.tab(screen, permissions=["camera"] if may_film else [])
@@ -51,7 +51,7 @@ class PhoneViewTests(BrowserCase, TeamCase):
         return page
 
     def test_take_part_and_stop(self) -> None:
-        """By touch and by keyboard alone, on three screens: it shows what it sees and what it is asked, and stops."""
+        """By touch and by keyboard, on three screens, the phone shows its detections and its task, and stops."""
         for screen in (PHONE, TABLET, DESK):
             look = self.sound_by_day_and_night if screen is PHONE else self.sound
             page = self.opened(screen)
@@ -71,7 +71,7 @@ class PhoneViewTests(BrowserCase, TeamCase):
             page.context.close()
 
     def test_leave_while_hidden(self) -> None:
-        """Out of sight it leaves and lets the camera go; in sight again it comes back by itself, as the same phone."""
+        """A hidden page leaves and releases the camera; a visible one rejoins automatically as the same phone."""
         page = self.opened()
         page.get_by_role("button", name="Take part", exact=True).tap()
         page.locator(".phone .said", has_text="Look for the red target").wait_for()
@@ -88,7 +88,7 @@ class PhoneViewTests(BrowserCase, TeamCase):
         self.assertEqual(self.faults, [])
 
     def test_say_why_not(self) -> None:
-        """A refused camera, a page that is not secure and a visitor who only looks: each is told what to do."""
+        """A denied camera, an insecure page and a viewer each get a message with the remedy."""
         page = self.opened(may_film=False)
         page.get_by_role("button", name="Take part", exact=True).tap()
         page.locator(".phone .trouble", has_text="The camera is not allowed. Allow it").wait_for()
@@ -108,7 +108,7 @@ class PhoneViewTests(BrowserCase, TeamCase):
             return str(json.load(answer)["token"])
 
     def test_see_as_robots_do(self) -> None:
-        """In the pictures of the yard's camera the page finds the target where the robots find it, or neither does."""
+        """In simulated camera frames the page finds the target at the same place as the robots."""
         import base64
 
         from agents.vision import Size, find_target
@@ -139,7 +139,7 @@ class DemonstrationPhoneTests(BrowserCase, DemonstrationCase):
     is_secure = all(find_spec(name) for name in ("OpenSSL", "cryptography"))
 
     def pins(self) -> str:
-        """What Chromium is to trust of both web nodes."""
+        """Return the public key hashes of both web nodes for Chromium to trust."""
         secure = [page["url"] for page in self.demo.api("node")["pages"] if page["is_secure"]]
         return ",".join(pin(int(url.rpartition(":")[2])) for url in secure)
 
@@ -160,7 +160,7 @@ class DemonstrationPhoneTests(BrowserCase, DemonstrationCase):
         return {name: each["status"] for name, each in self.devices().items()}
 
     def has_task(self, page: Any) -> bool:
-        """Whether the phone has the task, by its own page and by the team's."""
+        """Return whether the phone has the task, by its page and by the team's."""
         said = page.locator(".phone .said").text_content()
         return "You have the task" in said and self.statuses().get("anna") == "EXECUTING"
 
@@ -174,7 +174,7 @@ class DemonstrationPhoneTests(BrowserCase, DemonstrationCase):
         self.fail("there is no place for the target")
 
     def joined(self) -> Any:
-        """The page of a phone that takes part as anna, with the target before its camera."""
+        """Return the page of a phone that takes part as anna, with the target in view of its camera."""
         invitation = self.demo.api("invitations", {"role": "phone", "name": "visitor"})["token"]
         self.until(lambda: {"dog1", "dog2", "dog3"} <= set(self.devices()))
         self.until(lambda: len(self.demo.api("node")["pages"]) == (4 if self.is_secure else 2))
@@ -188,7 +188,7 @@ class DemonstrationPhoneTests(BrowserCase, DemonstrationCase):
         return page
 
     def lose_web_node(self, page: Any) -> None:
-        """Kill the node that the phone takes part at; it goes on at the other as the same device."""
+        """Kill the phone's web node; the phone continues at the other one as the same device."""
         before = self.devices()["anna"]
         self.demo.send_signal("vaio", signal.SIGKILL)
         page.locator("#node", has_text="pi").wait_for()
@@ -200,7 +200,7 @@ class DemonstrationPhoneTests(BrowserCase, DemonstrationCase):
         self.assertIsNone(after["gone"])
 
     def test_wins_at_another_web_node_and_is_taken_over(self) -> None:
-        """A phone joins by one tap, goes on when its web node dies, wins a task, and leaves it to a dog."""
+        """A phone joins with one tap, survives the death of its web node, wins a task, and leaves it to a dog."""
         page = self.joined()
         anna = self.devices()["anna"]
         self.assertEqual((anna["kind"], "camera" in anna["capabilities"]), ("phone", True))
@@ -222,7 +222,7 @@ class DemonstrationPhoneTests(BrowserCase, DemonstrationCase):
 
         def dog_waits() -> bool:
             if self.demo.api("tasks")[0]["status"] == "COMPLETED":
-                # On a slow machine the dogs look for longer than the phone has to.
+                # On a slow machine the dogs search for longer than the phone's task lasts.
                 self.demo.api("tasks", {"name": "watch-target"})
             found = self.statuses()
             waits = any(status == "WAITING" for name, status in found.items() if name.startswith("dog"))

@@ -1,4 +1,4 @@
-"""Where devices say that they are, on a page without a yard."""
+"""Tests of the positions that devices report, on a page without a simulator."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any
 
 from tests.live.page import DESK, PHONE, TABLET, PageCase
 
-# All of them at one moment: the page may scroll or grow between two questions.
+# All positions in one call: the page may scroll or grow between two calls.
 CENTRES = """names => names.map((name) => {
     const box = document.querySelector(`.spot[aria-label^=${name}] .dot`).getBoundingClientRect();
     return [box.x + box.width / 2, box.y + box.height / 2];
@@ -15,11 +15,11 @@ CENTRES = """names => names.map((name) => {
 
 class PositionTests(PageCase):
     def centres(self, page: Any, *names: str) -> list[list[float]]:
-        """Where devices are drawn at one moment, in pixels."""
+        """Return the centres of the devices' marks at one time, in pixels."""
         return list(page.evaluate(CENTRES, list(names)))
 
     def test_draw_to_scale(self) -> None:
-        """Metres are drawn to one scale, y upwards, with a bar that says how long it is; a tap opens the device."""
+        """Positions in metres are drawn to scale with y upwards and a scale bar; a tap opens the device."""
         self.team.order("outdoors")
         for place in ("dog1 x=0 y=0 heading=0", "dog2 x=30 y=0 heading=1.5708", "dog3 x=0 y=12 heading=0"):
             self.team.order(f"place {place}")
@@ -43,7 +43,7 @@ class PositionTests(PageCase):
         page.locator("#d-name", has_text="dog3").wait_for()
 
     def test_draw_by_the_globe(self) -> None:
-        """Latitude and longitude are drawn north up with what they are good to; another frame is listed and said."""
+        """Positions on the globe are drawn north up with their accuracy; those in another frame are listed."""
         self.team.order("outdoors")
         self.team.order("place dog1 lat=48.1371 lon=11.5754 accuracy=8")
         self.team.order("place dog2 lat=48.1372 lon=11.5757 accuracy=25")
@@ -52,7 +52,7 @@ class PositionTests(PageCase):
             page = self.opened(screen, scheme)
             self.view(page, "map")
             page.locator("#spots .spot").nth(1).wait_for()
-            # What it draws is to scale when it has heard of all three.
+            # The drawing is to scale after the page has received all three positions.
             page.locator("#place-map", has_text="north is up. 1 more is reported in another frame").wait_for()
             one, two = self.centres(page, "dog1", "dog2")
             # 22.3 m to the east and 11.1 m to the north.
@@ -67,7 +67,7 @@ class PositionTests(PageCase):
             self.sound(page)
 
     def test_leave_it_to_the_yard(self) -> None:
-        """Where there is a yard it is shown, whatever devices report."""
+        """With a simulator its map is shown, even if devices report positions."""
         self.team.order("place dog1 x=1 y=1 heading=0")
         page = self.opened(DESK)
         page.locator("#map .dog").nth(2).wait_for()

@@ -1,4 +1,4 @@
-"""Tests of ``middleware.faults.process`` with real processes: a frozen one continues, a killed one is gone."""
+"""Tests of ``middleware.faults.process`` with real processes: a frozen one continues, a killed one ends."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ print('still here')
 
 class OwnProcessTests(SynchronousTestCase):
     def run_program(self, program: str) -> subprocess.CompletedProcess[str]:
-        """Run it in a process of its own."""
+        """Run the program in a child process."""
         return subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=60)
 
     def test_freeze(self) -> None:
-        """Nothing runs while it is frozen, and it goes on by itself after its seconds."""
+        """A frozen process executes nothing, and continues automatically after the given time."""
         child = self.run_program(FREEZE)
         self.assertEqual(child.returncode, 0, child.stderr)
         self.assertGreater(float(child.stdout), 0.45)
 
     def test_kill(self) -> None:
-        """It dies by SIGKILL, and says nothing any more."""
+        """A killed process ends by SIGKILL without further output."""
         child = self.run_program(KILL)
         self.assertEqual((child.returncode, child.stdout), (-signal.SIGKILL, "here\n"))

@@ -1,4 +1,4 @@
-"""Tests with real processes: nothing of a team outlives whoever started it."""
+"""Tests with real processes: the processes of a team end with their parent."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ PATIENCE_S = 15.0
 
 
 def is_alive(pid: int) -> bool:
-    """Whether a process with this id runs."""
+    """Return whether a process with this id runs."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
         return False
-    # Where nobody collects orphans the dead stay in the table.
+    # Without a process that collects orphans, ended ones stay in the table as zombies.
     try:
         return ") Z " not in Path(f"/proc/{pid}/stat").read_text(encoding="ascii", errors="replace")
     except OSError:
@@ -46,7 +46,7 @@ def is_alive(pid: int) -> bool:
 
 
 class OrphanTests(SynchronousTestCase):
-    """Children end with their parent, however that ends."""
+    """Children end with their parent, for each kind of end."""
 
     def setUp(self) -> None:
         folder = Path(self.mktemp()).resolve()
@@ -64,17 +64,17 @@ class OrphanTests(SynchronousTestCase):
         self.assertEqual(sorted(line[1] for line in lines), ["a", "b"])
 
     def assert_ended(self) -> None:
-        """Wait until no child runs, and fail where one still does."""
+        """Wait until no child runs, and fail after a timeout."""
         until(lambda: not any(map(is_alive, self.pids)), told=lambda: list(filter(is_alive, self.pids)))
 
     def test_killed_parent_leaves_no_orphan(self) -> None:
-        """When the parent is killed by SIGKILL, its children end by themselves."""
+        """If the parent is killed by SIGKILL, its children end."""
         self.parent.kill()
         self.parent.wait(PATIENCE_S)
         self.assert_ended()
 
     def test_interrupted_parent_ends_its_children_first(self) -> None:
-        """When the parent is interrupted (Ctrl-C), it ends its children before it ends itself."""
+        """If the parent is interrupted (Ctrl-C), it ends its children first."""
         self.parent.send_signal(signal.SIGINT)
         self.parent.wait(PATIENCE_S)
         self.assert_ended()

@@ -65,10 +65,10 @@ class Behaviour:
 
 
 class PushedCodeTests(SynchronousTestCase):
-    """One process each."""
+    """One process per module."""
 
     def runner(self, source: str, kind: str = STRATEGY) -> Runner:
-        """A module that is started, and ready or refused."""
+        """Return a runner of this module, when it is ready or refused."""
         data = source.encode()
         runner = Runner(pushed("best", kind, data, None), data, ProcessChannel, time.monotonic)
         self.addCleanup(runner.stop, "the test is over")
@@ -77,18 +77,18 @@ class PushedCodeTests(SynchronousTestCase):
         return runner
 
     def looked(self, runner: Runner) -> Runner:
-        """The runner, after a look."""
+        """Update the runner's state and return it."""
         runner.look()
         return runner
 
     def asked(self, source: str) -> list[str]:
-        """What the module says of its attempts; raises where it gives no answer."""
+        """Return the results of the module's attempts; raise if there is no answer."""
         runner = self.runner(BASE + source)
         self.assertIs(runner.state, State.READY, runner.why)
         return [told[CHOICE] for told in runner.wait_for(*ATTEMPT)]
 
     def test_confined(self) -> None:
-        """On Linux all limits hold that this machine can give, seccomp among them."""
+        """On Linux all limits that the machine supports are in force, including seccomp."""
         if not sys.platform.startswith("linux"):
             raise SkipTest("limits of Linux")
         runner = self.runner(BASE)
@@ -96,7 +96,7 @@ class PushedCodeTests(SynchronousTestCase):
             self.assertIn(limit, runner.limits)
 
     def test_nothing_of_the_machine(self) -> None:
-        """A module reads and writes no file, opens no socket, starts nothing, signals nobody, sees no environment."""
+        """A module cannot access files, sockets, processes, signals and the environment."""
         if not sys.platform.startswith("linux"):
             raise SkipTest("limits of Linux")
         canary = Path(self.mktemp())
@@ -129,7 +129,7 @@ def ATTEMPT(what):
         self.assertEqual(environment, "0")
 
     def test_not_in_the_node(self) -> None:
-        """The node's process loads nothing of the module, and the module is another process."""
+        """The node's process loads no part of the module, which runs in another process."""
         before = set(sys.modules)
         (number,) = self.asked("def ATTEMPT(what): return [os.getpid()]\nsys.canary = 1\n")
         self.assertNotEqual(int(number), os.getpid())
@@ -137,7 +137,7 @@ def ATTEMPT(what):
         self.assertFalse([name for name in set(sys.modules) - before if name.startswith("swarm_deployed_")])
 
     def test_strategy_that_hangs(self) -> None:
-        """A strategy that hangs once it is in use is ended and started again, three times at most."""
+        """A strategy that hangs in use is killed and restarted, at most three times."""
         runner = self.runner(BASE + "def ATTEMPT(what):\n    while True: pass\n")
         losses = 0
         while runner.state is not State.OUT:
@@ -150,7 +150,7 @@ def ATTEMPT(what):
         self.flushLoggedErrors()
 
     def test_what_it_says_is_limited(self) -> None:
-        """A module that writes to the pipe by itself, or a large answer, is ended or refused."""
+        """A module that writes to the pipe directly, or returns too large an answer, is killed or refused."""
         flood = "def ATTEMPT(what):\n    for fd in range(3, 9):\n        try: os.write(fd, b'\\xff' * 100)\n"
         runner = self.runner(BASE + flood + "        except OSError: pass\n")
         self.assertRaises(NoOpinion, runner.wait_for, *ATTEMPT)
@@ -158,7 +158,7 @@ def ATTEMPT(what):
         self.assertRaises(NoOpinion, self.asked, "def ATTEMPT(what): return ['x' * 1000000]\n")
 
     def test_ends_with_its_node(self) -> None:
-        """A process whose runner stops is gone, and one whose pipe closes ends by itself."""
+        """The process ends when its runner stops."""
         runner = self.runner(BASE)
         channel = runner._channel
         assert isinstance(channel, ProcessChannel)
@@ -167,7 +167,7 @@ def ATTEMPT(what):
         self.assertRaises(ProcessLookupError, os.kill, number, 0)
 
     def test_module_that_is_refused(self) -> None:
-        """What does not load or conform is refused with its reason, and its process is ended."""
+        """A module that cannot be loaded or is invalid is refused with the reason, and its process ends."""
         for source, why in (
             ("1 / 0", "ZeroDivisionError"),
             ("while True: pass", "takes more than"),
@@ -178,7 +178,7 @@ def ATTEMPT(what):
             self.assertIn(why, runner.why)
 
     def test_behaviour(self) -> None:
-        """A behaviour sees pictures and moves the body; the agent waits for nothing; one that hangs is ended."""
+        """A behaviour gets frames and returns actions without a wait of the agent; one that hangs is killed."""
         runner = self.runner(SPIN, BEHAVIOUR)
         self.assertIs(runner.state, State.READY, runner.why)
         frame = Frame(1, 640, 480, b"j" * 200_000, 0.0)

@@ -1,4 +1,4 @@
-"""Tests of ``drivers.pyro`` with a brain on a thread of its own, and of the examples as commands."""
+"""Tests of ``drivers.pyro`` with a brain on another thread, and of the examples as commands."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class ThreadTests(TestCase):
     timeout = 20
 
     def test_brain_on_a_thread_of_its_own(self) -> Deferred[None]:
-        """A plain script on another thread connects, drives, reads and leaves, each call done when it returns."""
+        """A plain script on another thread connects, drives, reads and disconnects with blocking calls."""
         body = MemoryBody()
         dog = AiboEmulator(reactor, body, Random(1))
         dog.start()
@@ -55,7 +55,7 @@ class ThreadTests(TestCase):
 
         def end(result: Any) -> Any:
             dog.stop()
-            # What closes the links in memory takes a moment to arrive.
+            # The end of the links in memory arrives later.
             return deferLater(reactor, 0.05, lambda: result)
 
         done: Deferred[None] = deferToThread(script).addCallback(told).addBoth(end)
@@ -64,7 +64,7 @@ class ThreadTests(TestCase):
 
 class CommandTests(SynchronousTestCase):
     def test_examples_run_as_commands(self) -> None:
-        """Each of the two brains runs by one command for a second, says what its robot has, and ends well."""
+        """Each of the two brains runs as a command for a second, prints its robot's devices, and ends without error."""
         for name in ("avoid", "track_ball"):
             done = subprocess.run(
                 [sys.executable, f"examples/pyro/{name}.py", "--seconds", "1"],

@@ -1,4 +1,4 @@
-"""The rosbridge driver over real TCP; its emulator against another client, and itself against another server."""
+"""Tests of the rosbridge driver over real TCP, of its emulator with another client, and with another server."""
 
 from __future__ import annotations
 
@@ -51,12 +51,12 @@ ros.terminate()
 
 
 class LiveRosbridgeTests(TestCase):
-    """Real sockets of this machine."""
+    """Real sockets on this machine."""
 
     timeout = 60
 
     def setUp(self) -> None:
-        """A robot that listens on a free port."""
+        """Start a robot that listens on a free port."""
         self.body = MemoryBody(values={"power.level": 0.8, "range.near": 0.5})
         self.robot = RosbridgeRobot(reactor, self.body, Random(1))
         self.robot.start()
@@ -66,7 +66,7 @@ class LiveRosbridgeTests(TestCase):
         self.addCleanup(self.robot.stop)
 
     async def test_drives_over_tcp(self) -> None:
-        """Connected over TCP the robot drives, stops at the deadline, and after a reboot the link is opened again."""
+        """Over TCP the robot drives, stops at the deadline, and is reconnected after a reboot."""
         driver = RosbridgeDriver({"port": self.port}, TcpConnector(reactor), reactor)
         await driver.connect()
         self.addCleanup(driver.disconnect)
@@ -81,7 +81,7 @@ class LiveRosbridgeTests(TestCase):
         self.assertEqual(driver.diagnostics()["bad_frames"], 0)
 
     async def test_other_client_takes_it_for_a_robot(self) -> None:
-        """Another client, roslibpy, subscribes, publishes, calls, and is told of a service that is not there."""
+        """The client roslibpy can subscribe, publish and call services, and gets the error of a missing service."""
 
         def run() -> subprocess.CompletedProcess[str]:
             command = [sys.executable, "-c", OTHERS, str(self.port)]
@@ -95,7 +95,7 @@ class LiveRosbridgeTests(TestCase):
         self.assertEqual(self.robot.ignored, 0)
 
     async def test_other_server_takes_it_for_a_client(self) -> None:
-        """Another WebSocket server, autobahn's, hears the driver and is heard: small, middling and large."""
+        """The driver communicates with autobahn's WebSocket server in small, medium and large messages."""
         from autobahn.twisted.websocket import WebSocketServerFactory, WebSocketServerProtocol
 
         heard: list[dict[str, Any]] = []

@@ -1,4 +1,4 @@
-"""Every route of a real page, asked by each role and in unlawful ways: who is let in, and how the rest is told."""
+"""Tests of each route of a real page with each role and with invalid requests: permissions and errors."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Answer = tuple[int, Message, bytes]
 
 
 def path_of(route: Route) -> str:
-    """The path of a route, with names in it that are there, where the test knows one."""
+    """Return the path of a route, with the names of existing objects if the test knows them."""
     return re.sub(r"\{(\w+)\}", lambda found: NAMES.get(found[1], "x"), route.path)
 
 
@@ -43,7 +43,7 @@ class SafetyTests(TeamCase):
         self._number = 0
 
     def token(self, role: Role, ticket: bool = False, name: str = "") -> str:
-        """A token that was used by nobody before; none for anyone."""
+        """Return an unused token of this role; an empty string for ``anyone``."""
         if role == "anyone":
             return ""
         self._number += 1
@@ -51,7 +51,7 @@ class SafetyTests(TeamCase):
         return self._key.token(claim.ticket if ticket else claim)
 
     def asked(self, method: str, path: str, body: bytes | None = None, **headers: str) -> Answer:
-        """One request on a connection of its own; of a stream only its beginning is read."""
+        """Send one request on a new connection; of a stream, read only the headers."""
         given = {name.replace("_", "-"): value for name, value in headers.items()}
         connection = http.client.HTTPConnection("127.0.0.1", self.team.port, timeout=10)
         try:
@@ -63,18 +63,18 @@ class SafetyTests(TeamCase):
             connection.close()
 
     def bearer(self, role: Role, name: str = "") -> dict[str, str]:
-        """The header of somebody of that role."""
+        """Return the headers of a client with this role."""
         token = self.token(role, name=name)
         return {"Authorization": f"Bearer {token}"} if token else {}
 
     def test_let_in_whom_the_table_says(self) -> None:
-        """Each route lets in the roles that its line in the table names, by token, and nobody else: 401, or 403.
+        """Each route accepts a token of the roles in its line of the table, and answers all others with 401 or 403.
 
-        Each answer has all headers that keep a browser strict, and names no server.
+        Each answer has all security headers and does not name the server.
         """
         wrong: list[object] = []
         for route in TABLE:
-            # What a phone sends is taken from that phone alone.
+            # Requests of a phone need a token that is bound to this phone.
             name = f"{BOUND}{NAMES['uuid']}" if route.role == "phone" else ""
             for role in get_args(Role):
                 body = None if route.method == "GET" else b"{}"
@@ -86,7 +86,7 @@ class SafetyTests(TeamCase):
         self.assertEqual(wrong, [])
 
     def test_let_a_ticket_look_only(self) -> None:
-        """The ticket of an operator opens what a viewer may look at, and gives no order and tells no secret."""
+        """An operator's ticket gives access to a viewer's routes, but not to orders and secrets."""
         wrong = []
         for route in TABLE:
             if route.role not in ("viewer", "operator"):
@@ -98,13 +98,13 @@ class SafetyTests(TeamCase):
         self.assertEqual(wrong, [])
 
     def lax(self, name: str, headers: Message) -> list[object]:
-        """What is wrong with the headers of an answer."""
+        """Return the faults in the headers of an answer."""
         lacks = [key for key, value in HEADERS.items() if headers.get(key) != value]
         lacks += [key for key in ("Server", "Set-Cookie", "X-Powered-By") if headers.get(key)]
         return [(name, lacks)] if lacks else []
 
     def test_send_every_header_with_errors(self) -> None:
-        """Each kind of error is answered with all headers that keep a browser strict, and names no server."""
+        """Each kind of error response has all security headers and does not name the server."""
         wrong = []
         for method, path in (("GET", "/nothing"), ("PUT", "/"), ("PUT", "/events"), ("GET", "/static/../app.py")):
             wrong += self.lax(f"{method} {path}", self.asked(method, path)[1])
@@ -118,7 +118,7 @@ class SafetyTests(TeamCase):
         self.assertEqual(wrong, [])
 
     def raw(self, data: bytes) -> Answer:
-        """What bytes are answered with that no client would send."""
+        """Return the answer to bytes that no regular client would send."""
         with socket.create_connection(("127.0.0.1", self.team.port), 5.0) as client:
             client.sendall(data)
             answer = http.client.HTTPResponse(client)
@@ -126,7 +126,7 @@ class SafetyTests(TeamCase):
             return answer.status, answer.headers, answer.read()
 
     def test_refuse_at_once_and_in_words(self) -> None:
-        """Whatever is unlawful is refused within 50 ms, in JSON that names field and remedy, without a trace."""
+        """An invalid request is refused within 50 ms, with a JSON error that names field and remedy."""
         signed = self.bearer("operator")
         dog = f"/api/v1/devices/{'01' * 16}"
 
@@ -171,13 +171,13 @@ class SafetyTests(TeamCase):
             self.assertEqual(set(json.loads(body)["error"]), {"field", "problem", "remedy"}, name)
             self.assertNotIn(b"Traceback", body, name)
             took = self.best(ask)
-            # Where other programs keep the machine busy, a lawful question takes long, too.
+            # On a machine loaded by other programs a valid request is slow, too.
             if took > REFUSED_S and took > 3 * self.best(lambda: self.asked("GET", "/api/v1/tasks", None, **signed)):
                 slow.append((name, took))
         self.assertEqual(slow, [])
 
     def best(self, ask: Callable[[], object]) -> float:
-        """Seconds that it takes, the best of five."""
+        """Return the shortest of five durations in seconds."""
         took = []
         for _ in range(5):
             began = time.perf_counter()

@@ -1,4 +1,4 @@
-"""Two hundred pieces of script as names, tasks and messages: the page shows each as text, and none runs."""
+"""Tests with two hundred scripts as names, tasks and messages: the page shows each as text, and none runs."""
 
 from __future__ import annotations
 
@@ -67,13 +67,13 @@ class ScriptTests(PageCase):
         dialog.dismiss()
 
     def show(self, words: list[str]) -> None:
-        """Have the team made of ``words``."""
+        """Make the team's texts consist of ``words``."""
         path = Path(self.mktemp()).absolute()
         path.write_text(json.dumps(words), encoding="utf-8")
         self.team.order(f"strange {path}")
 
     def test_show_scripts_as_text(self) -> None:
-        """Of 200 scripts as names, titles, notes, messages and capabilities none runs; the CSP has none to report."""
+        """None of 200 scripts in names, titles, notes, messages and capabilities runs or violates the CSP."""
         self.assertEqual(len(set(PAYLOADS)), 200)
         self.show(PAYLOADS)
         self.page.goto(f"{self.team.url}#code={self.team.code}")
@@ -87,7 +87,7 @@ class ScriptTests(PageCase):
             self.assertIn("<", self.page.locator("dialog[open]").inner_text())
             self.page.keyboard.press("Escape")
             self.page.locator("dialog[open]").wait_for(state="hidden")
-        # The page lists the newest tasks only, so each batch has its turn.
+        # The page lists only the newest tasks, so the scripts are shown in batches.
         for number in range(len(PAYLOADS) // BATCH):
             self.show(PAYLOADS[number * BATCH : (number + 1) * BATCH])
             self.page.locator(f"#tasks li[data-key=s{2 + number}-{BATCH}]").wait_for()
@@ -101,7 +101,7 @@ class ScriptTests(PageCase):
         )
 
     def test_notice_what_would_run(self) -> None:
-        """The test would see it: markup that is put into the page as such is reported by the CSP."""
+        """The test can detect a script: inserted markup is reported by the CSP."""
         self.page.goto(f"{self.team.url}#code={self.team.code}")
         self.page.locator(".device").first.wait_for()
         self.page.evaluate("document.body.insertAdjacentHTML('beforeend', '<img src=x onerror=ran()>')")

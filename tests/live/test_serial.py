@@ -1,4 +1,4 @@
-"""The serial robots' drivers over real pseudo-terminals, with their emulators at the other end."""
+"""Tests of the serial robots' drivers over real pseudo-terminals, with their emulators at the other end."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ except ImportError as missing:
 
 
 class Create2PtyTests(TestCase):
-    """A Create 2 at the end of a pseudo-terminal."""
+    """A Create 2 at a pseudo-terminal."""
 
     timeout = 30
 
@@ -51,7 +51,7 @@ class Create2PtyTests(TestCase):
         return driver
 
     async def test_outlives_a_pulled_cable(self) -> None:
-        """The cable is pulled and plugged in again: stale, no such device, then ready with the motors on."""
+        """While the cable is unplugged the driver is stale and names the missing device; then it is ready again."""
         driver = self.driver()
         await driver.connect()
         await driver.enable()
@@ -71,7 +71,7 @@ class Create2PtyTests(TestCase):
         self.assertEqual((driver.state, self.robot.mode), ("ready", 2))
 
     async def test_names_a_busy_port(self) -> None:
-        """A second driver of the same port is told that it is busy, and gets it when the first has gone."""
+        """A second driver of a port reports it as busy, and connects after the first has disconnected."""
         first, second = self.driver(), self.driver()
         await first.connect()
         connected = second.connect()
@@ -81,17 +81,17 @@ class Create2PtyTests(TestCase):
         self.assertEqual(second.problem, "")
 
     async def test_names_what_is_no_port(self) -> None:
-        """A file that is no serial device, and one that may not be opened, are named."""
+        """A file that is no serial device, and one without permission, are reported."""
         plain = self.mktemp()
         with open(plain, "wb"):
             pass
         await self.named(plain, "no serial device")
-        if os.geteuid() != 0:  # who may open everything
+        if os.geteuid() != 0:  # root may open every file
             os.chmod(os.path.realpath(self.path), 0)
             await self.named(self.path, "no permission")
 
     async def named(self, path: str, words: str) -> None:
-        """Have a driver say these words of that path."""
+        """Wait until a driver of this path reports these words."""
         driver = Create2Driver(checked({"port": path}), "vacuum", SerialConnector(), CLOCK)
         driver.connect().addErrback(lambda _: None)
         self.drivers.append(driver)

@@ -1,4 +1,4 @@
-"""Signing in to the page in a real browser: by a link, by hand, as a viewer, and out again."""
+"""Tests of signing in to the page in a real browser: by link, by hand, as a viewer, and signing out."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from tests.live.page import DESK, PHONE, PageCase
 
 class SigningInTests(PageCase):
     def at_door(self, screen: dict[str, Any], fragment: str = "", scheme: Any = "light") -> Any:
-        """A page of somebody who comes by that link."""
+        """Return a new page that is opened with this link."""
         page = self.tab(screen, scheme)
         page.goto(self.team.url + fragment)
         return page
 
     def test_sign_in_by_hand(self) -> None:
-        """Without a session the page shows nothing of the team and asks; wrong is told, Escape leads nowhere."""
+        """Without a session the page shows only the sign-in form; a wrong code is refused, Escape changes nothing."""
         for screen, scheme in ((PHONE, "light"), (DESK, "dark")):
             page = self.at_door(screen, scheme=scheme)
             page.locator("#signin-code").wait_for()
@@ -35,7 +35,7 @@ class SigningInTests(PageCase):
             self.assertEqual(self.faults, [])
 
     def test_stay_signed_in(self) -> None:
-        """A link with the code signs in at once and leaves no trace of it; so it stays, until one signs out."""
+        """A link with the code signs in and removes the code from the URL; the session lasts until the sign-out."""
         page = self.opened(DESK)
         self.assertNotIn("code", page.url)
         page.reload()
@@ -47,7 +47,7 @@ class SigningInTests(PageCase):
         self.assertEqual(page.locator(".device").count(), 0)
 
     def test_look_as_a_viewer(self) -> None:
-        """An operator's invitation makes a viewer, who sees all and is offered nothing that it may not do."""
+        """An operator's invitation creates a viewer that sees all views and gets no controls."""
         page = self.opened(DESK)
         viewer = self.at_door(PHONE, f"#code={self.invitation(page)}")
         self.live(viewer)
@@ -65,7 +65,7 @@ class SigningInTests(PageCase):
         self.assertEqual(told, 403)
 
     def test_read_the_audit(self) -> None:
-        """An operator opens who changed what by keyboard, reads what it just did, and a viewer is not offered it."""
+        """An operator opens the audit log by keyboard and sees the last action; a viewer is not offered the log."""
         for screen, scheme in ((PHONE, "dark"), (DESK, "light")):
             page = self.opened(screen, scheme)
             page.get_by_role("button", name="Run Demo").click()
@@ -91,7 +91,7 @@ class SigningInTests(PageCase):
         return link.partition("#code=")[2]
 
     def test_ask_again_when_the_session_ends(self) -> None:
-        """When the node no longer knows the session, the page asks, and goes on where it was."""
+        """If the node no longer knows the session, the page asks for the code and returns to its view."""
         page = self.opened(DESK)
         page.evaluate(
             "fetch('/api/v1/session', {method: 'DELETE', headers: {'X-Swarm': '1', Authorization: 'Bearer ' + "
@@ -105,8 +105,8 @@ class SigningInTests(PageCase):
         self.live(page)
 
     def test_stay_for_days(self) -> None:
-        """A page that is left open has its session renewed before it runs out, again and again, and stays live."""
-        # The page is told an hour before.
+        """An open page renews its session repeatedly before its end, and stays live."""
+        # The page renews the session one hour before its end.
         self.team.order("session 3603")
         page = self.opened(DESK)
         first = page.evaluate("JSON.parse(localStorage['swarm.sessions'])[location.origin].token")
@@ -119,7 +119,7 @@ class SigningInTests(PageCase):
         self.assertNotEqual(page.locator("#link").get_attribute("data-link"), "lost")
         self.team.order("status dog3 IDLE")
         page.locator(".device[data-state=IDLE]", has_text="dog3").wait_for()
-        # Signing out ends what was there before as well.
+        # Signing out also ends earlier sessions of the page.
         page.get_by_role("button", name="Sign out").click()
         page.locator("#signin-code").wait_for()
         for token in (first, held):

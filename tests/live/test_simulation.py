@@ -1,4 +1,4 @@
-"""Tests of the ``sim`` command as processes: the same hash wherever it runs, and an end in good order."""
+"""Tests of the ``sim`` command as processes: equal hashes, and an orderly end."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ lasts = 4.0
 
 
 class SimulationTests(SynchronousTestCase):
-    """``sim run`` from outside."""
+    """Behaviour of ``sim run``."""
 
     def setUp(self) -> None:
         """Write a scenario."""
@@ -56,7 +56,7 @@ class SimulationTests(SynchronousTestCase):
         self.scenario.write_text(SCENARIO)
 
     def begun(self, hash_seed: int, *words: str) -> subprocess.Popen[str]:
-        """The command, begun with another order of sets."""
+        """Start the command with this hash seed of Python."""
         return subprocess.Popen(
             [sys.executable, "-m", "swarmnode.simulation", "run", "--scenario", str(self.scenario), *words],
             cwd=ROOT,
@@ -67,7 +67,7 @@ class SimulationTests(SynchronousTestCase):
         )
 
     def test_hash_is_the_same_in_every_process(self) -> None:
-        """One seed gives the same hash twice, whatever PYTHONHASHSEED is; another seed gives another one."""
+        """One seed gives the same hash for each PYTHONHASHSEED; another seed gives another hash."""
         runs = [self.begun(1, "--seed", "4"), self.begun(2, "--seed", "4"), self.begun(2, "--seed", "5")]
         hashes = []
         for process in runs:
@@ -78,10 +78,10 @@ class SimulationTests(SynchronousTestCase):
         self.assertNotEqual(hashes[0], hashes[2])
 
     def test_interrupt_leaves_a_report(self) -> None:
-        """After SIGINT the command ends soon, with a JSON report that says that it is partial."""
+        """After SIGINT the command ends with a JSON report that is marked as partial."""
         report = self.folder / "r.json"
         process = self.begun(1, "--nodes", "2000", "--json", str(report))
-        while not report.exists():  # it is opened when the run begins
+        while not report.exists():  # it is opened at the start of the run
             self.assertIsNone(process.poll())
             os.sched_yield()
         process.send_signal(signal.SIGINT)
@@ -91,7 +91,7 @@ class SimulationTests(SynchronousTestCase):
         self.assertTrue(json.loads(report.read_text())["partial"])
 
     def test_bad_input_is_one_line(self) -> None:
-        """A scenario that cannot be is refused with its line and exit code 2."""
+        """An invalid scenario is refused with its line number and exit code 2."""
         self.scenario.write_text("about = 'x'\nnodes = -3\n")
         process = self.begun(1)
         out, err = process.communicate(timeout=100)

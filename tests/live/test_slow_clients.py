@@ -1,4 +1,4 @@
-"""A real page among clients that send a byte a second, send nothing or read nothing: they are let go, others served."""
+"""Tests of a real page among clients that send slowly or not at all: they are disconnected, and others are served."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ BEGUN = b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX-Slow: "
 
 
 class Crowd:
-    """Clients of the page; ``open`` are those that it has not let go."""
+    """Clients of the page; ``open`` are the connected ones."""
 
     def __init__(self, port: int) -> None:
         self._port = port
@@ -26,7 +26,7 @@ class Crowd:
         self.heard: list[bytes] = []
 
     def join(self, count: int, begun: bytes, hosts: int = 1, first: int = 1) -> None:
-        """Connect so many, from so many addresses, each of which sends the beginning of a request."""
+        """Connect ``count`` clients from ``hosts`` addresses, each of which sends the start of a request."""
         for number in range(count):
             client = socket.create_connection(
                 ("127.0.0.1", self._port), 5.0, (f"127.0.{first}.{1 + number % hosts}", 0)
@@ -38,7 +38,7 @@ class Crowd:
             self._selector.register(client, selectors.EVENT_READ)
 
     def live(self, seconds: float, drip: bytes = b"") -> None:
-        """Hear what comes for so long; then each that is left sends ``drip``."""
+        """Read all data for ``seconds``, then send ``drip`` from each open client."""
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0.0:
             for key, _ in self._selector.select(left):
@@ -61,7 +61,7 @@ class Crowd:
                 continue
 
     def leave(self) -> None:
-        """Close all."""
+        """Close all clients."""
         for client in self.open:
             client.close()
         self._selector.close()
@@ -77,7 +77,7 @@ class SlowClientTests(TeamCase):
         self.addCleanup(lambda: self.crowd.leave())
 
     def ask_state(self) -> None:
-        """Ask for the state; another client is answered within 10 s."""
+        """Request the state, which must be answered within 10 s."""
         page = http.client.HTTPConnection("127.0.0.1", self.team.port, timeout=10)
         page.request("GET", "/api/v1/state", headers={"Authorization": f"Bearer {self.team.token}"})
         answer = page.getresponse()
@@ -86,7 +86,7 @@ class SlowClientTests(TeamCase):
         self.assertEqual(answer.status, 200)
 
     def test_let_go_who_dribbles(self) -> None:
-        """Three hundred that send a byte a second, from many addresses, are all closed in time; others are served."""
+        """Three hundred clients that send a byte per second are closed in time, while another client is served."""
         began = time.monotonic()
         self.crowd.join(300, BEGUN, hosts=30)
         while self.crowd.open and time.monotonic() - began < CLOSED_S:

@@ -1,4 +1,4 @@
-"""Tests of the data store with real processes: what was acknowledged survives ``kill -9``, and a disk that fails."""
+"""Tests of the data store with real processes: ``kill -9`` and a full disk lose no acknowledged record."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ print(number)
 
 class KillTest(SynchronousTestCase):
     def test_a_handful_of_kills(self) -> None:
-        """A writer that is killed at any moment loses no row that it acknowledged, and damages nothing."""
+        """A writer that is killed at any moment loses no acknowledged row, and corrupts nothing."""
         seen = killed(str(Path(self.mktemp()).resolve()), 6, seed=1)
         self.assertEqual((seen.lost, seen.damaged, seen.kills), ([], [], 6))
         self.assertGreater(seen.acknowledged, 0)
@@ -54,7 +54,7 @@ class KillTest(SynchronousTestCase):
 
 class FailingDiskTest(SynchronousTestCase):
     def test_lives_on(self) -> None:
-        """Where the system refuses to write, reads go on, writes are refused by name, and all is well afterwards."""
+        """If the system refuses writes, reads work, writes fail with the reason, and afterwards all works again."""
         path = str(Path(self.mktemp()).resolve())
         child = subprocess.run(
             [sys.executable, "-c", FAILING_DISK, path], cwd=ROOT, capture_output=True, text=True, timeout=60

@@ -1,4 +1,4 @@
-"""Tests of what a team leaves behind whose tasks name a strategy of somebody else: no process."""
+"""Tests that a team with strategies from other distributions leaves no process."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class StrategiesTests(SynchronousTestCase):
         self.patch(Worker, "_start", started)
 
     def installed(self) -> None:
-        """Have the entry point "spare" on this process's path for imports, as pip would."""
+        """Put the entry point "spare" on this process's path, as pip does."""
         folder = Path(self.mktemp()).resolve()
         (folder / "spare-1.dist-info").mkdir(parents=True)
         (folder / "spare_of_tests.py").write_text(MODULE)
@@ -46,7 +46,7 @@ class StrategiesTests(SynchronousTestCase):
         self.patch(sys, "path", [str(folder), ROOT, *sys.path])
 
     def submit(self, team: VirtualTeam, task_id: str) -> None:
-        """Have the dogs do a task that "spare" decides."""
+        """Submit a task with the strategy "spare", and check its completion."""
         task = Task(task_id, "turn-around", "Odd", strategy="spare", created=team.clock.seconds())
         submitted = Deferred.fromCoroutine(team.services["vaio"].assembly.node.submit(task))
         team.clock.advance(10.0)
@@ -56,13 +56,13 @@ class StrategiesTests(SynchronousTestCase):
 
     @property
     def alive(self) -> int:
-        """How many of the processes run."""
+        """The number of running processes."""
         return sum(process.poll() is None for process in self.processes)
 
     def test_node_has_one_process_and_ends_it(self) -> None:
-        """Each node has one process for all tasks of a strategy; it ends with its node, also when the power fails."""
+        """Each node has one process for all tasks of a strategy, which ends with the node, also after a crash."""
         team = VirtualTeam(11, dogs=("dog1", "dog2"))
-        self.addCleanup(self.flushLoggedErrors)  # a strategy that is still being loaded is logged
+        self.addCleanup(self.flushLoggedErrors)  # a strategy that is still loading is logged
         self.addCleanup(team.stop)
         self.submit(team, "t1")
         self.submit(team, "t2")
@@ -76,7 +76,7 @@ class StrategiesTests(SynchronousTestCase):
         self.assertEqual(self.alive, 0)
 
     def test_nothing_begins_after_the_end(self) -> None:
-        """Who asks for a strategy of somebody else when the node has left is refused, or hears the fallback."""
+        """After the end of a node, a strategy from another distribution is refused or replaced by the fallback."""
         early, late = Strategies(), Strategies()
         guard = early.named("spare", {})
         self.assertIs(early.named("spare", {}), guard)

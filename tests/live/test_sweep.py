@@ -1,4 +1,4 @@
-"""Long runs as processes: interrupted ones go on where they stopped, and several machines give the same as one."""
+"""Tests of long runs as processes: continuation after an interrupt, and equal results on several machines."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ ROOT = Path(__file__).resolve().parents[2]
 
 class InterruptTests(TestCase):
     def command(self, count: int, book: str) -> subprocess.Popen[str]:
-        """Many short schedules, one after the other, logged."""
+        """Start many short schedules in one process, with a logbook."""
         words = ["--schedules", str(count), "--only", "leases", "--jobs", "1", "--log", book, "--resume"]
         command = [sys.executable, "-m", "tests.invariants", *words]
         return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
     def test_interrupted(self) -> None:
-        """Ctrl-C leaves a logbook of what was run so far, and the next call runs the rest and nothing twice."""
+        """After Ctrl-C the logbook contains the completed schedules, and the next call runs only the others."""
         book = os.path.abspath(self.mktemp())
         with self.command(100_000, book) as child:
             assert child.stdout is not None

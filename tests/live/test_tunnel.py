@@ -1,4 +1,4 @@
-"""Real tunnels over the loopback interface: TLS, crowds, slow readers and dead ends; and two real nodes without UDP."""
+"""Tests of real tunnels over the loopback interface: TLS, crowds, slow readers, dead links, and nodes without UDP."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ REQUEST = (
 
 
 class Forwarder(portforward.ProxyServer):
-    """A TCP proxy that can stop to hand on, without a word to either end."""
+    """A TCP proxy that can stop to forward data while both connections stay open."""
 
     is_stuck = False
 
     def dataReceived(self, data: bytes) -> None:
-        """Hand on to the server."""
+        """Forward data to the server."""
         if not Forwarder.is_stuck:
             super().dataReceived(data)
 
@@ -56,7 +56,7 @@ class TunnelTests(TestCase):
         Forwarder.is_stuck = False
 
     def made(self, *urls: Url) -> tuple[TunnelNetwork, TcpCarrier]:
-        """An end, served at a free port where it has no URL."""
+        """Return a tunnel; without URLs it listens on a free port."""
         carrier = TcpCarrier(reactor, HOST, 0)
         tunnel = TunnelNetwork(carrier, REACTOR, random.SystemRandom(), urls, not urls)
 
@@ -68,13 +68,13 @@ class TunnelTests(TestCase):
         return tunnel, carrier
 
     def served(self) -> tuple[Endpoint, TunnelNetwork, Url]:
-        """An endpoint behind a tunnel, and where it begins."""
+        """Return an endpoint behind a tunnel, the tunnel, and its URL."""
         tunnel, carrier = self.made()
         end = self.endpoint(1, tunnel)
         return end, tunnel, Url("wss", HOST, carrier.number)
 
     def endpoint(self, seed: int, tunnel: TunnelNetwork) -> Endpoint:
-        """A started endpoint of the team."""
+        """Return a started endpoint of the team."""
         end = Endpoint(Identity(bytes([seed]) * 32), b"k" * 32, tunnel, REACTOR, random.SystemRandom())
         end.expose("echo", lambda peer, value: value)
         end.start()
@@ -82,14 +82,14 @@ class TunnelTests(TestCase):
         return end
 
     async def until(self, is_so: Callable[[], bool], seconds: float = 15.0) -> float:
-        """Wait until something is so; returns the seconds that it took."""
+        """Wait until ``is_so`` is true; return the elapsed seconds."""
         began = time.monotonic()
         while not is_so() and time.monotonic() - began <= seconds:
             await task.deferLater(REACTOR, 0.05)
         return time.monotonic() - began
 
     def dialled(self, url: Url) -> ssl.SSLSocket:
-        """A blocking client that has spoken TLS and the greeting, and reads nothing after it."""
+        """Return a TLS client without a handshake."""
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
         context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
         plain = socket.create_connection((url.host, url.port), 5.0)
@@ -100,14 +100,14 @@ class TunnelTests(TestCase):
         return client
 
     async def member(self, url: Url) -> tuple[Endpoint, Contact, TunnelNetwork]:
-        """An endpoint that has met the one where ``url`` leads, that one's contact, and its own tunnel."""
+        """Return an endpoint that has connected to ``url``, the other endpoint's contact, and its tunnel."""
         tunnel, _ = self.made(url)
         client = self.endpoint(2, tunnel)
         contact = await client.greet(url.address, 4.0)
         return client, contact, tunnel
 
     async def greet(self, url: Url) -> ssl.SSLSocket:
-        """One that has greeted by hand."""
+        """Return a client that has completed the TLS and WebSocket handshakes."""
         client = self.dialled(url)
         for step in (client.do_handshake, lambda: client.send(REQUEST), lambda: client.recv(4096)):
             while True:
@@ -119,7 +119,7 @@ class TunnelTests(TestCase):
         return client
 
     async def test_endpoints_talk(self) -> None:
-        """Two endpoints greet, ask and answer through TLS, 1 MiB included; the first answer comes within a second."""
+        """Two endpoints exchange requests and answers over TLS, up to 1 MiB; the first answer takes under a second."""
         _, _, url = self.served()
         began = time.monotonic()
         client, contact, tunnel = await self.member(url)
@@ -132,7 +132,7 @@ class TunnelTests(TestCase):
         self.assertEqual(tunnel.counters["opened"], 1, "where nothing is lost one connection is enough")
 
     async def test_bear_a_crowd(self) -> None:
-        """Of five hundred dribblers few are borne, all are let go in time, and a member is served in between."""
+        """Of five hundred slow clients few are accepted, all are closed in time, and a member is served meanwhile."""
         _, tunnel, url = self.served()
         client, contact, _ = await self.member(url)
         crowd: set[socket.socket] = set()
@@ -179,7 +179,7 @@ class TunnelTests(TestCase):
         self.assertLessEqual(most, MAX_BEGUN + 2)
 
     async def test_bear_one_address(self) -> None:
-        """Of one address no more are borne than a large team needs, and the rest is hung up on at once."""
+        """The number of clients per address is limited, and further ones are closed at once."""
         _, tunnel, url = self.served()
         crowd = [socket.create_connection((url.host, url.port), 5.0) for _ in range(100)]
         for each in crowd:
@@ -188,7 +188,7 @@ class TunnelTests(TestCase):
         self.assertEqual(tunnel.counters["crowded"], 100 - MAX_OF_HOST)
 
     async def test_garbage(self) -> None:
-        """Garbage instead of TLS, of the greeting, and of frames ends its own link alone; nothing is raised."""
+        """Invalid TLS, handshake or frame data ends only its link, and raises nothing."""
         _, tunnel, url = self.served()
         client, contact, _ = await self.member(url)
         dice = random.Random(3)
@@ -205,7 +205,7 @@ class TunnelTests(TestCase):
         self.assertEqual(answer, 1)
 
     async def test_slow_reader(self) -> None:
-        """For who reads nothing little is kept, the rest is dropped, and others are served as fast as before."""
+        """For a client that does not read, little is buffered, the rest is dropped, and others are served fast."""
         _, tunnel, url = self.served()
         client, contact, _ = await self.member(url)
         others = set(tunnel.peers)
@@ -227,7 +227,7 @@ class TunnelTests(TestCase):
         self.assertLess(slowest, 0.3)
 
     async def test_strain(self) -> None:
-        """Linux tells how a stream does: nothing held or repeated where all is confirmed, much where nobody reads."""
+        """On Linux the link metrics show no backlog if all data is confirmed, and one if the client does not read."""
         if sys.platform != "linux":
             self.skipTest("only Linux tells")
         server, tunnel, url = self.served()
@@ -254,7 +254,7 @@ class TunnelTests(TestCase):
         server.stop()
 
     async def test_dead_end(self) -> None:
-        """A connection that stays up and carries nothing is given up, and another one dialled, within 12 s."""
+        """A link that is open but transmits nothing is closed within 12 s and opened again."""
         server, tunnel, url = self.served()
 
         factory = portforward.ProxyFactory(HOST, url.port)
@@ -280,7 +280,7 @@ class TunnelTests(TestCase):
         await task.deferLater(REACTOR, 0.2)
 
     def test_port_in_use(self) -> None:
-        """A port that another program holds is refused in one line that names the setting and says what to do."""
+        """A used port is refused with one line that names the setting and the remedy."""
         with socket.socket() as taken:
             taken.bind((HOST, 0))
             taken.listen()
@@ -292,7 +292,7 @@ class TunnelTests(TestCase):
 
 class NodeTests(NodeCase):
     def joins(self, name: str, text: str) -> Any:
-        """A real node with these settings."""
+        """Start a real node with these settings."""
         path = self.file(f'[node]\nname = "{name}"\nteam_key = "of these tests"\n{text}', name)
         child = self.popen("--config", path)
         self.addCleanup(child.communicate)
@@ -300,7 +300,7 @@ class NodeTests(NodeCase):
         return child
 
     def test_enter_without_udp(self) -> None:
-        """A real node whose known node is silent by UDP enters by TLS within 2.5 s of trying."""
+        """A real node whose known node does not answer over UDP joins over TLS."""
         (number,) = port.free("tcp", HOST, 1)
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as silent:
             silent.bind((HOST, 0))

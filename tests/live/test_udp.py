@@ -1,4 +1,4 @@
-"""Tests of the real UDP network, over the loopback interface."""
+"""Tests of the real UDP network over the loopback interface."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class UdpTests(TestCase):
     """Behaviour of ``UdpNetwork``."""
 
     def network(self, host: str = "127.0.0.1") -> UdpNetwork:
-        """A network on a free port, closed after the test."""
+        """Return a network on a free port, which is closed after the test."""
         network = UdpNetwork(reactor, host, 0)
 
         def close() -> Deferred[Any]:
@@ -33,7 +33,7 @@ class UdpTests(TestCase):
 
     @inlineCallbacks
     def test_endpoints_talk(self) -> Generator[Deferred[Any], Any, None]:
-        """Two endpoints greet, ask and answer over real sockets, 1 MiB included."""
+        """Two endpoints exchange requests and answers over real sockets, up to 1 MiB."""
         ends = []
         for seed in (1, 2):
             end = Endpoint(Identity(bytes([seed]) * 32), b"k" * 32, self.network(), reactor, random.SystemRandom())
@@ -51,7 +51,7 @@ class UdpTests(TestCase):
         self.assertTrue(answer == large, "1 MiB comes back as it went")
 
     def test_port_in_use(self) -> None:
-        """A port that is held is refused in one line that says which and what to do."""
+        """A used port is refused with one line that names it and a remedy."""
         first = self.network()
         first.listen(lambda datagram, source: None)
         self.assertNotEqual(first.address.port, 0)
@@ -61,7 +61,7 @@ class UdpTests(TestCase):
         self.assertNotIn("\n", str(error))
 
     def test_what_cannot_be_sent_is_counted(self) -> None:
-        """Odd addresses, too large datagrams and a closed port raise nothing."""
+        """Invalid addresses, too large datagrams and a closed port raise nothing, and are counted."""
         network = self.network()
         network.send(b"x", Address("127.0.0.1", 9))
         network.listen(lambda datagram, source: None)
@@ -74,7 +74,7 @@ class UdpTests(TestCase):
 
     @inlineCallbacks
     def test_every_interface(self) -> Generator[Deferred[Any], Any, None]:
-        """A network at "*" hears one port of both families, and answers in the family in which it was asked."""
+        """A network at "*" listens on one port for both families, and answers in the family of the request."""
         wide = self.network("*")
         wide.listen(lambda datagram, source: wide.send(datagram + b" too", source))
         self.assertNotIn(wide.address.host, ("*", "0.0.0.0", "::"))
@@ -88,7 +88,7 @@ class UdpTests(TestCase):
 
     @inlineCallbacks
     def test_further_ports(self) -> Generator[Deferred[Any], Any, None]:
-        """What is led to a further port leaves by it; who writes there first is answered from there, others are not."""
+        """A peer can be assigned to an additional port; an unknown sender is answered from the port that it used."""
         one, other = self.network(), self.network()
         heard: list[Address] = []
         arrived: Deferred[None] = Deferred()

@@ -1,4 +1,4 @@
-"""The ways of the team in a real browser: how each device is reached, who is in the team, and who was turned away."""
+"""Tests of the network view in a real browser: the paths to each device, the members, and the rejections."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from tests.live.page import DESK, PHONE, PageCase
 
 class WaysTests(PageCase):
     def looked(self, screen: dict[str, Any]) -> Any:
-        """The network's view, when both panels have come."""
+        """Return the page with the network view when both panels are shown."""
         page = self.opened(screen)
         self.view(page, "network")
         page.locator("#ways li").nth(2).wait_for()
@@ -18,7 +18,7 @@ class WaysTests(PageCase):
         return page
 
     def test_tell_the_ways(self) -> None:
-        """Each way has its number, a word, how and since when; of the others the worst is first; axe finds nothing."""
+        """Each path shows its score, rating, kind and duration; among other nodes' links the worst is first."""
         page = self.looked(PHONE)
         rows = [item.inner_text().split("\n") for item in page.locator("#ways li").all()]
         self.assertEqual(
@@ -41,7 +41,7 @@ class WaysTests(PageCase):
         self.sound_by_day_and_night(page)
 
     def test_tell_who_was_turned_away(self) -> None:
-        """What several tell of one refusal is one line, with who, by whom, why and the remedy."""
+        """Several nodes' reports of one rejection are one line with peer, reporters, reason and remedy."""
         page = self.looked(DESK)
         told = [item.inner_text().split("\n") for item in page.locator("#refusals li").all()]
         self.assertEqual(
@@ -61,10 +61,10 @@ class WaysTests(PageCase):
         )
 
     def test_tell_the_team(self) -> None:
-        """A closed team has its name, fingerprint and members; whose certificate ends soon is first, and stands out.
+        """A closed team shows its name, fingerprint and members; certificates that expire soon are first and marked.
 
-        An operator reads by which command a member is put out; a viewer sees the members without, and no button.
-        However much a member may do, its name stands in one line.
+        An operator sees the command that revokes a member; a viewer sees the members without commands and buttons. A
+        member with many roles still has its name on one line.
         """
         page = self.looked(DESK)
         self.assertEqual(page.locator("#team-kind").inner_text(), "Closed team yard")
@@ -88,7 +88,7 @@ class WaysTests(PageCase):
         self.assertEqual(page.locator("#members li").count(), 3)
 
     def test_ask_while_somebody_looks(self) -> None:
-        """What is measured for the page is asked for while it is in sight, and no longer."""
+        """The page requests measurements only while its network view is shown."""
         page = self.opened(PHONE, has_clock=True)
 
         def asks() -> bool:

@@ -1,4 +1,4 @@
-"""A real node with a page: it says how to sign in, takes who does, and writes down what was changed."""
+"""Tests of a real node with a page: its code for signing in, and its audit log."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class WebCodeTests(NodeCase):
         skip = f"SIGNING IN AT A REAL NODE IS NOT TESTED: missing {', '.join(MISSING)}"
 
     def test_sign_in_with_what_the_node_says(self) -> None:
-        """``swarm web`` tells page and code, the code signs in, and the order given then stands in the audit's file."""
+        """``swarm web`` prints URL and code, the code signs in, and the following order is in the audit file."""
         web = 'roles = ["web"]\nstore = "vaio.sqlite"\n[web]\nport = 0\n'
         self.node("--config", self.file(f'[node]\nname = "vaio"\nteam_key = "t"\nport = 0\n{web}'))
         page = json.loads(until(lambda: self.swarm("web", "--json").stdout))

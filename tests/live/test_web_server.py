@@ -1,4 +1,4 @@
-"""The web node on a real port: Flask and the native streams beside each other."""
+"""Tests of the web node on a real port, with Flask and the native streams."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ reactor: Any = _reactor
 
 
 class Stream(Protocol):
-    """Collects what a stream says, and waits for words in it."""
+    """Collects a stream's data, and waits for words in it."""
 
     def __init__(self) -> None:
         self.data = b""
@@ -47,7 +47,7 @@ class Stream(Protocol):
 
 
 def read(connection: socket.socket) -> bytes:
-    """What has come and waits to be read."""
+    """Return the data that waits to be read."""
     taken = b""
     with contextlib.suppress(BlockingIOError):
         while data := connection.recv(1 << 16):
@@ -85,7 +85,7 @@ class WebServiceTests(TestCase):
         if threading.current_thread() is not threading.main_thread():
             self.held.set()
             if not self.gate.wait(5):
-                raise SystemExit  # says nothing more, so that whoever waits for the worker is free again
+                raise SystemExit  # end the worker without output
         return state_of(self.devices, [], {}, node="vaio")
 
     def asked(self, path: str, method: bytes = b"GET") -> Deferred[Any]:
@@ -101,7 +101,7 @@ class WebServiceTests(TestCase):
         return stream
 
     async def test_serve_everything(self) -> None:
-        """Page, JSON, a file, a picture and a wish all go over the one port."""
+        """Page, JSON, files, camera frames and orders are served on one port."""
         self.assertIn(b"vaio", await self.body("/"))
         self.assertEqual(json.loads(await self.body("/api/v1/devices"))[0]["name"], "dog1")
         self.assertIn(b"EventSource", await self.body("/static/stream.js"))
@@ -114,7 +114,7 @@ class WebServiceTests(TestCase):
         self.assertEqual(json.loads(await self.body("/api/v1/demo", b"POST")), {"id": "demo-1"})
 
     async def test_stream_while_workers_are_stuck(self) -> None:
-        """With every worker held, states, files and pictures still go out; afterwards the held answers come too."""
+        """While all workers are blocked, states, files and frames are sent; the blocked answers follow later."""
         self.gate.clear()
         held = [self.asked("/api/v1/state") for _ in range(WORKERS + 2)]
         stream = await self.opened("/events")
@@ -127,7 +127,7 @@ class WebServiceTests(TestCase):
             self.assertIn(b"dog2", await readBody(await each))
 
     async def test_feed_many_pages(self) -> None:
-        """Sixty open pages are all fed, and JSON is answered beside them."""
+        """Sixty open pages get their streams, and JSON requests are answered meanwhile."""
         streams = [await self.opened("/events") for _ in range(60)]
         self.devices.append({"uuid": "02", "name": "dog2", "joined": 2})
         for stream in streams:
@@ -135,7 +135,7 @@ class WebServiceTests(TestCase):
         self.assertIn(b"dog2", await self.body("/api/v1/state"))
 
     async def test_keep_little_for_a_slow_page(self) -> None:
-        """A page that stops reading has less than 200 kB of 1.5 MB waiting, and then has the newest state at once."""
+        """For a page that stops reading, under 200 kB of 1.5 MB are buffered; it gets the newest state afterwards."""
         self.devices[0]["description"] = "x" * 250
         self.devices += [{**self.devices[0], "uuid": f"a{n}", "name": f"dog{n}"} for n in range(100)]
         with socket.socket() as slow:
@@ -155,7 +155,7 @@ class WebServiceTests(TestCase):
         self.assertLess(len(taken), 400_000)
 
     async def test_serve_at_further_doors(self) -> None:
-        """A further door serves the same page and is closed with the first."""
+        """An additional port serves the same page, and is closed with the first one."""
         opened: list[Any] = []
 
         def door(site: Any) -> Any:
@@ -172,7 +172,7 @@ class WebServiceTests(TestCase):
         self.assertTrue(opened[0].disconnected)
 
     async def test_stop(self) -> None:
-        """Stopping ends the streams and the held questions, frees the port, and leaves nothing that ticks."""
+        """Stopping ends streams and waiting requests, frees the port, and leaves no timer."""
         stream = await self.opened("/events")
         await stream.said(b"dog1")
         held = self.asked("/shot/01?after=")
@@ -187,7 +187,7 @@ class WebServiceTests(TestCase):
         await maybeDeferred(again.stopService)
 
     async def test_stop_with_an_answer_under_way(self) -> None:
-        """A worker that is about to answer does not hold up the reactor that its answer needs, and ends."""
+        """A worker that is about to answer does not block the reactor during a stop, and ends."""
         self.gate.clear()
         asked = self.asked("/api/v1/state").addErrback(lambda _: None)
         while not self.held.is_set():

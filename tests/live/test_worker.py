@@ -1,4 +1,4 @@
-"""Tests of strategies of somebody else, in real processes."""
+"""Tests of strategies from other distributions in real processes."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class Raising(Nearest):
 
 class WorkerTests(SynchronousTestCase):
     def guard(self, name: str, deadline: float = PATIENCE) -> Guard:
-        """A class of this module in a process of its own, loaded, behind a guard."""
+        """Return a guard around a class of this module in a loaded child process."""
         worker = Worker(name, f"{__name__}:{name}", deadline, path=(ROOT,))
         self.addCleanup(worker.stop)
         guard = Guard(worker, twice=True)
@@ -87,7 +87,7 @@ class WorkerTests(SynchronousTestCase):
         return guard
 
     def loaded(self, guard: Guard) -> Consensus:
-        """What it finds as soon as its process has begun."""
+        """Return the result as soon as the process has loaded the strategy."""
         end = time.monotonic() + PATIENCE
         while "still loading" in (found := guard.find(TEAM)).reason and time.monotonic() < end:
             pass
@@ -95,7 +95,7 @@ class WorkerTests(SynchronousTestCase):
         return found
 
     def test_good_one(self) -> None:
-        """A good strategy answers from its own process as it would here."""
+        """A strategy in another process gives the same results as in this one."""
         guard = self.guard("Good")
         self.assertEqual(guard.find(TEAM), Nearest().find(TEAM))
         self.assertEqual(guard.find(TEAM).strategy, "Good")
@@ -104,7 +104,7 @@ class WorkerTests(SynchronousTestCase):
         self.assertEqual(self.flushLoggedErrors(), [])
 
     def test_group(self) -> None:
-        """A strategy for several tasks answers so from its own process; one for one task is asked for each."""
+        """A strategy for groups gives the same results in its process; one for single tasks is called for each task."""
         items = [Item("s", (1.0, 2.0)), Item("t")]
         bids = [Report(a, c, task=t) for a, c in (("a", 1.0), ("b", 2.0)) for t in "st"]
         self.assertEqual(self.guard("Many").find_group(bids, items), Cbba().find_group(bids, items))
@@ -112,7 +112,7 @@ class WorkerTests(SynchronousTestCase):
         self.assertEqual(self.flushLoggedErrors(), [])
 
     def test_looping(self) -> None:
-        """One that never answers costs its deadline three times; then it is asked no more, and no process is left."""
+        """A strategy that never answers costs its deadline three times; then it is not called, and its process ends."""
         guard = self.guard("Looping", DEADLINE_S)
         worst = 0.0
         end = time.monotonic() + PATIENCE
@@ -126,7 +126,7 @@ class WorkerTests(SynchronousTestCase):
         self.flushLoggedErrors()
 
     def test_others(self) -> None:
-        """What answers far too much, eats memory, ends its process or raises has no opinion, and says why."""
+        """A strategy with a too large answer, too much memory, a dead process or an exception is skipped."""
         for name, why in (
             ("Giant", "bytes, more than"),
             ("Hungry", "MemoryError"),
@@ -139,11 +139,11 @@ class WorkerTests(SynchronousTestCase):
             self.assertIn(why, found.reason)
 
     def test_chatty(self) -> None:
-        """What a strategy prints is not taken for its answer."""
+        """Printed text of a strategy is not read as its answer."""
         self.assertEqual(self.guard("Chatty").find(TEAM), Nearest().find(TEAM))
 
     def test_stopped(self) -> None:
-        """One that was stopped has no opinion and begins no new process; one that was lost does when it is asked."""
+        """A stopped strategy is skipped and starts no process; if its process died, the next call starts a new one."""
         guard = self.guard("Good")
         worker = guard.strategy
         assert isinstance(worker, Worker) and worker._process is not None
@@ -160,7 +160,7 @@ class WorkerTests(SynchronousTestCase):
         self.flushLoggedErrors()
 
     def test_foreign_by_name(self) -> None:
-        """A strategy that is not built in gets a process of its own; what is named by a dotted name is not."""
+        """A strategy named by module and class runs in a separate process."""
         guard = guarded(f"{__name__}:Good", dotted=True)
         self.addCleanup(guard.stop)
         self.assertIsInstance(guard.strategy, Worker)

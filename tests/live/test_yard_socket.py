@@ -1,4 +1,4 @@
-"""The yard as a process of its own, over real loopback sockets."""
+"""Tests of the robot simulator as a process, over real loopback sockets."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ ROOT = Path(sim.__file__).parents[1]
 
 
 def spawned(*arguments: str) -> subprocess.Popen[str]:
-    """A yard process; its first line says where it listens."""
+    """Start a simulator process; its first line contains the address."""
     return subprocess.Popen(
         [sys.executable, "-m", "sim.robots.server", *arguments],
         cwd=ROOT, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
@@ -33,7 +33,7 @@ def spawned(*arguments: str) -> subprocess.Popen[str]:
 
 @asynccontextmanager
 async def running_yard() -> AsyncIterator[tuple[subprocess.Popen[str], int]]:
-    """A yard process on a free port."""
+    """Run a simulator process on a free port."""
     process = spawned("--port", "0")
     assert process.stdout is not None
     line = process.stdout.readline()
@@ -50,7 +50,7 @@ class YardSocketTests(TestCase):
     timeout = 20
 
     async def test_drives_a_dog(self) -> None:
-        """Over TCP a dog connects, sees, walks and stops; the operator watches and moves it; both leave cleanly."""
+        """Over TCP a dog connects, senses, walks and stops; the operator moves the target; both disconnect."""
         clock = IReactorTime(reactor)
         async with running_yard() as (_, port):
             driver = driver_for("sim", {"port": port, "camera_fps": 30}, "dog1", clock)
@@ -75,7 +75,7 @@ class YardSocketTests(TestCase):
             await operator.disconnect()
 
     async def test_opens_a_lost_link_again(self) -> None:
-        """A yard that is killed makes the driver stale at once; a new one at the same port finds it back by itself."""
+        """If the simulator is killed, the driver is stale at once; it reconnects to a new one at the same port."""
         clock = IReactorTime(reactor)
         async with running_yard() as (process, port):
             driver = driver_for("sim", {"port": port, "camera": False}, "dog2", clock)
@@ -98,29 +98,29 @@ class YardSocketTests(TestCase):
 
 
 class YardCommandTests(SynchronousTestCase):
-    """What the command line says about mistakes."""
+    """Errors of the command line."""
 
     def refusal(self, *arguments: str) -> str:
-        """The one line of a yard that does not start."""
+        """Return the error line of a simulator that does not start."""
         process = spawned(*arguments)
         _, line = process.communicate(timeout=20)
         self.assertEqual((process.returncode, line.count("\n")), (2, 1), line)
         return line
 
     def test_names_the_mistake(self) -> None:
-        """An unknown scene and a port that is none end with code 2 and one line that says what to write."""
+        """An unknown scene or invalid port ends with code 2 and one line with the valid values."""
         self.assertIn("known are three-dogs", self.refusal("--scene", "nowhere"))
         self.assertIn("1 to 65535", self.refusal("--port", "70000"))
 
     def test_names_an_address_of_another(self) -> None:
-        """An address that this machine has not, or that is none, ends with code 2 and asks for another address."""
+        """An address of another machine, or an invalid one, ends with code 2 and asks for another address."""
         for host in ("192.0.2.1", "300.1.1.1"):
             said = self.refusal("--host", host, "--port", "0")
             self.assertIn(f"cannot listen on {host}:0: ", said)
             self.assertTrue(said.endswith("; give --host an address of this machine\n"), said)
 
     def test_names_a_port_in_use(self) -> None:
-        """A second yard at the same port ends with code 2 and names the port."""
+        """A second simulator at the same port ends with code 2 and names the port."""
         first = spawned("--port", "0")
         try:
             assert first.stdout is not None

@@ -1,4 +1,4 @@
-"""Until: wait for what another process or thread does."""
+"""Wait for a condition that another process or thread fulfils."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PATIENCE_S = 120.0
 
 
 def until(is_so: Callable[[], T], within: float = PATIENCE_S, told: Callable[[], object] = str) -> T:
-    """Return what ``is_so`` gives as soon as it is true; after so many seconds fail with what is ``told``."""
+    """Return the value of ``is_so`` when it is true; after ``within`` seconds fail with the text of ``told``."""
     end = time.monotonic() + within
     while not (found := is_so()):
         if time.monotonic() > end:
@@ -24,7 +24,7 @@ def until(is_so: Callable[[], T], within: float = PATIENCE_S, told: Callable[[],
 
 
 def takes(port: int) -> bool:
-    """Whether something listens at that TCP port of this machine."""
+    """Return whether a TCP port of this machine accepts connections."""
     try:
         socket.create_connection(("127.0.0.1", port), 1.0).close()
     except OSError:

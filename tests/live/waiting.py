@@ -1,4 +1,4 @@
-"""Waiting for what happens on the running reactor, in tests that are coroutines."""
+"""Wait for conditions on the running reactor, in tests that are coroutines."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ STEP_S = 0.005
 
 
 def wait(seconds: float) -> Deferred[None]:
-    """Fire after so long."""
+    """Return a Deferred that fires after ``seconds``."""
     return deferLater(CLOCK, seconds, lambda: None)
 
 
 async def until(is_so: Callable[[], Any], seconds: float = 20.0) -> None:
-    """Return as soon as ``is_so`` is true; fail after so many seconds."""
+    """Return as soon as ``is_so`` is true; fail after ``seconds``."""
     end = CLOCK.seconds() + seconds
     while not is_so():
         if CLOCK.seconds() > end:
