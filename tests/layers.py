@@ -32,7 +32,7 @@ def _middleware(*names: str) -> tuple[str, ...]:
 
 
 BASE = _entangled("background", "bounded", "contact", "errors", "identity", "listeners", "record", "token_bucket")
-"""Small modules of the library on which all of its packages stand."""
+"""Small modules of the library that all its packages may import."""
 LIBRARY = _middleware("entangled", "errors")
 
 LAYERS: dict[str, Layer] = {
@@ -140,7 +140,7 @@ LAYERS: dict[str, Layer] = {
     ),
     "swarmnode": Layer("settings in, a running node out; the `swarm` command", TOP),
 }
-"""From the bottom up.  A module belongs to the longest name that fits it."""
+"""From the bottom to the top.  A module belongs to the longest matching name."""
 
 
 def layer_of(module: str) -> str:

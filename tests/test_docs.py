@@ -34,7 +34,7 @@ LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 NAMED = re.compile(r"`([\w./-]+\.(?:py|toml|json|md))(?:::(\w+))?`")
 EXAMPLES = sorted((ROOT / "examples").glob("*.toml"))
 MARKED = re.compile(r"(\d[\d.,]*)<!-- ([^>]+) -->")
-"""A number of a document, followed by the expression of the code that it has to equal."""
+"""A number in a document, followed by the expression in the code that must have this value."""
 
 
 def value_of(expression: str) -> float:

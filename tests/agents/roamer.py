@@ -26,7 +26,7 @@ from sim.robots.world import SUBSTEP, World
 STEPS = 6
 TICK = STEPS * SUBSTEP
 LIT = 0.35
-"""Metres within which the light bumpers of a Create 2 see something."""
+"""The range in metres of the light bumpers of a Create 2."""
 TOUCH = 0.012
 LENS: Mapping[str, float | str] = {"width": 208, "height": 160, "fps": 15, "fov_h_deg": 56.9, "fov_v_deg": 45.2}
 Does = Callable[[Action], Action]
@@ -88,7 +88,7 @@ class Roamer:
         self.behaviour.embody(self.means)
         self.now = 0.0
         self.hardest = 0.0
-        """The highest speed in m/s with which it touched anything."""
+        """The highest speed in m/s at a contact with an object."""
         self.done: Action = {}
         self.reversals = 0
         self._kind = kind

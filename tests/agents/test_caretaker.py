@@ -19,7 +19,7 @@ from swarmnode.rehearsal import VirtualTeam
 
 OTHERS = ("witness1", "witness2", "witness3")
 LATEST = SILENT + LOOK_AGAIN_S + VISIT_S + 2.0
-"""Seconds within which a silent member is replaced."""
+"""The time in seconds within which a silent member is replaced."""
 TURNS = 60.0
 
 

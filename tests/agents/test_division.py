@@ -21,7 +21,7 @@ from tests.invariants.tasks import Groups
 
 AGENTS = ("a", "b", "c")
 Costs = dict[str, dict[str, float | None]]
-"""What each task costs each agent."""
+"""The cost of each task for each agent."""
 
 
 def task(name: str, **fields: Any) -> Task:

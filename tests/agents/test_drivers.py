@@ -32,7 +32,7 @@ STEPS = 2
 TICK_S = 0.048
 FPS = {"bittle": 5.0}
 TOUCH = 0.15
-"""The gap that counts as having reached the target."""
+"""The largest distance to the target, in metres, that counts as reached."""
 
 
 class DogBody:

@@ -52,7 +52,7 @@ class RobotCase(SynchronousTestCase):
 
     STEP_S = 0.005
     END_S = 0.1
-    """How long the robot may go on after its drivers have left."""
+    """The time in seconds that the robot may need to stop after its drivers have disconnected."""
     kind = ""
     options: Mapping[str, object] = {}
     robot: Any = None

@@ -18,7 +18,7 @@ from drivers.errors import UsageError
 from drivers.registry import describe
 
 SPECIFIED = bytes((19, 5, 29, 2, 25, 13, 0, 163))
-"""The frame of the vendor's own specification (page of opcode 148)."""
+"""The example frame of the vendor's specification (page of opcode 148)."""
 
 
 def values_of(ids: tuple[int, ...]) -> st.SearchStrategy[dict[str, int]]:

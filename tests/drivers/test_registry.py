@@ -23,7 +23,7 @@ NEEDED: dict[str, dict[str, object]] = {
     "compass": {"host": "board"},
     "create2": {"port": "/dev/ttyUSB0"},
 }
-"""The options that a kind, or its test, cannot do without."""
+"""The required options of each kind."""
 NO_NUMBERS = (True, math.nan)
 WRONG: list[tuple[str, str, object]] = [
     *((kind, "colour", "red") for kind in built_in_kinds()),
@@ -56,7 +56,7 @@ WRONG: list[tuple[str, str, object]] = [
     *(("sim", "camera_fps", value) for value in (31, *NO_NUMBERS)),
     ("sim", "camera", "no"),
 ]
-"""Kind, option and a value that it does not allow."""
+"""Kind, option and a value that is not allowed."""
 INCOMPLETE: list[tuple[str, dict[str, object], str]] = [
     ("aibo", {}, "host"),
     ("aibo", {"host": "dog1.local", "camera_transport": "udp"}, "numeric"),
@@ -67,7 +67,7 @@ INCOMPLETE: list[tuple[str, dict[str, object], str]] = [
     ("create2", {}, "/dev/ttyUSB0"),
     ("rosbridge", {"odometry_topic": "", "scan_topic": ""}, "odometry_topic"),
 ]
-"""Options that do not go together, and a word of the error."""
+"""Inconsistent options, and a part of the error message."""
 
 
 class RegistryTests(SynchronousTestCase):

@@ -16,7 +16,7 @@ from sim.robots.emulator.rosbridge import RosbridgeRobot
 from tests.drivers.contract import KeptLog, RobotCase
 
 JPEG = b"\xff\xd8\xff\xc0\x00\x0b\x08\x00\x60\x00\x80\x01\x11\x00\x00\xff\xd9"
-"""128 x 96, as far as its head goes."""
+"""The head of a JPEG of 128 x 96 pixels."""
 IMAGE = "/camera/image_raw/compressed"
 
 

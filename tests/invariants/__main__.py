@@ -18,11 +18,11 @@ from tests.invariants.bug import BUGS, FINDERS
 from tests.invariants.run import ALONE, WORKLOADS, Least, Outcome, hunt_all, least, line, run_all
 
 BOUND = 400
-"""Schedules within which each bug must show, unless fewer are asked for."""
+"""The number of schedules that must detect each bug, unless fewer are requested."""
 STRETCH = 1000
-"""The most seeds that one line of a logbook tells of."""
+"""The maximum number of seeds in one line of a logbook."""
 MOST_SHRUNK = 3
-"""Failures that are shrunk; where there are more, these say enough."""
+"""The maximum number of failures that are shrunk."""
 INTERRUPTED = 130
 
 NAMES = (*WORKLOADS, *ALONE)

@@ -329,7 +329,7 @@ _BUGS: dict[tuple[str, ...], dict[str, list[tuple[Any, str, Any]]]] = {
         "bidders stop after one quiet round": [(bidder, "is_over", lambda rounds, quiet, tasks, members: quiet >= 1)],
     },
 }
-"""The seeded bugs, below the workloads that look for them."""
+"""The seeded bugs, by the workloads that detect them."""
 BUGS = {name: changes for bugs in _BUGS.values() for name, changes in bugs.items()}
 FINDERS = {name: finders for finders, bugs in _BUGS.items() for name in bugs}
 

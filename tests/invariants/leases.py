@@ -24,9 +24,9 @@ from sim.team.shrink import WHOLE, Trim
 
 TTL = 1.5
 SLACK = 0.8
-"""E3: seconds beyond the ttl within which another executes when the executor is gone and the rest is well."""
+"""E3: the maximum time beyond the TTL until another agent executes, if only the executor has failed."""
 LEAVE = 0.2
-"""Seconds within which a stand-by holds what was given back, beside the time to stop."""
+"""The maximum time until a standby holds a returned lease, beyond the time to stop."""
 
 
 KINDS = (

@@ -48,11 +48,11 @@ WORKLOADS: dict[str, Callable[[Schedule], Workload]] = {
     "wire": Wire,
     "deciders": Deciders,
 }
-"""Each may be asked for by name; the order is the one in which they act."""
+"""The workloads that share a world, in the order in which they act."""
 ALONE: dict[str, Callable[[int, Trim], Alone]] = {"tasks": Tasks, "leases": Leases, "groups": Groups}
-"""Those that need no fleet: a world of their own beside it, with faults of its own."""
+"""The workloads with separate worlds and faults."""
 SHARES = {"records": 0.15, "tuples": 0.06, "stores": 0.06, "wire": 0.06, "deciders": 0.06, "groups": 0.06}
-"""The share of schedules in which each takes part, unless it is asked for; those that are not here are in all."""
+"""The share of schedules with each workload, unless it is requested; the others are in all schedules."""
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ def run_all(
 
 
 Hunted = tuple[str, tuple[str, ...], int, Outcome | None]
-"""A bug, the workloads that looked for it, how many schedules they took, and the one that showed it, if any did."""
+"""A bug, its workloads, the number of schedules run, and the outcome that detected it, or None."""
 
 
 def hunt(number: int, seeds: Sequence[int]) -> Hunted:

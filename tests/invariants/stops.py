@@ -49,7 +49,7 @@ HONEST = ("ann", "bob", "web")
 ROBOTS = ("dog1", "dog2", "dog3")
 NODES = (*HONEST, *ROBOTS)
 OUTSIDE = "invented"
-"""Signs records with a key that is no member's."""
+"""The signer with a key of no member."""
 
 
 class Violation(AssertionError):

@@ -18,9 +18,9 @@ from tests.invariants.records import KEYS
 PROBE = hashed_key("probe of a full disk")
 FULL = "database or disk is full"
 EARLY = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0)
-"""Seconds after which a node with a rotten store is read."""
+"""The times in seconds at which a node with a corrupt store is read."""
 RECOVERY = 2.0
-"""Seconds within which a node writes again when there is room (S-c)."""
+"""The time in seconds within which a node writes again after space is available (S-c)."""
 
 
 class Stores(Workload):

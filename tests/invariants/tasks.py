@@ -32,7 +32,7 @@ STEP = 0.25
 FAULTS_S = 20.0
 SETTLE_S = 40.0
 HEARD = 3.0
-"""Seconds in calm after which everybody has heard."""
+"""The time in seconds without faults after which all agents have received all reports."""
 
 
 class Tasks:

@@ -28,12 +28,13 @@ JOB = ("job", int, ANY)
 BELL = ("bell", int)
 MOST_WAITING = 6
 SWEEP = 3.0
-"""Seconds after the repair interval at which somebody takes whatever is left, many in one question."""
+"""The time in seconds after the repair interval at which a client takes all remaining tuples."""
 FETCH = 5.0
-"""Seconds after which somebody waits for each tuple that is left even then.  In what remains of the run two rounds fit
-in which the council waits for a member that has died (1.5 s each): one to be outbid by what a taker bid before it died,
-and one that knows the counter of that bid.  A sweep that took anything ends after the first, as ``get_many`` may, and a
-second sweep from elsewhere begins where the first did: that a tuple was left by both does not show that it is stuck."""
+"""The time in seconds after which a client waits for each tuple that still remains.  The rest of the run has time for
+two rounds in which the council waits for a failed member (1.5 s each): one may be outbid by a taker's bid before its
+failure, and the next one knows the counter of this bid.  A sweep that took a tuple ends after the first round, as
+``get_many`` may, and a second sweep from another node starts at the same tuple: a tuple that both leave is not
+necessarily stuck."""
 
 
 class Tuples(Workload):

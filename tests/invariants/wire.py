@@ -43,9 +43,9 @@ from tests.fuzz.ground import state_of
 KINDS = ("replayed", "replayed", "forged", "forged", "truncated", "misdirected", "malformed", "greeting")
 STRANGER = Address("10.66.6.6", 666)
 REMEMBERED = 6
-"""Datagrams that are remembered of each type that came to a node."""
+"""The number of datagrams stored for each node and type."""
 FLOOD = 150
-"""Handshakes that one who holds the team's key begins at once: more than are answered without a cookie."""
+"""The number of handshakes that a client with the team's key starts at once: above the limit without a cookie."""
 
 
 @implementer(ILogObserver)

@@ -19,7 +19,7 @@ from benchmarks.demo import family
 from tests.live.page import BrowserCase
 
 PATIENCE_MS = 120_000
-"""Upper limit of a wait on a loaded machine."""
+"""The timeout of a wait, for a loaded machine."""
 
 
 class Demonstration:

@@ -8,7 +8,7 @@ from middleware.entangled.identity import Identity
 from webnode.token import TokenKey
 
 GATEWAYS = ("vaio", "pi")
-"""Those that vouch for sessions; no other does."""
+"""The nodes with the right to sign session tokens."""
 
 
 def key_of(name: str) -> TokenKey:

@@ -32,13 +32,13 @@ FLAGS = [
     *("--disable-component-update", "--disable-sync", "--disable-dev-shm-usage"),
 ]
 DISC = 66
-"""Pixels across the red disc that the camera shows, of 104."""
+"""The diameter in pixels of the red disc in the camera's picture, of 104."""
 PHONE = {"viewport": {"width": 412, "height": 839}, "has_touch": True}
 TABLET = {"viewport": {"width": 820, "height": 1180}, "has_touch": True}
 DESK = {"viewport": {"width": 1280, "height": 800}}
 VIEWS = ("tasks", "cameras", "map", "groups", "network", "events", "more", "devices")
 PATIENCE_MS = 45_000
-"""How long a page is waited for on a machine that has more to do; where it is in time nothing waits for that."""
+"""The timeout of a wait, for a loaded machine; a page that is in time is not delayed."""
 INFORMED = """async () => {
   const { model } = await import("/static/model.js");
   while (!model.has.includes("invites")) await new Promise((done) => setTimeout(done, 20));
@@ -56,7 +56,7 @@ SMALL = """[...document.querySelectorAll('button, input, select, nav a')].filter
     .filter(e => e.offsetHeight < 44 || e.offsetWidth < 44
         || (e.tagName !== 'INPUT' && e.scrollWidth > e.clientWidth + 1))
     .map(e => e.outerHTML)"""
-"""What a finger does not hit, or is cut off."""
+"""Elements that are too small to touch, or cut off."""
 
 
 def pin(port: int) -> str:
@@ -132,7 +132,7 @@ class Team:
     """A team and its page, served by a child process; ``order`` changes its content."""
 
     _idle: list[subprocess.Popen[str]] = []
-    """Processes that serve no team now."""
+    """Processes that serve no team at present."""
 
     def __init__(self, port: int = 0) -> None:
         self._process = Team._idle.pop() if Team._idle else self._started()

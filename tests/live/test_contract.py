@@ -21,8 +21,8 @@ STREAMS = ("/events", "/shot/{uuid}")
 SIGNING_OUT = "delete_session"
 CHECKS = ("not_a_server_error", "status_code_conformance", "content_type_conformance", "response_schema_conformance")
 KNOWN = {"uuid": ["01" * 16, "02" * 16, "99"], "task_id": ["t1", "t9"]}
-"""Names of things that are there, and of one that is not: by chance alone none would be found.  The third dog answers
-nobody, which is told with 504: no fault of the page."""
+"""Names of present objects and of a missing one, as random names would find none.  The third dog does not answer, for
+which the page returns 504."""
 LIMIT_S = 170
 
 

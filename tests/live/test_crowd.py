@@ -9,9 +9,9 @@ from tests.live.page import DESK, PHONE, PageCase
 
 COUNT = 2000
 SHOWN_S = 40.0
-"""Limit on a loaded machine; 2.2 to 3.7 s on two cores that run five other tests."""
+"""The limit on a loaded machine; 2.2 to 3.7 s on two cores that run five other tests."""
 TOLD_MS = 1000.0
-"""Of the page's own work for one change: 23 to 33 ms there."""
+"""The limit of the page's work for one change; 23 to 33 ms there."""
 CHANGE = """async () => {
   const { model, take } = await import("/static/model.js");
   const { tell } = await import("/static/shell.js");
@@ -27,7 +27,7 @@ CHANGE = """async () => {
   }
   return taken.sort((a, b) => a - b)[2];
 }"""
-"""Milliseconds that the page takes for one device that is other than before: the middle of five."""
+"""The milliseconds that the page needs for one changed device: the median of five."""
 
 
 class CrowdTests(PageCase):

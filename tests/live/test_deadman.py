@@ -42,7 +42,7 @@ HAS_SERIAL = find_spec("serial") is not None
 ROOT = Path(__file__).resolve().parents[2]
 REACTOR: Any = reactor
 LATE_S = 0.4
-"""Seconds after the deadline, or after its node is killed, within which the robot stands on a loaded machine."""
+"""The maximum time in seconds until the robot stands, after the deadline or the death of its node."""
 
 
 @dataclass

@@ -13,9 +13,9 @@ SMALL = """index => {
   small.drawImage(seen, 0, 0, 26, 20);
   return Array.from(small.getImageData(0, 0, 26, 20).data);
 }"""
-"""A camera's picture, so small that its noise is averaged out."""
+"""A camera's picture, scaled down to average its noise."""
 MOVED = 4.0
-"""Mean difference of two such pictures, of 255, that noise alone does not reach and a turning dog does."""
+"""A mean difference of two such pictures, of 255, above the noise and below the change by a turning dog."""
 
 
 STOPPED = """async () => {
@@ -34,9 +34,9 @@ STOPPED = """async () => {
   }
   return { took, moved };
 }"""
-"""Press stop while a dog moves: ms until all stand by the view from above, and how often one moved after that."""
+"""Press stop while a dog moves; return the milliseconds until all stand in the view from above, and later motions."""
 STANDING_MS = 6000.0
-"""Limit until all stand: 200 ms to brake, a view that is 200 ms old, and the rest for a loaded machine."""
+"""The limit until all stand: 200 ms to brake, a view that is 200 ms old, and the rest for a loaded machine."""
 
 
 class DemonstrationPageTests(DemonstrationPageCase):

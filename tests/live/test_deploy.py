@@ -21,7 +21,7 @@ PAGE = ROOT / "docs" / "how-to" / "set-up-a-team.md"
 BLOCK = re.compile(r"^```sh (\w+)( again)?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 CODE = re.compile(r"\b[0-9A-Z]{5}(?:-[0-9A-Z]{5}){3}\b")
 AT_HOME, RENTED = "192.168.1.10", "203.0.113.7"
-"""The addresses of the first laptop and of the rented computer, on the page."""
+"""The addresses of the first laptop and of the rented computer in the page."""
 PATIENCE_S = 40.0
 FIREWALL = """table inet filter {
   chain input {

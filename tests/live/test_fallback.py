@@ -16,7 +16,7 @@ KEPT = """async () => {
   const shell = await caches.open("swarm.shell");
   while (!await shell.match("/")) await new Promise((done) => setTimeout(done, 50));
 }"""
-"""The browser has kept the page, with all its files."""
+"""Wait until the browser has cached the page with all its files."""
 
 
 class FallbackTests(BrowserCase):

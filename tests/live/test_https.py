@@ -19,7 +19,7 @@ from tests.live.until import takes, until
 
 MISSING = [name for name in ("flask", "OpenSSL", "cryptography") if find_spec(name) is None]
 DRIBBLED_S = 20.0
-"""Within 12 s where the machine has nothing else to do."""
+"""12 s on an idle machine."""
 CODE = "quiet-otter"
 
 

@@ -12,7 +12,7 @@ PHONES = """async () => {
   const { model } = await import("/static/model.js");
   model.has = [...model.has, "phones"];
 }"""
-"""The page's node takes phones."""
+"""Add the feature ``phones`` to the page's model."""
 
 
 class InviteTests(PageCase):

@@ -17,7 +17,7 @@ LINKS = {
     "events": "Events",
 }
 FURTHER = ("groups", "network", "events")
-"""To these a phone leads by *More*."""
+"""The views that a phone opens through *More*."""
 USED = {
     "devices": ".device",
     "tasks": "#task",
@@ -25,7 +25,7 @@ USED = {
     "more": "#theme",
     "events": "#events",
 }
-"""What the keyboard reaches in a view; the others are to be looked at only."""
+"""The elements that the keyboard reaches in a view; the other views are only shown."""
 SHOWN = "id => document.getElementById(id).checkVisibility()"
 
 

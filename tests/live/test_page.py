@@ -18,7 +18,7 @@ TWINS = """async () => {
   });
   return seen;
 }"""
-"""A list that is kept in step with items two of which are alike: what it shows, and how many rows were made anew."""
+"""A list updated with items of which two are equal: its text, and the number of new rows."""
 PANELS = """async () => {
   const { panel } = await import("/static/panel.js");
   const { model } = await import("/static/model.js");
@@ -37,7 +37,7 @@ PANELS = """async () => {
     return { update: (_, event) => { if (event === "state") throw new Error("a fault of one"); } };
   } });
 }"""
-"""Two panels that a node with faults shows to operators; one fails at each state."""
+"""Two panels that the page shows to operators of a node with faults; one of them fails at each state."""
 
 
 class PageTests(PageCase):

@@ -26,7 +26,7 @@ from tests.live.until import until
 TEAM = [Report("a", 3.0), Report("b", 1.0), Report("c", 2.0)]
 WAIT_S = 60.0
 ATTEMPT = ("call", [0, "merge", [[list(astuple(Report("ask", 1.0)))], []]])
-"""The question by which ``BASE`` has the module make its attempts."""
+"""The call with which ``BASE`` makes the module run its attempts."""
 CHOICE = [field.name for field in fields(Report)].index("choice")
 BASE = """
 import ctypes, os, signal, socket, sys, threading, time

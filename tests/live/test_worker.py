@@ -21,7 +21,7 @@ from middleware.consensus.worker import DEADLINE_S, Worker
 ROOT = str(Path(__file__).resolve().parents[2])
 TEAM = [Report("a", 3.0, value=(1.0, 2.0)), Report("b", 1.0), Report("c", 2.0)]
 PATIENCE = 20.0
-"""Also the deadline of those who are to answer: how late a busy machine lets them be is not what is shown."""
+"""Also the deadline of strategies that must answer: delays on a loaded machine are not tested."""
 
 
 class Good(Nearest):
