@@ -1,4 +1,4 @@
-"""Whole teams in memory: the dog that acts is lost, in each of the ways of ``make bench-takeover``."""
+"""Tests of the loss of the acting dog in a whole team in memory, for each cause of ``make bench-takeover``."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from tests.swarm.case import TeamCase
 
 class TakeoverTests(TeamCase):
     def test_each_way_to_be_lost(self) -> None:
-        """Whatever befalls the dog that acts, another completes the task, soon, and no two ever move at once.
+        """After each kind of loss another dog completes the task within 2.5 s, and no two dogs ever move at once.
 
-        A frozen dog does nothing when it goes on; one that the others do not hear stops before another moves; and where
-        the robot of a dog hears its node no more, it stands by itself.
+        A frozen dog does nothing after the thaw; a dog that the others do not hear stops before another dog moves; a
+        robot without a link to its node stops by itself.
         """
         seeds = {Cause.POLITE_LEAVE: (2,), Cause.LOST_LINK: (1, 2, 3)}
         for cause in (each for each in Cause if each is not Cause.TRIPLE_KILL):
