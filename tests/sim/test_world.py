@@ -89,7 +89,7 @@ class WorldTests(SynchronousTestCase):
         self.assertEqual((self.world.target.x, self.world.target.y), (1.8, 1.0))
 
     def test_measures_ahead(self) -> None:
-        """The way ahead ends at a wall, a dog or the target, never at the dog itself, and is None beyond the reach."""
+        """The distance ahead ends at a wall, a dog or the target, never at the dog itself; out of range it is None."""
         self.assertIsNone(self.world.distance_ahead(self.dog, 0.1, 1.0))
         self.assertAlmostEqual(self.world.distance_ahead(self.dog, 0.1, 3.0) or 0.0, 1.5, 6)
         self.world.place_target(2.0, 1.0)

@@ -1,4 +1,4 @@
-"""Tests of ``swarmnode.deploy`` and of deployment on a whole team: three dogs in a yard, and a shell at the laptop."""
+"""Tests of ``swarmnode.deploy`` and of deployment on a whole team: three simulated dogs and the laptop's shell."""
 
 from __future__ import annotations
 
