@@ -25,9 +25,9 @@ class CrowdTeamTests(SynchronousTestCase):
         return team
 
     def test_search_among_others(self) -> None:
-        """The thesis' experiment among many: they search, agree on the nearest that has found it, and it gets there.
+        """The thesis' experiment in a crowd: the agents agree on the nearest, which reaches the target.
 
-        The desk has no body, each agent has one, and each node an address of its own.
+        The desk has no robot, each agent has one, and each node has its own address.
         """
         team = self.made(3)
         self.assertEqual(list(team.services), [DESK, *team.yard.names])

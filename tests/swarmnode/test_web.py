@@ -16,7 +16,7 @@ from tests.swarmnode.team import World
 
 class WebRoleTests(SynchronousTestCase):
     def test_tls_without_its_libraries_names_the_extra(self) -> None:
-        """Where the libraries of TLS are missing, asking for it is refused with the command that installs them."""
+        """If the libraries for TLS are missing, TLS is rejected with the command that installs them."""
         loaded = [name for name in sys.modules if name == "webnode.tls" or name.split(".")[0] == "OpenSSL"]
         hidden = {name: sys.modules.pop(name) for name in loaded}
 

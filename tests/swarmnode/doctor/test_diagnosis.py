@@ -114,7 +114,7 @@ class DiagnosisTests(SynchronousTestCase):
         )
 
     def test_kind_of_router(self) -> None:
-        """One port seen by all is a friendly router, another port for each a symmetric one, one witness too few."""
+        """Equal external ports for all peers mean a cone NAT, different ones a symmetric NAT; one peer is too few."""
         self.check(
             (seen_at(5000, 5000), "note nat-cone", ""),
             (seen_at(5000, 6000), "warning nat-symmetric", "198.51.100.1:6000"),
