@@ -36,7 +36,7 @@ class WebRoleTests(SynchronousTestCase):
             self.assertIn(words, str(error))
 
     def test_web_role_without_flask_names_the_extra(self) -> None:
-        """Where Flask is not installed the web role is refused with the command that installs it."""
+        """If Flask is not installed, the web role is rejected with the command that installs it."""
 
         def needing() -> list[str]:
             return [n for n in sys.modules if n.split(".")[0] in ("flask", "webnode") or n == "swarmnode.page"]

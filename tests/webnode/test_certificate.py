@@ -1,4 +1,4 @@
-"""Tests of ``webnode.certificate``: an authority for each web node, which vouches for the local network alone."""
+"""Tests of ``webnode.certificate``: each web node has an authority that is limited to the local network."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class AuthorityTests(SynchronousTestCase):
         skip = SKIP
 
     def test_be_the_same_after_each_start(self) -> None:
-        """One secret gives one authority, byte for byte and for good; another secret another one, by another name."""
+        """A secret always gives the same authority, byte for byte; another secret another one with another name."""
         first, second, other = authority(SECRET, "vaio"), authority(SECRET, "vaio"), authority(bytes(32), "vaio")
         self.assertEqual(first.pem, second.pem)
         self.assertTrue(first.fingerprint.startswith("BC:95:A9:E3:43:30"), first.fingerprint)
