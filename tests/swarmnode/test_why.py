@@ -93,7 +93,7 @@ class WhyTests(SynchronousTestCase):
         self.assertEqual(self.shell.said, "swarm why: 2 tasks begin with 'a': a , a [2J; give more of the id\n")
 
     def test_prefix(self) -> None:
-        """A beginning that fits several is refused with their names; a whole id is meant, also where others go on."""
+        """An ambiguous prefix is rejected with the matching ids; a complete id matches even if it is a prefix."""
         tasks = [Task(name, "k", name, created=float(n)) for n, name in enumerate(("ab", "abc", "b"))]
         self.assertEqual(chosen("last", tasks).task_id, "b")
         self.assertEqual(chosen("ab", tasks).task_id, "ab")

@@ -40,7 +40,7 @@ class ActionTests(SynchronousTestCase):
         return answer.status_code, answer.get_json()
 
     def test_stop_and_go_on(self) -> None:
-        """Both are answered with what each device does, and noted with who asked; whether it is stopped can be read."""
+        """Stop and release return the state of each device and are audited; viewers can read the stop state."""
         stopped = (200, {"halted": True, "devices": {"01": "stands", "02": "stands"}})
         self.assertEqual(self.ask("POST", "halt", {}), stopped)
         self.assertEqual(self.ask("GET", "halt", role="viewer"), (200, {"halted": True}))
