@@ -179,7 +179,7 @@ class MembershipTests(TeamCase):
         self.until(team, lambda: self.task(team)["status"] == "COMPLETED")
 
     def test_others_spread_when_one_leaves(self) -> None:
-        """After the loss of the acting dog the waiting dog moves around the target, away from the new one."""
+        """After a loss the waiting dog moves around the target, away from the acting dog and without a collision."""
         team = self.start_team(1)
         team.scatter(3)
         team.run_demo()

@@ -70,7 +70,7 @@ class AssemblyTests(SynchronousTestCase):
         self.assertEqual(identity_in(store, random.Random(1)).node_id, identity_in(store, random.Random(1)).node_id)
 
     def test_lost_identity_is_said(self) -> None:
-        """A node whose store has lost the identity logs a warning; a node with a new store does not."""
+        """A node logs a warning if its existing store has lost the identity, and none if its store is new."""
         lost = MemoryStore()
         lost.origin = "replaced"
         for store, words in ((MemoryStore(), []), (lost, ["the data store has lost the node's identity"])):

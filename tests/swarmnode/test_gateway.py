@@ -135,7 +135,7 @@ class GatewayTests(SynchronousTestCase):
         self.assertLess(self.team.clock.seconds() - began, 2.0 + SILENCE_S)
 
     def test_first_look_may_take_longer(self) -> None:
-        """The first picture may take longer than the others; a phone that sends none is removed as well."""
+        """The first picture may take up to ``FIRST_S``; after it a phone that falls silent is removed."""
         phone = Phone(self, self.gateways["vaio"])
         phone.looks = False
         self.live(FIRST_S - 0.2)

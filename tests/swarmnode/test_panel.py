@@ -99,7 +99,7 @@ class ManyTests(SynchronousTestCase):
         sent = self.team.board.counters["sent"] - self.sent
         self.assertLess(sent / AGENTS, 1000)
         members = {member.uuid for record in self.records if (member := member_of(record)) is not None}
-        self.assertLessEqual(len(members), SEATS + 2 * ANNOUNCED)  # some write too early
+        self.assertLessEqual(len(members), SEATS + 2 * ANNOUNCED)  # some write before the last announcement
         uuid = self.engagements()[name].me.uuid
         self.assertEqual({one.me.assigned for one in self.engagements().values()}, {uuid})
         self.team.services[name].vanish()

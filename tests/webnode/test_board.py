@@ -19,7 +19,7 @@ class BoardTests(SynchronousTestCase):
         self.assertGreater(token.until, 5.0)
 
     def test_say_what_it_has(self) -> None:
-        """The page is told only the parts that the node has; the map counts if it exists."""
+        """``has`` lists only the optional parts that the node has; the map counts if it exists."""
         self.assertEqual(Board(MemoryDesk(), OpenSessions()).has, [])
         yard = MemoryDesk(yard={"walls": [3.0, 2.4], "dogs": [], "target": None})
         self.assertEqual(Board(yard, OpenSessions()).has, ["yard"])

@@ -156,7 +156,7 @@ class ChronicleTests(SynchronousTestCase):
         self.assertEqual([entry.n for entry in self.chronicle.since(0, "t1")], [4])
 
     def test_ask_by_http(self) -> None:
-        """A viewer reads all entries, those after a number, or those of one device; a wrong number is rejected."""
+        """A viewer reads all entries, entries after a number, or entries of one device; a wrong number is rejected."""
         self.saw(1.0, dog(1), dog(2))
         app = create_app(lambda: state_of([], [], {}), Board(MemoryDesk(), Guests(), chronicle=self.chronicle))
         client = app.test_client()

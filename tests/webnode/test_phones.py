@@ -98,7 +98,7 @@ class PhoneRouteTests(SynchronousTestCase):
         self.assertEqual((answer.status_code, answer.get_json()["error"]["field"]), (403, "ticket"))
 
     def test_ticket_is_of_one_phone(self) -> None:
-        """A phone's ticket is valid for that phone only; an operator's token is valid for all phones."""
+        """The ticket of a phone is valid only at that phone's routes; the token of an operator at all of them."""
         one, other = self.joined(), self.joined(secret="1e" * 32, name="ben")
         self.assertEqual(self.look(one, jpeg(), ticket=other["ticket"])[0], 403)
         self.assertEqual(self.send(f"phones/{one['uuid']}/leave?ticket={other['ticket']}")[0], 403)
@@ -166,7 +166,7 @@ class PhoneRouteTests(SynchronousTestCase):
             self.assertEqual(b"Allow: POST" in asked, status == 405)
 
     def test_share_with_the_team(self) -> None:
-        """A page of another web node of the team may send pictures here; a foreign origin may not."""
+        """A page of another web node of the team may send pictures here; a page of an unknown origin may not."""
         self.board.fallbacks = Fallbacks(Page("02", "http://other:8080"))
         phone = self.joined()
         path = f"phones/{phone['uuid']}/look?ticket={phone['ticket']}"

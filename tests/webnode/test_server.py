@@ -182,7 +182,7 @@ class QuickReactor:
 
 class CallerTests(SynchronousTestCase):
     def test_bring_the_answer(self) -> None:
-        """What the desk returns comes back, also by a Deferred; what it refuses is raised."""
+        """The caller returns the desk's result, also from a Deferred, and raises its refusals."""
 
         def refuse() -> None:
             raise Refusal("name", "no", "ask another", 404)

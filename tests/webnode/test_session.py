@@ -106,7 +106,7 @@ class SignedSessionsTests(SynchronousTestCase):
         self.assertEqual(self.refused(invitation.text, 3.0).status, 401)
 
     def test_refuse_what_is_not_the_code(self) -> None:
-        """A wrong code is rejected with 401 and a hint to ``swarm web``; a visitor without a token has no role."""
+        """A wrong code is rejected with 401 and a hint to ``swarm web``; a visitor without a token is anonymous."""
         for words in ("", "quiet", "quiet-otter1", "\N{DOG FACE}", "A" * 60):
             refusal = self.refused(words)
             self.assertEqual((refusal.status, refusal.field), (401, "code"))

@@ -92,7 +92,7 @@ class GroupTests(SynchronousTestCase):
         self.assertEqual((view["differ"], view["undecided"]), ([], []))
 
     def test_differ(self) -> None:
-        """Who names another, and who names nobody, is told by name; who bids nothing has no share."""
+        """Members with another choice and undecided members are listed by name; no cost means no share."""
         view = group_view("t", "T", [member(1, 1.0, 1), member(2, 0.5, 2), member(3, 0.7, 2), member(4, None, None)])
         self.assertEqual((view["assigned"], view["agree"], view["of"]), ("dog2", 2, 4))
         self.assertEqual((view["differ"], view["undecided"]), (["dog1"], ["dog4"]))

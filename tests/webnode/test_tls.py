@@ -76,7 +76,7 @@ class CertifiedTests(SynchronousTestCase):
         self.assertEqual(self.path.read_bytes(), pem)
 
     def test_make_it_anew(self) -> None:
-        """An exposed, truncated, foreign, old or incomplete certificate is replaced, with a log line."""
+        """A certificate that is exposed, truncated, old, incomplete or of another authority is replaced and logged."""
 
         def cut() -> None:
             self.path.write_bytes(self.path.read_bytes()[:300])
@@ -273,7 +273,7 @@ class HandshakeTests(SynchronousTestCase):
         return b""
 
     def test_let_little_wait_for_a_slow_reader(self) -> None:
-        """A stream over TLS is as short in this machine as a plain one: its socket lies below the TLS."""
+        """Over TLS the send buffers are as small as without, because the option is set on the socket below TLS."""
         connection = self.connected()
         with socket.socket() as below:
             connection.transport.getHandle = lambda: below  # type: ignore[attr-defined]

@@ -36,7 +36,7 @@ def snapshot(*xs: float, moving: str = "", target: bool = True) -> dict[str, Any
 
 
 def state(task: str, by: str = "", gone: float | None = None, **statuses: str) -> dict[str, Any]:
-    """Return the page's state: task status, finishing agent, status of each dog, and the time since the dogs left."""
+    """Return the page's state: task status, finishing agent, status of each dog, and the time of their loss."""
     return {
         "devices": [
             {"uuid": name, "name": name, "status": status, "task": TASK, "gone": gone}

@@ -34,7 +34,7 @@ class NatDemoTests(SynchronousTestCase):
             self.assertNotIn(LOOPBACK, plan.played)
 
     def test_everybody_enters_by_the_router(self) -> None:
-        """The dogs and the judge reach the bootstrap node at the address of the router."""
+        """The dogs and the judge use the address of the bootstrap node that is valid in their own network."""
         plan = planned(Path("/nowhere"), "sim", places(), "over-there")
         for name in DOGS:
             self.assertIn(f'known_nodes = ["198.18.1.1:{NODE_PORT}"]', plan.texts()[name])

@@ -149,7 +149,7 @@ class DriverCommandTests(SynchronousTestCase):
             self.assertEqual((self.body.motion, self.dog.is_engaged), ((0.0, 0.0, 0.0), True))
 
     def test_drive_says_why_it_does_not_move(self) -> None:
-        """The status line shows that the motors were switched off at the robot."""
+        """The status line shows that the motors were switched off at the robot, and m enables them again."""
         self.ground.keys = [(1.5, "w"), (2.0, "m"), (3.0, "w"), (4.0, "x")]
         self.clock.callLater(1.0, self.dog.press)
         self.ground.swarm_driver(f"drive {BLIND}")

@@ -71,7 +71,7 @@ class UnitTests(SynchronousTestCase):
         self.assertIn('--config "/a b/50%%\\"/a.toml"\n', made.text)
 
     def test_systemd_takes_it(self) -> None:
-        """systemd accepts the unit and rates its exposure below 2 of 10."""
+        """The unit passes the checks of systemd, which rates its exposure below 2 of 10."""
         if shutil.which("systemd-analyze") is None:
             raise SkipTest("there is no systemd-analyze here")
         folder = Path(self.mktemp())
