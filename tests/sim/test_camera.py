@@ -17,22 +17,22 @@ from sim.robots.world import World
 
 
 def red(image: Image) -> Image:
-    """Where the picture is target red: one range of Cr, as the ERS-7's own colour space has it."""
+    """Mask the target's red: one range of Cr, as in the colour space of the ERS-7."""
     mask = cv2.inRange(cv2.cvtColor(image, cv2.COLOR_BGR2YCrCb), (20, 170, 60), (235, 255, 128))
     return np.asarray(mask, dtype=np.uint8)
 
 
 def columns(mask: Image) -> tuple[int, int]:
-    """The first and the last column of a mask."""
+    """Return the first and the last column of a mask."""
     lit = np.nonzero(mask.any(axis=0))[0]
     return int(lit[0]), int(lit[-1])
 
 
 class CameraTests(SynchronousTestCase):
-    """What dog1 sees, standing at the left and looking to the right."""
+    """dog1 stands at the left and looks to the right."""
 
     def setUp(self) -> None:
-        """The others stand behind."""
+        """Place the other dogs behind dog1."""
         self.world = World(Random(1), loaded("three-dogs"))
         self.world.move_dog("dog1", 0.5, 1.2, 0.0)
         self.world.move_dog("dog2", 0.3, 0.3, 0.0)
@@ -41,11 +41,11 @@ class CameraTests(SynchronousTestCase):
         self.dog = self.world.dogs["dog1"]
 
     def mask(self) -> Image:
-        """The red of a fresh picture."""
+        """Return the red mask of a new picture."""
         return red(self.camera.image(self.dog))
 
     def test_sees_no_red_without_a_target(self) -> None:
-        """Walls, floor, dogs and noise have nothing of target red, also nose to nose, in corners and against walls."""
+        """Walls, floor, dogs and noise contain no target red, also nose to nose, in corners and at walls."""
         for seed in range(20):
             self.world.scatter(seed, clearance=0.25, from_walls=0.12)
             for dog in self.world.dogs.values():
@@ -57,7 +57,7 @@ class CameraTests(SynchronousTestCase):
             self.camera.image(self.dog)
 
     def test_shows_the_target_where_and_as_large_as_it_is(self) -> None:
-        """Bearing and width of the red agree with the geometry to a pixel and a half, near and far."""
+        """Bearing and width of the red area match the geometry within 1.6 pixels, near and far."""
         for x, y in ((1.0, 1.2), (1.5, 1.35), (2.0, 0.9), (2.8, 1.2), (2.8, 1.9)):
             self.world.place_target(x, y)
             left, right = columns(self.mask())
@@ -68,7 +68,7 @@ class CameraTests(SynchronousTestCase):
             self.assertLess(abs(right + 1 - (WIDTH / 2 - FOCAL_X * math.tan(bearing - half))), 1.6)
 
     def test_sees_the_target_across_the_yard(self) -> None:
-        """At the far end of the yard, and after JPEG, the target is still some nine pixels wide."""
+        """At the far end of the map, and after JPEG compression, the target is at least nine pixels wide."""
         self.world.move_dog("dog1", 0.14, 1.2, 0.0)
         self.world.place_target(2.9, 1.2)
         picture = cv2.imdecode(np.frombuffer(self.camera.jpeg(self.dog), np.uint8), cv2.IMREAD_COLOR)
@@ -76,12 +76,12 @@ class CameraTests(SynchronousTestCase):
         self.assertGreaterEqual(right - left + 1, 9)
 
     def test_fills_the_view_when_touching(self) -> None:
-        """Nose to nose with the target, most of the picture is red, and nothing breaks."""
+        """Nose to nose with the target, more than 70 % of the picture is red."""
         self.world.place_target(0.5 + 0.12 + 0.081, 1.2)
         self.assertGreater(int((self.mask() > 0).sum()), 0.7 * WIDTH * HEIGHT)
 
     def test_hides_the_target_behind_a_dog(self) -> None:
-        """A dog between eye and target hides it, whichever way the dog looks; beside or behind it does not."""
+        """A dog between camera and target hides it at any heading; a dog next to it or behind it does not."""
         self.world.place_target(2.4, 1.2)
         plain = int((self.mask() > 0).sum())
         self.assertGreater(plain, 100)
@@ -96,7 +96,7 @@ class CameraTests(SynchronousTestCase):
         self.assertLess(abs(int((self.mask() > 0).sum()) - plain), 0.05 * plain)
 
     def test_shows_as_many_stripes_as_the_dog_has(self) -> None:
-        """One, two or three yellow stripes can be counted on the back of the head of a dog in front."""
+        """One, two or three yellow stripes are visible on the back of the head of a dog in front."""
         self.camera = Camera(Random(2), self.world)
         for name, stripes in (("dog2", 2), ("dog3", 3)):
             self.world.move_dog(name, 1.1, 1.2, 0.0)

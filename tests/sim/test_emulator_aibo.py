@@ -1,4 +1,4 @@
-"""Tests of ``sim.robots.emulator.aibo_dog``: the dog's side of the wire, as a client that knows bytes alone sees it."""
+"""Tests of ``sim.robots.emulator.aibo_dog`` by a client that sends and receives bytes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ MAIN, STATE, WALK, HEAD, ESTOP, CAMERA, GAINS = 10020, 10031, 10050, 10052, 1005
 
 
 class Client:
-    """Who calls one port and keeps what it hears."""
+    """A client of one port that stores the received bytes."""
 
     def __init__(self) -> None:
         self.heard = b""
@@ -40,10 +40,10 @@ class Client:
 
 
 class AiboEmulatorTests(SynchronousTestCase):
-    """What is known of a dog, one by one."""
+    """The emulator follows the known protocol of an Aibo."""
 
     def setUp(self) -> None:
-        """A dog that was just switched on."""
+        """Create an emulated Aibo that was just switched on."""
         self.clock = Clock()
         self.body = MemoryBody()
         self.dog = self.made()
@@ -56,7 +56,7 @@ class AiboEmulatorTests(SynchronousTestCase):
         return dog
 
     def called(self, port: int) -> Client:
-        """A client of that port, which may not have answered."""
+        """Return a client of the port, connected if the port listens."""
         client = Client()
         line = self.connector.call("dog", port, client)
         self.addCleanup(line.hang_up)
@@ -67,7 +67,7 @@ class AiboEmulatorTests(SynchronousTestCase):
         self.clock.pump([0.002] * round(seconds / 0.002))
 
     def say(self, client: Client, data: bytes) -> bytes:
-        """What the dog says upon these bytes within 10 ms."""
+        """Send bytes and return the answer that arrives within 10 ms."""
         assert client.link is not None
         client.heard = b""
         client.link.send(data)
@@ -75,14 +75,14 @@ class AiboEmulatorTests(SynchronousTestCase):
         return client.heard
 
     def released(self) -> tuple[Client, Client]:
-        """Main control and the walk server of a dog whose motors are on."""
+        """Return clients of the main control and the walk server of a dog with enabled motors."""
         main, estop = self.called(MAIN), self.called(ESTOP)
         self.say(main, b'!select "Walk Remote Control"\n')
         self.say(estop, b"start\n")
         return main, self.called(WALK)
 
     def test_listens_where_a_dog_does(self) -> None:
-        """Main control and the e-stop listen from the start, the others once they are selected, each for one client."""
+        """Main control and e-stop listen from the start, other servers once selected, each for one client."""
         self.assertIsNone(self.called(WALK).link)
         main = self.called(MAIN)
         self.assertIsNotNone(self.called(ESTOP).link)
@@ -98,7 +98,7 @@ class AiboEmulatorTests(SynchronousTestCase):
         self.assertTrue(self.dog.listens(WALK))
 
     def test_shows_in_the_menu_what_runs(self) -> None:
-        """A running server is called #name: selecting its name again does nothing, and #name stops it."""
+        """A running server is listed as #name: selecting name again has no effect, and #name stops it."""
         main = self.called(MAIN)
         self.say(main, b'!select "Walk Remote Control"\n')
         again = self.say(main, b'!select "Walk Remote Control"\n')
@@ -108,7 +108,7 @@ class AiboEmulatorTests(SynchronousTestCase):
         self.assertFalse(self.dog.listens(WALK))
 
     def test_answers_every_line(self) -> None:
-        """Greetings are answered with a count, and lines that are none with a status; nothing breaks."""
+        """Known commands are answered with their result, and invalid lines with a status."""
         main = self.called(MAIN)
         self.assertEqual(self.say(main, b"!hello\r\n"), b"hello\n1\n")
         self.assertEqual(self.say(main, b"!dump_stack\n"), b"stack_dump\n1\nRoot Control\n")
@@ -117,7 +117,7 @@ class AiboEmulatorTests(SynchronousTestCase):
         self.assertIn(b"\n----------\n0\n\n2\n1\nMode Switch\n2\n", self.say(main, b"!refresh\n"))
 
     def test_starts_stopped_and_tells_changes_alone(self) -> None:
-        """The e-stop is on at first, says nothing on connect, and tells changes, refreshes and presses."""
+        """The e-stop is on at first, sends nothing on connect, and reports changes, refreshes and button presses."""
         estop = self.called(ESTOP)
         self.assertEqual(estop.heard, b"")
         for said, answer in ((b"refresh\n", b"on\n"), (b"stop\n", b""), (b"start\n", b"off\n"), (b"warp\n", b"")):
@@ -127,7 +127,7 @@ class AiboEmulatorTests(SynchronousTestCase):
         self.assertEqual(estop.heard, b"on\n")
 
     def test_walks_while_its_motors_are_on(self) -> None:
-        """Each of the three parts holds until it is changed; a stopped dog ignores them, and starts at rest."""
+        """Each motion component holds until it changes; a stopped dog ignores commands and restarts at rest."""
         _, walk = self.released()
         self.say(walk, command("f", 0.5) + command("r", -0.25))
         self.assertEqual(self.body.motion, (0.08, 0.0, -0.5075))
@@ -140,14 +140,14 @@ class AiboEmulatorTests(SynchronousTestCase):
         self.assertEqual(self.body.motion, (0.0, 0.0, 0.0))
 
     def test_walks_no_nan(self) -> None:
-        """A command that is no number stands for zero; the others count."""
+        """A component that is not finite counts as zero; the others are obeyed."""
         _, walk = self.released()
         for value in (math.nan, math.inf, -math.inf):
             self.say(walk, command("f", 0.5) + command("r", value))
             self.assertEqual(self.body.motion, (0.08, 0.0, 0.0))
 
     def test_stops_three_seconds_after_the_last_command(self) -> None:
-        """The dead man's time is 3 s from the last command, which may be the one that means nothing."""
+        """The walk stops 3 s after the last command, which may be a command without effect."""
         _, walk = self.released()
         self.say(walk, command("f", 0.5))
         self.pass_time(2.5)
@@ -158,14 +158,14 @@ class AiboEmulatorTests(SynchronousTestCase):
         self.assertEqual(self.body.motion, (0.0, 0.0, 0.0))
 
     def test_stops_when_its_walk_server_stops(self) -> None:
-        """Stopping the walk server stops the walk and its client."""
+        """Stopping the walk server stops the walk and closes its connection."""
         main, walk = self.released()
         self.say(walk, command("f", 0.5))
         self.say(main, b'!select "#Walk Remote Control"\n')
         self.assertEqual((self.body.motion, walk.link), ((0.0, 0.0, 0.0), None))
 
     def test_tells_its_world_every_32_ms(self) -> None:
-        """World states of 374 bytes come every 32 ms, 244 from an old dog, and gains beside them."""
+        """World states of 374 bytes (244 in the older dialect) arrive every 32 ms, with gains of 224 bytes."""
         for dialect, size in (("T4", 374), (T2, 244)):
             self.dog = self.made(dialect)
             main = self.called(MAIN)
@@ -178,7 +178,7 @@ class AiboEmulatorTests(SynchronousTestCase):
             self.assertEqual(len(gains.heard), 224 * (len(state.heard) // size))
 
     def test_holds_its_head(self) -> None:
-        """Head commands move the neck to their share of its range, and are clipped."""
+        """Head commands move the neck to the given share of its range, and are clamped."""
         main = self.called(MAIN)
         self.say(main, b'!select "Head Remote Control"\n!select "World State Serializer"\n')
         head, state = self.called(HEAD), self.called(STATE)
@@ -190,7 +190,7 @@ class AiboEmulatorTests(SynchronousTestCase):
         self.assertAlmostEqual(pan, 0.768, places=5)
 
     def test_sends_pictures_only_where_they_are_asked_for(self) -> None:
-        """By TCP once the transport is set so; by UDP after the request; and says so when it closes."""
+        """Pictures are sent over TCP if so configured, over UDP after a request, and end with ``CloseConnection``."""
         main = self.called(MAIN)
         heard = self.say(main, b'!select "Raw Cam Server"\n')
         self.assertIn(b'10011\n"raw" "10011" "udp"\n', heard)
@@ -213,7 +213,7 @@ class AiboEmulatorTests(SynchronousTestCase):
         self.assertIsNone(camera.link)
 
     def test_begins_anew_after_a_reboot(self) -> None:
-        """A reboot breaks every link, stops servers and motors, and begins the time at zero."""
+        """A reboot closes all links, stops servers and motors, and allows new connections."""
         main, walk = self.released()
         self.say(walk, command("f", 0.5))
         self.dog.reboot()
@@ -226,18 +226,18 @@ class AiboEmulatorTests(SynchronousTestCase):
 
 
 class Ports(Clock):
-    """A reactor whose sockets close with its next turn, as real ones do: until then their numbers are taken."""
+    """A reactor that closes sockets in its next turn, like a real one; until then their ports stay in use."""
 
     def __init__(self) -> None:
         super().__init__()
         self.taken: dict[int, Any] = {}
 
     def listenUDP(self, *_: object) -> Any:  # noqa: N802 (Twisted's)
-        """Return a port without a number of its own."""
+        """Return a port object with number 0."""
         return _Port(self, 0)
 
     def listenTCP(self, port: int, factory: Any, interface: str) -> Any:  # noqa: N802 (Twisted's)
-        """Take a number, or raise as Twisted does."""
+        """Open the port, or raise ``CannotListenError`` if it is in use."""
         if port in self.taken:
             raise CannotListenError(interface, port, OSError("in use"))
         self.taken[port] = factory
@@ -250,7 +250,7 @@ class _Port:
         self._number = number
 
     def stopListening(self) -> Deferred[None]:  # noqa: N802 (Twisted's)
-        """Free the number with the reactor's next turn."""
+        """Free the port in the reactor's next turn."""
         closed: Deferred[None] = Deferred()
         self._reactor.callLater(0.0, self._reactor.taken.pop, self._number, None)
         self._reactor.callLater(0.0, closed.callback, None)
@@ -258,7 +258,7 @@ class _Port:
 
 
 class AiboServerTests(SynchronousTestCase):
-    """Which ports of an emulated dog listen."""
+    """An emulated dog opens and closes its ports as clients connect and leave."""
 
     def setUp(self) -> None:
         self.reactor = Ports()
@@ -267,14 +267,14 @@ class AiboServerTests(SynchronousTestCase):
         self.server.start()
 
     def tearDown(self) -> None:
-        """Every port is free at the end, and nothing is left on the clock."""
+        """After ``stop`` every port is free and no timer is left."""
         stopped = self.server.stop()
         self.reactor.advance(0.0)
         self.successResultOf(stopped)
         self.assertEqual((self.reactor.taken, self.reactor.getDelayedCalls()), ({}, []))
 
     def test_opens_a_port_again_once_its_socket_is_closed(self) -> None:
-        """A client that leaves before the port it took is closed raises nothing, there or in the next client's link."""
+        """A port reopens after its socket is closed, also if the client leaves before that."""
         gone = self.dog.accept(ESTOP, KeptLink())
         gone.link_down()
         main = self.dog.accept(MAIN, KeptLink())
@@ -284,7 +284,7 @@ class AiboServerTests(SynchronousTestCase):
         self.assertEqual(set(self.reactor.taken), {ESTOP, MAIN})
 
     def test_tries_a_port_again_that_another_program_took(self) -> None:
-        """A number that another program took while its port was closed is opened once it is free; nothing is raised."""
+        """A port that another program took in the meantime is retried until it is free, without an exception."""
         client = self.dog.accept(ESTOP, KeptLink())
         self.reactor.advance(0.0)
         self.reactor.taken[ESTOP] = "another"

@@ -1,4 +1,4 @@
-"""Tests of ``sim.robots.emulator.camera``: what a client of any kind finds there."""
+"""Tests of ``sim.robots.emulator.camera``."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.drivers.contract import KeptLink
 
 class MjpegCameraTests(SynchronousTestCase):
     def setUp(self) -> None:
-        """A camera of 8 pictures a second that is on."""
+        """Start a camera with 8 pictures a second."""
         self.clock = Clock()
         self.body = MemoryBody(jpeg=b"\xff\xd8a\xff\xd9")
         self.camera = MjpegCamera(self.clock, self.body, 8.0)
@@ -21,7 +21,7 @@ class MjpegCameraTests(SynchronousTestCase):
         self.camera.start()
 
     def tearDown(self) -> None:
-        """Nothing is left on the clock once it is off."""
+        """After ``stop`` no timer is left."""
         self.camera.stop()
         self.camera.stop()
         self.assertEqual(self.clock.getDelayedCalls(), [])
@@ -30,7 +30,7 @@ class MjpegCameraTests(SynchronousTestCase):
         return StreamReader().read(wire.said)
 
     def test_serves_several_clients(self) -> None:
-        """Each client gets every picture from its request on, whatever path it asks for; a late one loses none."""
+        """Each client gets every picture after its request, for any path, until it leaves."""
         first, second = KeptLink(), KeptLink()
         asks = self.camera.accept(first)
         for byte in request("cam", "/stream"):
@@ -46,7 +46,7 @@ class MjpegCameraTests(SynchronousTestCase):
         self.assertEqual((len(self.pictures(first)), len(self.pictures(second))), (16, 16))
 
     def test_drops_for_a_busy_client(self) -> None:
-        """A client that does not take its pictures loses them whole, and the others lose none."""
+        """Pictures for a busy client are dropped whole, and other clients lose none."""
         slow, quick = KeptLink(), KeptLink()
         for wire in (slow, quick):
             self.camera.accept(wire).received(request("cam", "/"))
@@ -57,7 +57,7 @@ class MjpegCameraTests(SynchronousTestCase):
         self.assertEqual((len(self.pictures(slow)), len(self.pictures(quick)), self.camera.dropped), (8, 16, 8))
 
     def test_turns_away(self) -> None:
-        """Another method, an endless request, and who comes while it is out of order get no pictures."""
+        """Another method, an endless request, and a request while the camera is out of order get no pictures."""
         posts, endless, late = KeptLink(), KeptLink(), KeptLink()
         self.camera.accept(posts).received(b"POST / HTTP/1.1\r\n\r\n")
         self.camera.accept(endless).received(bytes(10_000))

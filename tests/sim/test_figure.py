@@ -1,4 +1,4 @@
-"""Figures: what they are held to, and how they are read."""
+"""Tests of figures: their bounds, statistics and tables."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sim.team.figure import Bound, Figure, at_least, at_most, bound_of, mean, pe
 
 class FigureTests(SynchronousTestCase):
     def test_bounds(self) -> None:
-        """A bound is read from its text, and holds at its very value; what is no bound is refused."""
+        """A bound is parsed from text and includes its limit; invalid text is rejected."""
         self.assertEqual(bound_of("<= 450"), Bound(450.0))
         self.assertTrue(bound_of(">= 0.999").holds(0.999))
         self.assertFalse(bound_of(">= 0.999").holds(0.9989))
@@ -21,13 +21,13 @@ class FigureTests(SynchronousTestCase):
                 bound_of(text)
 
     def test_what_was_not_measured_is_missed(self) -> None:
-        """A target is missed where nothing was measured; without a target nothing is."""
+        """A figure without a value misses its target; a figure without a target has no result."""
         self.assertIs(at_most("x", None, "s", 1.0).holds, False)
         self.assertIs(at_least("x", 2.0, "s", 1.0).holds, True)
         self.assertIsNone(Figure("x", None).holds)
 
     def test_percentiles(self) -> None:
-        """A percentile is one of the values: the least that so many do not exceed."""
+        """A percentile is one of the values, the smallest that covers the share."""
         values = [float(n) for n in range(100, 0, -1)]
         self.assertEqual((percentile(values, 0.5), percentile(values, 0.99)), (50.0, 99.0))
         self.assertEqual([figure.value for figure in spread("x", values, "s")], [50.0, 99.0, 100.0])
@@ -35,13 +35,13 @@ class FigureTests(SynchronousTestCase):
         self.assertIsNone(mean([]))
 
     def test_table(self) -> None:
-        """The table says what is missed, and what nothing seen in n trials leaves room for."""
+        """The table shows missed targets, and the upper confidence limit of a share without failures."""
         shown = table([share("found", 1000, 1000).against(Bound(0.999, most=False)), at_most("slow", 3.0, "s", 2.0)])
         self.assertIn("n 1,000, < 0.003 else", shown)
         self.assertRegex(shown, r"found +1 share +>= 0\.999 +yes")
         self.assertRegex(shown, r"slow +3 s +<= 2 +NO")
 
     def test_json_knows_no_infinity(self) -> None:
-        """What never happened is packed as None, which JSON can hold."""
+        """An infinite value is packed as None, because JSON has no infinity."""
         self.assertIsNone(Figure("x", math.inf, "s").packed()["value"])
         self.assertEqual(Figure("x", 1.5, "s").packed()["value"], 1.5)

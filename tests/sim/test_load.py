@@ -1,4 +1,4 @@
-"""The workloads of a team: what they measure, and that they see what is wrong."""
+"""Tests of the workloads of a simulated team: their figures and the violations that they find."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from sim.team.scenario import scenario_of
 
 
 def played(text: str, seed: int = 1) -> tuple[Outcome, dict[str, Figure]]:
-    """The outcome of a scenario, and its figures by name."""
+    """Run a scenario and return the outcome and its figures by name."""
     settings = {name: kind.settings for name, kind in LOADS.items()}
     outcome = Run(scenario_of(text, "test", "test", settings), seed, LOADS).go()
     return outcome, {figure.name: figure for figure in outcome.figures}
@@ -31,7 +31,7 @@ def played(text: str, seed: int = 1) -> tuple[Outcome, dict[str, Figure]]:
 
 class CensusTests(SynchronousTestCase):
     def test_closest(self) -> None:
-        """Whoever lives, dies and asks: those closest are the same as by looking at everybody."""
+        """``closest`` matches a search of all living nodes after random joins and deaths."""
         dice, census, living = random.Random(1), Census(), set()
         for _ in range(300):
             born = dice.randbytes(20)
@@ -51,7 +51,7 @@ class CensusTests(SynchronousTestCase):
 
 class PaceTests(SynchronousTestCase):
     def test_due(self) -> None:
-        """So many a second are due, however rarely it is asked, and none beyond the last."""
+        """The due count follows the rate at any polling interval, up to the total count."""
         clock = HeapClock()
         pace = Pace(clock, 2.5, 12)
         due = [pace.due()]
@@ -76,10 +76,10 @@ Bounds = dict[str, tuple[float, float]]
 
 
 class QuietTests(SynchronousTestCase):
-    """Where nothing is wrong the workloads find nothing wrong, and measure what is to be expected."""
+    """In a run without faults the workloads find no violation and measure the expected values."""
 
     def check(self, text: str, bounds: Bounds, **counts: int) -> None:
-        """Play it: no violation, each figure within its bounds, and as many values behind it as ``counts`` says."""
+        """Run a scenario; check that it has no violation, and check each figure's bounds and number of samples."""
         outcome, figures = played(text)
         self.assertEqual(outcome.violations, [])
         for name, (low, high) in bounds.items():
@@ -90,56 +90,56 @@ class QuietTests(SynchronousTestCase):
             self.assertEqual(figures[name.replace("__", ".")].n, count, name)
 
     def test_records(self) -> None:
-        """Everything is acknowledged and read."""
+        """Every write is acknowledged and every value is read."""
         self.check(RECORDS, {"records.acknowledged": (1.0, 1.0), "records.read": (1.0, 1.0)})
 
     def test_lookups(self) -> None:
-        """Every lookup finds its node in time, and every key its closest nodes, in their order."""
+        """Every lookup finds its node in time, and every key's closest nodes in order."""
         bounds: Bounds = {"lookups.reached.p50": (0.05, 0.9), "lookups.seconds.p50": (0.05, 1.0)}
         bounds |= {"lookups.success": (1.0, 1.0), "lookups.exact": (1.0, 1.0)}
         self.check(LOOKUPS, bounds, lookups__success=90, lookups__exact=20)
 
     def test_values(self) -> None:
-        """A value outlives all but one of those that acknowledged it, and a reader finds every holder."""
+        """A value survives the death of all but one of its acknowledging nodes, and a reader finds every holder."""
         bounds: Bounds = {"values.read": (1.0, 1.0), "values.lost": (0.0, 0.0), "values.killed": (4.0, 8.0)}
         self.check(VALUES, bounds, values__read=1)
         bounds = {"values.holders_found": (1.0, 1.0), "values.copies": (8.0, 8.0), "values.lost": (0.0, 0.0)}
         self.check(HOLDERS, bounds, values__lost=10)
 
     def test_watches(self) -> None:
-        """Every follower hears of every change, well within a second."""
+        """Every watcher receives every change within a second."""
         self.check(WATCHES, {"watches.heard": (1.0, 1.0), "watches.seconds.max": (0.0, 1.0)})
 
     def test_auctions(self) -> None:
-        """All that bid name the nearest soon after the waiting period, with few messages, of three and of forty."""
+        """In small and large teams all bidders name the nearest agent soon after the waiting period."""
         bounds: Bounds = {"auctions.right": (1.0, 1.0), "auctions.last": (0.0, 0.6), "auctions.messages": (1.0, 10.0)}
         for nodes in (3, 40):
             self.check(f"nodes = {nodes}\n{AUCTIONS}", bounds, auctions__agree__p50=2 * nodes)
 
     def test_directory(self) -> None:
-        """Every device is held somewhere, each reader finds all, and it shows who holds the most."""
+        """Each device is stored, each reader finds all devices, and the load of the busiest node is measured."""
         bounds: Bounds = {"directory.held.mean": (1.0, 12.0), "directory.busiest": (1 / 12, 1.0)}
         self.check(DIRECTORY, {**bounds, "directory.devices": (12.0, 12.0), "directory.listed_whole": (1.0, 1.0)})
 
     def test_takeovers(self) -> None:
-        """Whenever the holder of a lease dies, another one holds it within two seconds, and never two at once."""
+        """When the holder of a lease dies, another node gets the lease within two seconds, and never two at once."""
         self.check(TAKEOVERS, {"takeovers.seconds.max": (0.5, 2.0)}, takeovers__seconds__max=8)
 
     def test_tasks(self) -> None:
-        """Of many tasks at once each has one holder, the nearest, also where datagrams are lost."""
+        """Each of many concurrent tasks has one holder, the nearest, also if datagrams are lost."""
         self.check(TASKS, {"tasks.held_once": (1.0, 1.0), "tasks.by_the_nearest": (1.0, 1.0)}, tasks__held_once=30)
 
     def test_traffic(self) -> None:
-        """A quiet team of twelve knows everybody, and sends a few datagrams a second each."""
+        """In a quiet team of twelve each node knows all others and sends at most ten datagrams a second."""
         bounds: Bounds = {"traffic.datagrams": (0.5, 10.0), "traffic.bytes": (15.0, 3000.0)}
         self.check(TRAFFIC, {**bounds, "traffic.contacts": (11.0, 11.0)})
 
 
 class WrongTests(SynchronousTestCase):
-    """What is wrong shows."""
+    """The workloads detect defects."""
 
     def test_what_is_not_kept(self) -> None:
-        """A node that acknowledges what it does not store breaks D1, and what is nowhere is heard by nobody."""
+        """A node that acknowledges writes without storing them violates D1, and watchers receive no change."""
         self.patch(EntangledNode, "put", lambda node, *what: succeed(5))
         outcome, _ = played(RECORDS)
         self.assertEqual({line[:3] for line in outcome.violations}, {"D1:"})
@@ -147,7 +147,7 @@ class WrongTests(SynchronousTestCase):
         self.assertEqual(figures["watches.heard"].value, 0.0)
 
     def test_what_is_old(self) -> None:
-        """A reader that is shown the first value of a slot for ever is shown what is not fresh (D2)."""
+        """A reader that always gets the first value of a slot violates D2."""
         get, first = EntangledNode.get, dict[Any, Record]()
 
         def stale(node: EntangledNode, key: bytes, *concern: Any) -> Deferred[list[Record]]:
@@ -158,7 +158,7 @@ class WrongTests(SynchronousTestCase):
         self.assertIn("D2:", {line[:3] for line in outcome.violations})
 
     def test_wrong_and_late_lookups(self) -> None:
-        """A lookup beyond its limit has failed; one without the closest node is counted as wrong and is not exact."""
+        """A lookup beyond its time limit counts as late; a lookup without the closest node is wrong and not exact."""
         _, figures = played(LOOKUPS + "limit = 0.1\n")
         self.assertEqual((figures["lookups.success"].value, figures["lookups.late"].value), (0.0, 90.0))
         find = EntangledNode.find_node
@@ -174,7 +174,7 @@ class WrongTests(SynchronousTestCase):
         self.assertEqual(len([line for line in outcome.violations if line.startswith("D6")]), 20)
 
     def test_lost_values(self) -> None:
-        """Where nobody answers with the value, that is told at once as a violation, and in the end as a loss."""
+        """A value that no node returns is a violation at once, and a lost value at the end."""
         get = EntangledNode.get
 
         def nothing(node: EntangledNode, key: bytes, concern: Any = "majority") -> Deferred[list[Record]]:
@@ -187,7 +187,7 @@ class WrongTests(SynchronousTestCase):
         self.assertTrue(any("is lost after" in line for line in outcome.violations))
 
     def test_two_holders(self) -> None:
-        """Where a lease is given to whoever asks, it shows that two hold one."""
+        """Acceptors that grant every request cause two holders of a lease, which violates E2."""
         self.patch(LeaseAcceptor, "prepare", lambda acceptor, task, number, ballot, *_: Reply(Kind.GRANTED, ballot))
         self.patch(
             LeaseAcceptor, "lease", lambda acceptor, task, number, ballot, token, *_: Reply(Kind.GRANTED, ballot, token)
@@ -198,7 +198,7 @@ class WrongTests(SynchronousTestCase):
 
 class RepeatTests(SynchronousTestCase):
     def test_same_seed_same_hash(self) -> None:
-        """A run with every workload has the same hash twice, and another one with another seed."""
+        """A run with every workload gives the same digest twice, and another digest with another seed."""
         text = 'nodes = 10\nseconds = 6.0\n[link]\nkind = "wifi"\nloss = 0.05\n'
         few = {"tasks": "count = 10\n", "values": "count = 5\n", "takeovers": "rate = 0.5\n"}
         text += "".join(f"[load.{name}]\n{few.get(name, '')}" for name in sorted(LOADS))

@@ -15,15 +15,15 @@ from sim.robots.world import World
 
 
 class PictureTests(SynchronousTestCase):
-    """The yard from above."""
+    """The map from above."""
 
     def setUp(self) -> None:
-        """The yard with a target at the right, above the middle."""
+        """Place a target at the right, above the middle of the map."""
         self.world = World(Random(1), loaded("three-dogs"))
         self.world.place_target(2.2, 1.7)
 
     def drawn(self, caption: str = "", **changes: object) -> Any:
-        """The channels blue, green and red of the picture of a snapshot with ``changes``."""
+        """Return the blue, green and red channels of the picture of a snapshot with ``changes``."""
         data = overhead({**self.world.snapshot(), **changes}, caption)
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
         assert image is not None
@@ -31,7 +31,7 @@ class PictureTests(SynchronousTestCase):
         return np.moveaxis(image.astype(int), 2, 0)
 
     def test_shows_the_target_where_it_is(self) -> None:
-        """Red is drawn where the target is, and nowhere without one; a caption leaves ink below."""
+        """The target is drawn red at its place, and nothing is red without a target; a caption is drawn below."""
         blue, green, red = self.drawn()
         rows, lit = np.nonzero((red > 180) & (green < 70) & (blue < 70))
         self.assertGreater(len(rows), 100)
@@ -41,7 +41,7 @@ class PictureTests(SynchronousTestCase):
         self.assertGreater(int((red[490:] < 120).sum()), 60)
 
     def test_shows_more_yellow_for_more_stripes(self) -> None:
-        """The dog with three stripes carries about three times the yellow of the dog with one."""
+        """The dog with three stripes is drawn with more than twice the yellow of the dog with one stripe."""
         dogs: Any = self.world.snapshot()["dogs"]
         shown = [self.drawn(dogs=[dog]) for dog in dogs]
         yellow = [int(((red > 200) & (green > 150) & (blue < 100)).sum()) for blue, green, red in shown]

@@ -1,4 +1,4 @@
-"""Tests of ``sim.robots.table`` and ``emulator.dog``: dogs of the yard that are reached as other robots are."""
+"""Tests of ``sim.robots.table`` and ``emulator.dog``: simulated dogs that emulate other kinds of robots."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from sim.robots.yard import Yard
 
 
 class YardCase(SynchronousTestCase):
-    """A running yard on a turned clock."""
+    """A running simulator in virtual time."""
 
     def setUp(self) -> None:
         self.clock = Clock()
@@ -35,20 +35,20 @@ class YardCase(SynchronousTestCase):
         self.yard.start()
 
     def pass_time(self, seconds: float) -> None:
-        """Turn the clock, a tick of the yard at a time."""
+        """Advance the clock, one tick of the simulator at a time."""
         for _ in range(round(seconds / TICK)):
             self.clock.advance(TICK)
 
 
 class DogBodyTests(YardCase):
-    """A lent dog is moved and felt through its body."""
+    """``DogBody`` moves a lent dog and reads its sensors."""
 
     def lent(self, limits: Any = LIMITS) -> DogBody:
-        """The body of dog1, which heads for the middle of the yard."""
+        """Return the body of dog1, which faces the middle of the map."""
         return self.yard.lend("dog1", limits)
 
     def test_moves_as_fast_as_its_kind(self) -> None:
-        """The body obeys the limits that it is lent with, and stands still when it is halted."""
+        """The body obeys the limits with which it is lent, and stops when it is halted."""
         body = self.lent({"base.vx": (-0.5, 0.5), "base.wz": (-4.25, 4.25)})
         body.drive(0.9, 0.2, 0.0)
         self.pass_time(1.0)
@@ -60,7 +60,7 @@ class DogBodyTests(YardCase):
         self.assertFalse(body.sense()["base.moving"])
 
     def test_stands_where_it_is_told_no_number(self) -> None:
-        """A velocity that is NaN or infinite halts the dog, and its place stays a number."""
+        """A velocity that is NaN or infinite stops the dog, and its position stays finite."""
         body = self.lent()
         for motion in ((math.nan, 0.0, 0.0), (0.0, -math.inf, 0.0), (0.0, 0.0, math.nan)):
             body.drive(0.1, 0.0, 0.0)
@@ -71,7 +71,7 @@ class DogBodyTests(YardCase):
             self.assertTrue(math.isfinite(self.yard.world.dogs["dog1"].x))
 
     def test_senses(self) -> None:
-        """It feels at any moment, and by its bumper a wall ahead or beside; its eye sees in full or half size."""
+        """Sensors are always readable, bumpers detect walls ahead and at the side, and pictures have two sizes."""
         body = self.lent()
         self.pass_time(0.5)
         sensed = body.sense()
@@ -89,10 +89,10 @@ class DogBodyTests(YardCase):
 
 
 class RobotsTests(YardCase):
-    """The table of robots is checked, and each dog is reached in one way only."""
+    """The table of robots is validated, and each dog accepts one kind of connection only."""
 
     def test_lent_dog_has_no_other_driver(self) -> None:
-        """A driver of simulated dogs is told that this one is none of them any more."""
+        """A driver of simulated dogs is rejected by a dog that is lent to an emulator."""
         from drivers.sim.driver import SimDriver
 
         self.yard.lend("dog1", describe("create2", {"port": "x"}).limits)
@@ -102,7 +102,7 @@ class RobotsTests(YardCase):
         self.assertIn("reached as a robot of another kind", self.failureResultOf(failed).getErrorMessage())
 
     def test_refuses_what_it_cannot_play(self) -> None:
-        """A dog that is not there, a kind without an emulator, and an unknown dialect are named."""
+        """An unknown dog, a kind without emulator, an unknown dialect and invalid options are rejected by name."""
         aibo = {"kind": "aibo", "options": {"host": "127.0.0.1"}}
         cases: list[tuple[dict[str, Any], str]] = [
             ({"dog9": aibo}, "no robot is named 'dog9'.*it has dog1, dog2, dog3"),
@@ -122,7 +122,7 @@ class RobotsTests(YardCase):
                 Robots(self.clock, Random(1), self.yard, table)
 
     def test_replaces_no_file(self) -> None:
-        """What lies where a robot's cable shall begin stays as it is, and is named; only a link left behind goes."""
+        """A file at the path of the serial port is kept and reported; only a leftover link is replaced."""
         folder = Path(self.mktemp())
         folder.mkdir()
         path = folder / "ttyUSB0"
@@ -137,14 +137,14 @@ class RobotsTests(YardCase):
         path.symlink_to("/dev/pts/99999")
         port = PtyPort(MemoryReactorClock(), Bittle(MemoryBody(), self.clock, Random(1)).accept, str(path))
         self.assertNotEqual(str(path.readlink()), "/dev/pts/99999")
-        # Another one that took the path over keeps it.
+        # A link that another program put at the path stays.
         path.unlink()
         path.symlink_to("elsewhere")
         port.close()
         self.assertEqual(str(path.readlink()), "elsewhere")
 
     def test_names_whose_address_cannot_be_had(self) -> None:
-        """A robot that cannot be served is named with what is wrong, and nothing of it stays open."""
+        """A robot that cannot be served is reported with the reason, and no file stays open."""
         before = len(os.listdir("/dev/fd"))
         table = {"dog2": {"kind": "create2", "options": {"port": "/nowhere/at/all"}}}
         robots = Robots(MemoryReactorClock(), Random(1), self.yard, table)

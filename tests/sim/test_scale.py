@@ -1,4 +1,4 @@
-"""The curves of ``sim scale``: what they are made of, resumed and drawn."""
+"""Tests of ``sim scale``: expected values, resumed measurements, drawings and pages."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from sim.team.scale.survey import Ended, Sized, SurveySettings, Watcher, surveye
 
 
 def world() -> Environment:
-    """A machine with room for everything."""
+    """Return an environment with more memory than any team needs."""
     ticks = itertools.count()
     return Environment(
         io.StringIO(), io.StringIO(), lambda: next(ticks), lambda: 0.0, read=lambda path: "MemAvailable: 99999999 kB"
@@ -32,14 +32,14 @@ def world() -> Environment:
 
 
 def sized(nodes: int) -> Sized:
-    """A made-up size: everything is 1, and hops are as many as there are nodes."""
+    """Return results for a size: hops equal the number of nodes, all other values are 1."""
     figures = [Figure(curve.figure, 1.0, curve.unit) for curve in CURVES if curve.figure != "lookups.hops.mean"]
     return Sized(nodes, [*figures, Figure("lookups.hops.mean", float(nodes), "hops").against(None)], [], "h", 1.0)
 
 
 class TheoryTests(SynchronousTestCase):
     def test_curves(self) -> None:
-        """What is expected by arithmetic: half the bits in hops, full buckets and the near ones, a tree's messages."""
+        """The expected numbers of hops, contacts, tree messages and agreement follow the formulas."""
         self.assertEqual((theory.hops(3), theory.hops(1024)), (2.0, 5.0))
         self.assertEqual(theory.contacts(4), 3.0)
         self.assertTrue(60 < theory.contacts(1024) < 80)
@@ -50,7 +50,7 @@ class TheoryTests(SynchronousTestCase):
 
 class RecordTests(SynchronousTestCase):
     def test_resumed(self) -> None:
-        """A size that is in the file is not measured again; what has other settings is not put over it."""
+        """A size that is in the file is not measured again; a file with other settings is not overwritten."""
         out = self.mktemp()
         asked: list[int] = []
 
@@ -68,7 +68,7 @@ class RecordTests(SynchronousTestCase):
         self.assertEqual(Path(out, "scale.json").read_text(), before)
 
     def test_ended_run_keeps_what_it_has(self) -> None:
-        """Each size is written as soon as it is measured; one in whose midst a person wants an end is let go of."""
+        """Each size is written after its measurement; the measurement that is interrupted is discarded."""
         out, here, wishes = self.mktemp(), world(), list[int]()
         here.is_stopped = lambda: bool(wishes)
 
@@ -82,7 +82,7 @@ class RecordTests(SynchronousTestCase):
         self.assertEqual(list(json.loads(Path(out, "scale.json").read_text())["sizes"]), ["3"])
 
     def test_bad_input(self) -> None:
-        """Sizes that are none, a file that is not ours, and a folder that cannot be written are refused by name."""
+        """Invalid sizes, an invalid file, and a folder that cannot be written are rejected by name."""
         for text in ("", "many", "2", "3,1000000"):
             with self.assertRaisesRegex(BadSetting, "--nodes"):
                 scale(["--nodes", text, "--out", self.mktemp()], world())
@@ -104,7 +104,7 @@ class RecordTests(SynchronousTestCase):
                 scale(["--nodes", "3", "--out", str(out)], world(), lambda nodes, settings, watcher: self.fail("late"))
 
     def test_missed_targets_show(self) -> None:
-        """A figure beyond its target makes the command say so, and end with 1."""
+        """A figure beyond its target is marked in the table and sets exit code 1."""
         here = world()
         code = scale(["--nodes", "1000", "--out", self.mktemp()], here, lambda nodes, settings, watcher: sized(nodes))
         self.assertEqual(code, 1)
@@ -115,7 +115,7 @@ class RecordTests(SynchronousTestCase):
 
 class DrawingTests(SynchronousTestCase):
     def test_svg(self) -> None:
-        """Every curve with points is drawn in a field of its own, and the whole is XML, whatever its values are."""
+        """Each curve with points has its own chart, and the drawing is valid XML for any values."""
         for values in ([1.0, 1.0], [0.0, 0.0], [0.001, 5e6], [3.0, 4.0]):
             points = {curve.figure: [(3, values[0]), (1000, values[1])] for curve in CURVES[:5]}
             root = ElementTree.fromstring(drawn(CURVES, points, "a & b"))
@@ -126,20 +126,20 @@ class DrawingTests(SynchronousTestCase):
 
 class PageTests(SynchronousTestCase):
     def test_table(self) -> None:
-        """A value beyond its target is bold, and the last column goes on straight over the logarithm of the size."""
+        """A value beyond its target is bold, and the last column extrapolates over the logarithm of the size."""
         hops = [(n, 1.0 + 0.3 * math.log2(n)) for n in (3, 100, 300, 1000)]
         shown = page(CURVES, {"lookups.hops.mean": hops, "traffic.cpu": [(100, 1.0), (1000, 1.0)]})
         self.assertRegex(shown, r"Hops of a lookup \| hops \|.*\| 6.979 \|")
         self.assertRegex(shown, r"Processor of a node.* \| - \| 1 \| - \| \*\*1\*\* \| <= 0.5 \|  \|")
         self.assertIsNone(led(hops[:3]))
-        # Where smaller teams are held to something else, the table says to what.
+        # If smaller teams have other targets, the table shows them.
         shown = page(CURVES, {"auctions.agree.p95": [(n, 0.7) for n in (3, 100, 1000, 10_000)]})
         self.assertIn("| 0.7 | **0.7** | 0.7 | 0.7 | <= 1; <= 0.6 at 100, <= 0.8 at 1,000 |", shown)
 
 
 class SurveyTests(SynchronousTestCase):
     def test_ends_soon(self) -> None:
-        """A survey ends within a quarter of a second of the team's time after a person wants it to."""
+        """A survey that is interrupted ends at the next check, within 0.25 s of simulated time."""
         looks: list[int] = []
 
         def is_stopped() -> bool:
@@ -151,7 +151,7 @@ class SurveyTests(SynchronousTestCase):
         self.assertEqual(len(looks), 5)
 
     def test_small_team(self) -> None:
-        """A team of five is measured in everything, twice the same, and nothing is violated."""
+        """A survey of five nodes measures every figure without violations, and its digest is reproducible."""
         settings = SurveySettings(settle=5.0, quiet=5.0, lookups=2.0, exact=5, auctions=1, takeovers=1, swarm_most=5)
         one, same = surveyed(5, settings), surveyed(5, settings)
         self.assertEqual(one.violations, [])

@@ -12,10 +12,10 @@ from sim.robots.scene import SceneError, loaded, parsed, scene_names
 
 
 class SceneTests(SynchronousTestCase):
-    """Scenes from JSON."""
+    """Scenes are read from JSON."""
 
     def setUp(self) -> None:
-        """A lawful scene to spoil."""
+        """Create a valid scene for the tests to change."""
         self.fields = {
             "name": "two",
             "width": 2.0,
@@ -29,18 +29,18 @@ class SceneTests(SynchronousTestCase):
         }
 
     def refusal(self) -> str:
-        """What is said about the spoilt scene."""
+        """Return the error message for the changed scene."""
         return str(self.assertRaises(SceneError, parsed, json.dumps(self.fields), "two.json"))
 
     def test_loads_the_three_dogs_of_the_thesis(self) -> None:
-        """The installed scene has dogs with one, two and three stripes in a walled enclosure."""
+        """The installed scene has dogs with one, two and three stripes in a walled enclosure, as in the thesis."""
         self.assertIn("three-dogs", scene_names())
         scene = loaded("three-dogs")
         self.assertEqual([(one.name, one.stripes) for one in scene.kennels], [("dog1", 1), ("dog2", 2), ("dog3", 3)])
         self.assertEqual((scene.width, scene.height), (3.0, 2.4))
 
     def test_reads_a_file(self) -> None:
-        """A name that ends in .json is a path, and degrees become radians; unknown names and paths are refused."""
+        """A name that ends in .json is a path, and degrees become radians; unknown names and paths are rejected."""
         path = Path(self.mktemp() + ".json")
         path.write_text(json.dumps(self.fields))
         self.assertEqual(loaded(str(path)).kennels[0].heading, math.pi / 2)
@@ -48,12 +48,12 @@ class SceneTests(SynchronousTestCase):
         self.assertIn("nowhere.json", str(self.assertRaises(SceneError, loaded, "nowhere.json")))
 
     def test_refuses_what_is_no_scene(self) -> None:
-        """Text that is not JSON, or not an object, is refused with the source's name."""
+        """Text that is not a JSON object is rejected with the name of its source."""
         for text in ("", "{", "[]", "7", "null", "[" * 100_000):
             self.assertIn("two.json", str(self.assertRaises(SceneError, parsed, text, "two.json")))
 
     def test_names_the_wrong_key(self) -> None:
-        """A missing or wrong field, and dogs in a wall, in each other, or of one name are refused with the key."""
+        """A missing or invalid field, and dogs in a wall, overlapping or with equal names are rejected with the key."""
         wrong = {"width": 0, "height": "2", "wall_height": None, "name": 7, "dogs": [], "target": 3}
         for key, value in wrong.items():
             self.setUp()

@@ -12,27 +12,27 @@ from sim.robots.world import SUBSTEP, NotPossible, World
 
 
 def make_world(seed: int = 1) -> World:
-    """The three dogs, far apart."""
+    """Return a world with the three dogs far apart."""
     return World(Random(seed), loaded("three-dogs"))
 
 
 def run(world: World, seconds: float) -> None:
-    """Let time pass."""
+    """Run the physics for some seconds."""
     for _ in range(round(seconds / SUBSTEP)):
         world.step()
 
 
 class WorldTests(SynchronousTestCase):
-    """The physics of the yard."""
+    """The physics of the robot simulator."""
 
     def setUp(self) -> None:
-        """A fresh world with dog1 in the middle, looking to the right."""
+        """Create a world with dog1 in the middle, facing right."""
         self.world = make_world()
         self.dog = self.world.dogs["dog1"]
         self.world.move_dog("dog1", 1.4, 1.0, 0.0)
 
     def test_walks_as_far_as_an_aibo(self) -> None:
-        """Full speed ahead for two seconds is 0.16 m/s less the start, and no dog exceeds the walk figures."""
+        """Speed is limited to 0.16 m/s, and two seconds cover that distance less the acceleration."""
         self.world.drive("dog1", 5.0, 0.0, 0.0)
         run(self.world, 2.0)
         self.assertAlmostEqual(self.dog.motion.vx, 0.160, 6)
@@ -40,7 +40,7 @@ class WorldTests(SynchronousTestCase):
         self.assertAlmostEqual(self.dog.y, 1.0, 6)
 
     def test_moves_in_its_own_frame(self) -> None:
-        """Strafing left of a dog that looks up goes to smaller x, and positive turns are counter-clockwise."""
+        """Velocities are relative to the dog: left of a dog that faces up is smaller x; turns are counter-clockwise."""
         self.world.move_dog("dog1", 1.4, 1.0, math.pi / 2)
         self.world.drive("dog1", 0.0, 0.1, 0.0)
         run(self.world, 1.0)
@@ -50,7 +50,7 @@ class WorldTests(SynchronousTestCase):
         self.assertGreater(self.dog.heading, math.pi / 2 + 0.4)
 
     def test_needs_time_to_start_and_to_stop(self) -> None:
-        """Speed neither jumps up nor down, and a dog at full speed stands within a tenth of a second."""
+        """Speed changes gradually, and a dog at full speed stops within a tenth of a second."""
         self.world.drive("dog1", 0.16, 0.0, 0.0)
         run(self.world, 0.05)
         self.assertTrue(0.01 < self.dog.motion.vx < 0.08)
@@ -62,7 +62,7 @@ class WorldTests(SynchronousTestCase):
         self.assertFalse(self.dog.is_moving)
 
     def test_stays_between_the_walls(self) -> None:
-        """Walking against walls and into corners for a minute never brings a dog more than 3 mm into them."""
+        """A minute of walking against walls and into corners never moves a dog more than 3 mm into them."""
         for name, turn in (("dog1", 0.0), ("dog2", 0.3), ("dog3", -0.2)):
             self.world.drive(name, 0.16, 0.05, turn)
         for _ in range(round(60 / SUBSTEP)):
@@ -73,7 +73,7 @@ class WorldTests(SynchronousTestCase):
         self.assertGreater(self.world.collisions, 0)
 
     def test_pushes_another_dog_but_not_the_target(self) -> None:
-        """A dog walks another one along without overlapping; the target stands fast."""
+        """A dog pushes another dog without overlap, but cannot push the target."""
         self.world.move_dog("dog2", 1.8, 1.0, 0.0)
         self.world.drive("dog1", 0.16, 0.0, 0.0)
         run(self.world, 4.0)
@@ -89,7 +89,7 @@ class WorldTests(SynchronousTestCase):
         self.assertEqual((self.world.target.x, self.world.target.y), (1.8, 1.0))
 
     def test_measures_ahead(self) -> None:
-        """The way ahead ends at a wall, a dog or the target, never at the dog itself, and is None beyond the reach."""
+        """The distance ahead ends at a wall, a dog or the target, never at the dog itself; out of range it is None."""
         self.assertIsNone(self.world.distance_ahead(self.dog, 0.1, 1.0))
         self.assertAlmostEqual(self.world.distance_ahead(self.dog, 0.1, 3.0) or 0.0, 1.5, 6)
         self.world.place_target(2.0, 1.0)
@@ -101,7 +101,7 @@ class WorldTests(SynchronousTestCase):
         self.assertIsNone(self.world.distance_ahead(self.dog, 0.1, 1.0))
 
     def test_places_the_target_later(self) -> None:
-        """A target that was asked for later comes then, and not where one was placed or taken away meanwhile."""
+        """A delayed target appears after its delay, unless a target was placed or removed in the meantime."""
         self.world.place_target_later(1.0)
         run(self.world, 0.9)
         self.assertIsNone(self.world.target)
@@ -117,7 +117,7 @@ class WorldTests(SynchronousTestCase):
             self.assertRaises(NotPossible, self.world.place_target_later, seconds)
 
     def test_places_the_target_clear_of_everything(self) -> None:
-        """Scattered alike for one seed, the dogs leave the random target its distances: one is clearly the nearest."""
+        """For each seed the dogs have distinct distances to a random target, so one is clearly the nearest."""
         for seed in range(60):
             world, same = make_world(seed), make_world()
             for each in (world, same):
@@ -132,7 +132,7 @@ class WorldTests(SynchronousTestCase):
             self.assertGreaterEqual(min(far[1] - far[0], far[2] - far[1]), 0.25 - 1e-9, seed)
 
     def test_refuses_impossible_orders(self) -> None:
-        """Places in walls, dogs or the target, and unknown dogs are refused in words; nothing moves."""
+        """Places in walls, dogs or the target, and unknown dogs are rejected; nothing moves."""
         self.world.place_target(2.0, 2.0)
         before = self.world.snapshot()
         for order in (

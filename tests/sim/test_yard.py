@@ -1,4 +1,4 @@
-"""Tests of ``sim.robots.yard`` and ``sim.robots.reception`` by the bytes that clients exchange with it."""
+"""Tests of ``sim.robots.yard`` and ``sim.robots.reception`` on the level of messages."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from sim.robots.yard import Yard
 
 
 class Client:
-    """A bare client: the yard's link and what came over it."""
+    """A client with a link to the simulator that stores the received messages."""
 
     def __init__(self, yard: Yard) -> None:
         self.is_busy = False
@@ -44,31 +44,31 @@ class Client:
         self.session = yard.attach(self)
 
     def send(self, data: bytes) -> None:
-        """Hear what the yard sends."""
+        """Receive data from the simulator."""
         self.heard += self._reader.read(data)
 
     def close(self) -> None:
-        """Learn that the yard hangs up."""
+        """Close the link from the side of the simulator."""
         if self.is_open:
             self.is_open = False
             if self.session is not None:
                 self.session.link_down()
 
     def say(self, *messages: Message) -> None:
-        """Tell the yard."""
+        """Send messages to the simulator."""
         assert self.session is not None
         self.session.received(b"".join(encoded(message) for message in messages))
 
     def of(self, kind: type[Message]) -> list[Message]:
-        """What was heard of one kind."""
+        """Return the received messages of one kind."""
         return [message for message in self.heard if isinstance(message, kind)]
 
 
 class YardTests(SynchronousTestCase):
-    """The yard as its clients meet it."""
+    """The simulator serves its clients."""
 
     def setUp(self) -> None:
-        """A yard on a turned clock, with dog1 driven."""
+        """Start a simulator in virtual time, with a driver for dog1."""
         self.clock = Clock()
         self.yard = Yard(self.clock, Random(1), loaded("three-dogs"))
         self.yard.start()
@@ -76,7 +76,7 @@ class YardTests(SynchronousTestCase):
         self.client.say(Hello(VERSION, "dog1", 0.0), Motors(True))
 
     def ticks(self, count: int) -> None:
-        """Let whole ticks pass."""
+        """Advance by whole ticks."""
         for _ in range(count):
             self.clock.advance(TICK)
 
@@ -85,11 +85,11 @@ class YardTests(SynchronousTestCase):
         self.client.say(Drive(vx, 0.0, 0.0, token, ttl, self.clock.seconds() if sent is None else sent))
 
     def is_moving(self) -> bool:
-        """Whether dog1 really moves."""
+        """Return whether dog1 moves."""
         return self.yard.world.dogs["dog1"].is_moving
 
     def test_sends_a_sensor_frame_each_32_ms(self) -> None:
-        """After ten seconds 312 frames have come, their stamps 32 ms apart without drift."""
+        """After ten seconds 312 frames have arrived, with timestamps 32 ms apart and without drift."""
         for _ in range(1000):
             self.clock.advance(0.01)
             self.client.say(Alive())
@@ -98,7 +98,7 @@ class YardTests(SynchronousTestCase):
         self.assertAlmostEqual(stamps[-1], 312 * TICK, 9)
 
     def test_catches_up_on_physics_but_not_on_pictures(self) -> None:
-        """A yard that was held up for half a second makes up for the sensor frames, and draws once."""
+        """After a delay of half a second all missed sensor frames are sent, but only one picture."""
         self.client.say(Hello(VERSION, "dog1", 30.0))
         self.ticks(2)
         before = len(self.client.of(Picture))
@@ -107,7 +107,7 @@ class YardTests(SynchronousTestCase):
         self.assertEqual(len(self.client.of(Picture)), before + 1)
 
     def test_draws_only_for_those_who_asked(self) -> None:
-        """Without a wish there are no pictures; a wish of ten a second gives ten a second, of 99 thirty."""
+        """A client gets no pictures by default, ten a second if it requests ten, and at most thirty."""
         self.ticks(31)
         self.assertEqual(self.client.of(Picture), [])
         for wish, count in ((10.0, 10), (99.0, 30)):
@@ -117,7 +117,7 @@ class YardTests(SynchronousTestCase):
             self.assertIn(len(self.client.of(Picture)) - before, (count - 1, count, count + 1))
 
     def test_stops_at_the_end_of_the_time_to_live(self) -> None:
-        """A command runs out by itself; a late one is shorter, or none; a stamp ahead of the yard gains nothing."""
+        """A command ends after its TTL, counted from its timestamp; a timestamp in the future does not extend it."""
         self.ticks(40)
         self.drive(ttl=0.3)
         self.ticks(8)
@@ -138,7 +138,7 @@ class YardTests(SynchronousTestCase):
         self.assertFalse(self.is_moving())
 
     def test_halts_at_once(self) -> None:
-        """A halt needs no token, and motors off mean no motion."""
+        """A halt needs no token, and a dog with disabled motors does not move."""
         for stop in (Halt(), Motors(False)):
             self.drive(ttl=5.0)
             self.ticks(5)
@@ -151,7 +151,7 @@ class YardTests(SynchronousTestCase):
         self.assertFalse(self.is_moving())
 
     def test_stops_the_dog_of_a_lost_driver(self) -> None:
-        """When the connection closes, the dog stops and is free for another driver, who learns its token."""
+        """If the connection closes, the dog stops and is free for another driver, which receives the last token."""
         self.drive(token=9, ttl=5.0)
         self.ticks(5)
         self.client.close()
@@ -169,7 +169,7 @@ class YardTests(SynchronousTestCase):
         self.assertTrue(self.is_moving())
 
     def test_forgets_a_suspension(self) -> None:
-        """A yard that wakes goes on from where it was, and what was ordered before is over."""
+        """After a suspension the simulation continues from its last state, and earlier commands have expired."""
         self.drive(ttl=5.0)
         self.ticks(5)
         self.clock.advance(60.0)
@@ -178,7 +178,7 @@ class YardTests(SynchronousTestCase):
         self.assertLess(self.yard.world.t, 2.0)
 
     def test_tells_what_the_gates_did(self) -> None:
-        """An older token and a late command change nothing; the truth counts what each gate obeyed and refused."""
+        """Lower tokens and expired commands have no effect; each gate counts accepted and rejected commands."""
         self.drive(token=7)
         self.drive(token=7)
         self.drive(token=6, vx=-0.1)
@@ -190,7 +190,7 @@ class YardTests(SynchronousTestCase):
         self.assertEqual(told, [("dog1", 7, 2, 2), ("dog2", 0, 0, 0), ("dog3", 0, 0, 0)])
 
     def test_gives_up_a_silent_client(self) -> None:
-        """A frozen driver is hung up on after some seconds, and so is a stranger who never says hello."""
+        """A driver that falls silent and a client that never sends hello are disconnected after ``SILENT_S``."""
         stranger = Client(self.yard)
         lively = Client(self.yard)
         for _ in range(round(SILENT_S / TICK) + 3):
@@ -200,7 +200,7 @@ class YardTests(SynchronousTestCase):
         self.assertEqual(self.yard.holders, [])
 
     def test_refuses_drivers(self) -> None:
-        """A robot that is taken is refused for now; an unknown one, another version or a second robot for good."""
+        """A taken robot is refused temporarily; an unknown robot, another version or a second robot permanently."""
         cases = [("dog1", VERSION, False), ("cat", VERSION, True), ("dog2", VERSION + 1, True)]
         for robot, version, is_lasting in cases:
             client = Client(self.yard)
@@ -214,7 +214,7 @@ class YardTests(SynchronousTestCase):
         self.assertEqual(self.yard.holders, [])
 
     def test_drops_for_a_client_that_does_not_read(self) -> None:
-        """A busy link gets nothing until it is free again: the newest matters, not the oldest."""
+        """A busy client gets nothing until it is free again, and then the newest frame, not the oldest."""
         self.client.is_busy = True
         self.ticks(10)
         self.assertEqual(self.client.heard, [])
@@ -226,7 +226,7 @@ class YardTests(SynchronousTestCase):
         self.assertEqual({len(row) for row in newest.samples.values()}, {4})
 
     def test_lives_on_after_rubbish(self) -> None:
-        """Rubbish, orders of those who are no operator and commands of those who hold no dog change nothing."""
+        """Invalid bytes, orders without operator rights and commands without a dog have no effect."""
         before = self.yard.world.snapshot()
         stranger = Client(self.yard)
         assert stranger.session is not None
@@ -235,7 +235,7 @@ class YardTests(SynchronousTestCase):
         self.assertEqual((stranger.heard, self.yard.world.snapshot()), ([], before))
 
     def test_shows_the_operator_everything(self) -> None:
-        """An operator gets the truth at the rate asked for, and an answer to every order, lawful or not."""
+        """An operator receives the truth at the requested rate, and an answer to every order, valid or not."""
         operator = Client(self.yard)
         operator.say(Overlook(VERSION, 5.0))
         self.ticks(31)
@@ -252,7 +252,7 @@ class YardTests(SynchronousTestCase):
         self.assertIsNotNone(self.yard.world.target)
 
     def test_turns_away_the_crowd(self) -> None:
-        """The sixty-fifth connection is refused; a stopped yard hangs up on everybody and has no timer left."""
+        """The sixty-fifth connection is rejected; ``stop`` closes all connections and leaves no timer."""
         crowd = [Client(self.yard) for _ in range(65)]
         self.assertEqual(sum(not client.is_open for client in crowd), 2)
         self.assertTrue(self.client.is_open)
@@ -262,10 +262,10 @@ class YardTests(SynchronousTestCase):
 
 
 class BeatTests(SynchronousTestCase):
-    """The rhythm of pictures."""
+    """``Beat`` schedules pictures."""
 
     def test_keeps_its_rate_on_average(self) -> None:
-        """Any rate up to the tick rate is kept; after a pause one beat is due, not all the missed ones."""
+        """Any rate up to the tick rate is kept; after a pause one picture is due, not all the missed ones."""
         for rate in (0.0, 1.0, 10.0, 15.0, 29.97, 30.0, 31.25):
             beat = Beat(rate)
             count = sum(beat.is_due(tick * TICK) for tick in range(1, 3126))

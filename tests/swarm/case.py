@@ -1,4 +1,4 @@
-"""What the tests of whole teams in memory share."""
+"""Shared test case for whole teams in memory."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ class TeamCase(SynchronousTestCase):
         loss: float = 0.0,
         others: tuple[str, ...] = (),
     ) -> VirtualTeam:
-        """A team that ends with the test."""
+        """Start a team that stops with the test."""
         team = VirtualTeam(seed, weather=replace(LAN, loss=loss), dogs=dogs, others=others)
         self.addCleanup(team.stop)
         return team
 
     def until(self, team: VirtualTeam, is_so: Callable[[], bool], limit: float = 90.0) -> float:
-        """Let the team live until something is so; the seconds that took, a failure after ``limit``."""
+        """Run the team until a condition holds; return the seconds, or fail after ``limit``."""
         began = team.clock.seconds()
         while not is_so():
             if team.clock.seconds() - began > limit:
@@ -45,53 +45,53 @@ class TeamCase(SynchronousTestCase):
         return team.clock.seconds() - began
 
     def look(self, team: VirtualTeam) -> None:
-        """Called after each step of ``until``."""
+        """Hook that ``until`` calls after each step."""
 
     def task(self, team: VirtualTeam) -> dict[str, Any]:
-        """The newest task as the page shows it."""
+        """Return the newest task as the page shows it."""
         tasks = team.state()["tasks"]
         return dict(tasks[0]) if tasks else {"status": "absent"}
 
     def device(self, team: VirtualTeam, name: str) -> dict[str, Any]:
-        """A device as the page shows it."""
+        """Return a device as the page shows it."""
         return next((dict(row) for row in team.state()["devices"] if row["name"] == name), {"status": "absent"})
 
     def statuses(self, team: VirtualTeam) -> dict[str, str]:
-        """The status of each device."""
+        """Return the status of each device."""
         return {row["name"]: row["status"] for row in team.state()["devices"]}
 
     def lines(self, team: VirtualTeam, name: str) -> list[str]:
-        """The messages of a device."""
+        """Return the messages of a device."""
         return [text for _, text in self.device(team, name)["messages"]]
 
     def executing(self, team: VirtualTeam) -> list[str]:
-        """Who executes the newest task."""
+        """Return the devices that execute the newest task."""
         groups = team.state()["groups"]
         return [m["name"] for m in groups[0]["members"] if m["status"] == "EXECUTING"] if groups else []
 
     def gap(self, team: VirtualTeam, name: str) -> float:
-        """Metres between the dog's footprint and the target."""
+        """Return the metres between the dog's footprint and the target."""
         dog, target = team.yard.world.dogs[name], team.yard.world.target
         assert target is not None
         return math.hypot(dog.x - target.x, dog.y - target.y) - target.radius - FOOTPRINT
 
     def moving(self, team: VirtualTeam) -> list[str]:
-        """The dogs that move now."""
+        """Return the dogs that move now."""
         return [dog.name for dog in team.yard.world.dogs.values() if dog.is_moving]
 
     def submit(self, team: VirtualTeam, task: Task) -> None:
-        """Let the laptop publish a task."""
+        """Publish a task through the laptop's node."""
         Deferred.fromCoroutine(team.services["vaio"].assembly.node.submit(task))
 
     def members(self, team: VirtualTeam, task_id: str) -> list[Member]:
-        """What is reported on a task."""
+        """Return the reports on a task."""
         return [m for record in team.desk.read(group_key(task_id)) if (m := member_of(record)) is not None]
 
     def verdicts(self, team: VirtualTeam, task_id: str) -> list[Verdict]:
-        """What each device says of its decisions on a task."""
+        """Return the decision records of a task."""
         return [v for record in team.desk.read(verdicts_key(task_id)) if (v := verdict_of(record)) is not None]
 
     def use_facing(self) -> None:
-        """Let the tasks of this test have the behaviour ``facing``."""
+        """Register the behaviour ``facing`` for this test."""
         KINDS["facing"] = "tests.swarm.facing:Facing"
         self.addCleanup(KINDS.pop, "facing")

@@ -1,4 +1,4 @@
-"""Facing: a behaviour for tests of whole teams: to each dog each task costs something else, and each has an opinion."""
+"""A behaviour for tests of whole teams with a different cost and vote for each dog and task."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ NEAR = math.radians(6.0)
 
 
 class Facing:
-    """Turn to the direction ``towards`` (radians by the compass) at ``speed``; it costs the angle, in tenths.
+    """Turn to the direction ``towards`` (radians by the compass) at ``speed``; the cost is the angle, in tenths.
 
     It votes for the half of the world to which the dog looked first, and offers that direction as a number.
     """
@@ -30,33 +30,33 @@ class Facing:
         self._heading = 0.0
 
     def look(self, seen: Observation, now: float) -> None:
-        """Take in the compass."""
+        """Read the compass."""
         self._heading = float(seen.values["compass.heading"])
         self._first = self._heading if self._first is None else self._first
 
     @property
     def cost(self) -> float | None:
-        """The angle to turn, in radians."""
+        """Return the angle to turn, in radians."""
         return None if self._first is None else round(abs(self._way), 1)
 
     @property
     def choice(self) -> str:
-        """The half of the world."""
+        """Return the vote: the half of the world."""
         return "" if self._first is None else "south" if self._first < 0.0 else "north"
 
     @property
     def value(self) -> tuple[float, ...]:
-        """The direction."""
+        """Return the first direction."""
         return () if self._first is None else (round(self._first, 2),)
 
     def search(self, now: float) -> Action:
-        """Stand."""
+        """Stand still."""
         return STAND
 
     hold = search
 
     def execute(self, context: Context) -> Action | None:
-        """Turn the shorter way."""
+        """Turn in the shorter direction."""
         self.contexts.append(context)
         return None if abs(self._way) < NEAR else {**STAND, "base.wz": math.copysign(self._speed, self._way)}
 

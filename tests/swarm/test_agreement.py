@@ -1,4 +1,4 @@
-"""Whole teams in memory whose strategies go by more than a cost: charge, votes and numbers."""
+"""Tests of whole teams in memory with strategies that use battery levels, votes and numbers."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ class AgreementTests(TeamCase):
         self.told: dict[str, Member] = {}
 
     def look(self, team: VirtualTeam) -> None:
-        """Note what each device reports last."""
+        """Record the latest report of each device."""
         self.told.update({member.name: member for member in self.members(team, "t1")})
 
     def run_task(self, strategy: str) -> dict[str, Any]:
-        """Have a task done; how the page shows it at the end."""
+        """Run a task to its end and return it as the page shows it."""
         task = Task("t1", "facing", "Face it", {"compass": {}}, {"towards": 2.0}, strategy, waiting_period=2.0)
         self.submit(self.team, task)
         self.until(self.team, lambda: self.task(self.team)["status"] == "COMPLETED", 12.0)
         return self.task(self.team)
 
     def why(self) -> str:
-        """What ``swarm why`` reads of the records."""
+        """Return the output of ``swarm why`` for the task."""
         return as_text(explained(self.verdicts(self.team, "t1")))
 
     def test_charged_dog_goes(self) -> None:
-        """By ``capability_cost`` the nearest dog stays at rest where its battery is low, and all say why."""
+        """With ``capability_cost`` the nearest dog does not act on a low battery, and the explanations agree."""
         self.team.yard._senses["dog2"]._power = 0.1
         shown = self.run_task("capability_cost")
         self.assertNotEqual(shown["result"]["by"], "dog2")
@@ -45,14 +45,14 @@ class AgreementTests(TeamCase):
         self.assertNotIn("differs", told)
 
     def test_nearest_does_not_mind_the_charge(self) -> None:
-        """By ``nearest`` the same dog goes, and nobody tells what it has left."""
+        """With ``nearest`` the same dog acts, and the explanation does not mention the battery."""
         self.team.yard._senses["dog2"]._power = 0.1
         self.assertEqual(self.run_task("nearest")["result"]["by"], "dog2")
         self.assertNotIn("battery", self.why())
         self.assertEqual({member.battery for member in self.told.values()}, {1.0})
 
     def test_vote_reaches_who_acts(self) -> None:
-        """The option of two of three dogs is agreed on, one of the two acts, knows it, and all say so."""
+        """The option of two of three dogs wins, and one of the two acts on it; the explanations agree."""
         shown = self.run_task("weighted_vote")
         self.assertIn(shown["result"]["by"], ("dog1", "dog2"))
         self.assertEqual({context.choice for context in Facing.contexts}, {"north"})
@@ -62,7 +62,7 @@ class AgreementTests(TeamCase):
         self.assertEqual(shown["why"][0]["agreed"], "north")
 
     def test_mean_reaches_who_acts(self) -> None:
-        """The mean of what the three dogs offer is agreed on in every digit, and whoever acts knows it."""
+        """All dogs agree on the exact mean of their three values, and the assigned agent receives it."""
         self.run_task("average")
         offered = [member.value[0] for member in self.told.values()]
         self.assertEqual((len(offered), len(set(offered))), (3, 3))

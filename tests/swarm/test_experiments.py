@@ -1,4 +1,4 @@
-"""Whole teams in memory: the thesis' experiments, and what may happen to a team on its way."""
+"""Tests of whole teams in memory: the thesis' experiments, tasks, membership and faults."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from tests.swarm.case import LOOK_S, TeamCase
 
 class ExperimentTests(TeamCase):
     def test_nearest_dog_reaches_the_target(self) -> None:
-        """Experiment 1: all find the target, all name the same dog, it is the nearest, and it gets there."""
+        """Experiment 1: all dogs find the target and agree on the nearest dog, which reaches the target."""
         for seed in (2, 3):
             outcome = trial(VirtualTeam, 1, seed)
             self.assertEqual(outcome.broken, [], seed)
             self.assertTrue(outcome.held and outcome.found and outcome.agreed and outcome.right, seed)
 
     def test_another_dog_takes_over_within_two_seconds(self) -> None:
-        """Experiment 2: the dog on its way is lost without a word, and another moves within 2 s and gets there.
+        """Experiment 2: the acting dog is killed, and another dog moves within 2 s and reaches the target.
 
-        A lease lives on for at least a second after its holder: a takeover faster than that would mean that the dead
-        dog's lease was given back, or not minded.
+        The lease of a killed dog remains valid for at least a second, so a faster takeover would mean that the lease
+        was released or ignored.
         """
         for seed in (1, 2):
             outcome = trial(VirtualTeam, 2, seed)
@@ -38,7 +38,7 @@ class ExperimentTests(TeamCase):
 
 class TaskTests(TeamCase):
     def test_task_that_nobody_can_do_stays_open_and_says_why(self) -> None:
-        """A task with a requirement that no device meets stays open, and its note says what each device lacks."""
+        """A task with a requirement that no device meets stays open, and its note lists the missing capabilities."""
         team = self.start_team()
         answer = team.desk.assign("fetch-the-ball")
         team.clock.advance(5.0)
@@ -49,7 +49,7 @@ class TaskTests(TeamCase):
         self.assertEqual(set(self.statuses(team).values()), {"IDLE"})
 
     def test_device_is_done_or_idle_until_its_next_task(self) -> None:
-        """After the end the dog that did it shows DONE, the others IDLE, and all take up the next task."""
+        """After a task its dog is DONE and the others are IDLE until all of them take part in the next task."""
         team = self.start_team()
         team.desk.assign("turn-around")
         shown: list[dict[str, str]] = []
@@ -73,7 +73,7 @@ class TaskTests(TeamCase):
         self.until(team, lambda: self.task(team)["status"] == "COMPLETED")
 
     def test_tasks_are_done_one_after_the_other(self) -> None:
-        """A task that comes while a dog is busy waits, and is done after."""
+        """A task that arrives while a dog is busy is done afterwards."""
         team = self.start_team()
         team.desk.assign("turn-around")
         team.clock.advance(0.2)
@@ -81,7 +81,7 @@ class TaskTests(TeamCase):
         self.until(team, lambda: [t["status"] for t in team.state()["tasks"]] == ["COMPLETED", "COMPLETED"])
 
     def test_urgent_task_has_the_bodies_first(self) -> None:
-        """A task of a higher priority puts a preemptible one aside, which is resumed and done after."""
+        """A task of higher priority preempts a preemptible task, which is resumed and completed afterwards."""
         team = self.start_team()
         turn = Task("slow", "turn-around", "Slow", parameters={"turns": 3.0}, waiting_period=1.0, preemptible=True)
         self.submit(team, turn)
@@ -102,7 +102,7 @@ class TaskTests(TeamCase):
         self.until(team, lambda: is_done("slow"))
 
     def test_paused_task_rests_until_it_is_resumed(self) -> None:
-        """Paused, no dog moves and the page says who paused it; resumed, it is completed."""
+        """While a task is paused no dog moves and the page names the operator; after the resume it completes."""
         team = self.start_team()
         team.run_demo()
         self.until(team, lambda: bool(self.executing(team)))
@@ -119,7 +119,7 @@ class TaskTests(TeamCase):
         self.until(team, lambda: self.task(team)["status"] == "COMPLETED")
 
     def test_deadline_fails_the_task_and_says_so(self) -> None:
-        """A task that nobody finishes in time fails once, for all, with the reason on the page."""
+        """A task that misses its deadline fails once, for all devices, and the page shows the reason."""
         team = self.start_team()
         task = Task("late", "find-target", "Late", created=team.clock.seconds(), deadline=4.0)
         self.submit(team, task)
@@ -129,7 +129,7 @@ class TaskTests(TeamCase):
         self.assertEqual(set(self.statuses(team).values()) - {"DONE"}, {"IDLE"})
 
     def test_cancel_stops_the_robot(self) -> None:
-        """A cancelled task ends for everybody within half a second: no dog moves, no dog has a task."""
+        """A cancelled task ends on all devices within half a second: no dog moves, and all are IDLE."""
         team = self.start_team()
         team.run_demo()
         self.until(team, lambda: bool(self.executing(team)))
@@ -142,7 +142,7 @@ class TaskTests(TeamCase):
         self.assertEqual(set(self.statuses(team).values()), {"IDLE"})
 
     def test_moved_target_is_reached(self) -> None:
-        """The target is moved away while a dog walks to it: a dog still gets there, and no dog only believes so."""
+        """If the target moves while a dog walks to it, a dog still reaches it before the task is completed."""
         team = self.start_team()
         team.run_demo()
         self.until(team, lambda: bool(self.executing(team)))
@@ -160,7 +160,7 @@ class TaskTests(TeamCase):
 
 class MembershipTests(TeamCase):
     def test_task_assigned_to_one_dog_draws_in_those_that_come(self) -> None:
-        """A task that one dog began is joined by two that come later; all report, and all name the same dog."""
+        """Two dogs that join later take part in a running task; all three report and agree on the same dog."""
         team = self.start_team(dogs=("dog1",))
         team.run_demo()
         team.clock.advance(1.0)
@@ -179,7 +179,7 @@ class MembershipTests(TeamCase):
         self.until(team, lambda: self.task(team)["status"] == "COMPLETED")
 
     def test_others_spread_when_one_leaves(self) -> None:
-        """When the dog on its way is lost, the one that stands by moves around the target, as far from it as before."""
+        """After a loss the waiting dog moves around the target, away from the acting dog and without a collision."""
         team = self.start_team(1)
         team.scatter(3)
         team.run_demo()
@@ -210,7 +210,7 @@ class MembershipTests(TeamCase):
         self.assertNotEqual(self.task(team)["result"]["by"], first)
 
     def test_newcomer_takes_over_only_if_it_is_clearly_better(self) -> None:
-        """A dog that joins mid-task is drawn in, and takes over where it stands far nearer to the target."""
+        """A dog that joins during a task takes over only if it is much nearer to the target."""
         for place, takes_over in (((1.5, 0.75), True), ((2.8, 2.2), False)):
             team = self.start_team(6, dogs=("dog1",))
             world = team.yard.world
@@ -225,7 +225,7 @@ class MembershipTests(TeamCase):
             self.assertEqual(self.task(team)["result"]["by"], "dog3" if takes_over else "dog1")
 
     def test_dog_alone_finishes(self) -> None:
-        """One dog that is all there is does the task by itself."""
+        """A single dog completes the task alone."""
         team = self.start_team(dogs=("dog2",))
         team.run_demo()
         self.until(team, lambda: self.task(team)["status"] == "COMPLETED")
@@ -233,7 +233,7 @@ class MembershipTests(TeamCase):
         self.assertLessEqual(self.gap(team, "dog2"), TOUCH_M)
 
     def test_winner_that_died_is_still_named(self) -> None:
-        """While the others still name the dog that died, the page shows its name and not its number."""
+        """While the decision still names a dead dog, the page shows the dog's name instead of its id."""
         team = self.start_team()
         team.run_demo()
         self.until(team, lambda: bool(self.executing(team)))
@@ -247,7 +247,7 @@ class MembershipTests(TeamCase):
         self.assertTrue(shown <= set(team.DOGS), shown)
 
     def test_killed_dog_says_nothing_more(self) -> None:
-        """A killed node sends no datagram at all, not even that it gives its lease back, and its robot stops."""
+        """A killed node sends no further datagram, not even the release of its lease, and its robot stops."""
         team = self.start_team()
         team.run_demo()
         self.until(team, lambda: bool(self.executing(team)))
@@ -261,7 +261,7 @@ class MembershipTests(TeamCase):
         self.assertFalse(team.yard.world.dogs[first].is_moving)
 
     def test_disconnected_dog_comes_back(self) -> None:
-        """A dog told to leave for 5 s is gone for the others, returns as the same device, and another does its task."""
+        """A dog that leaves for 5 s is GONE, returns as the same device, and another dog does its task."""
         team = self.start_team()
         team.run_demo()
         self.until(team, lambda: bool(self.executing(team)))
@@ -277,7 +277,7 @@ class MembershipTests(TeamCase):
         self.until(team, lambda: self.task(team)["status"] == "COMPLETED")
 
     def test_at_no_time_do_two_dogs_walk_to_the_target(self) -> None:
-        """Through loss of a dog and its return at most one dog holds a lease at any look."""
+        """During the loss and return of a dog at most one dog holds a lease at any time."""
         team = self.start_team(4)
         team.run_demo()
         killed = ""
@@ -298,7 +298,7 @@ class MembershipTests(TeamCase):
 
 class WeatherTests(TeamCase):
     def test_loss_of_a_fifth_still_completes(self) -> None:
-        """With 20 % of all datagrams lost the team still finds the target and one dog gets there."""
+        """With 20 % packet loss the team finds the target, and one dog reaches it."""
         team = self.start_team(2, loss=0.2)
         team.run_demo()
         self.until(team, lambda: self.task(team)["status"] == "COMPLETED")
@@ -306,7 +306,7 @@ class WeatherTests(TeamCase):
         self.assertLessEqual(self.gap(team, self.task(team)["result"]["by"]), TOUCH_M)
 
     def test_garbage_on_a_robots_link_costs_frames_only(self) -> None:
-        """Bytes that are no frames on the way from a robot are counted and skipped, and the task is done as ever."""
+        """Invalid bytes on the link from a robot are counted and skipped, and the task is completed."""
         team = self.start_team()
         driver = team.services["dog1"].assembly.driver
         assert driver is not None
@@ -323,7 +323,7 @@ class WeatherTests(TeamCase):
         self.until(team, lambda: self.task(team)["status"] == "COMPLETED")
 
     def test_broken_link_of_the_dog_on_its_way_moves_another(self) -> None:
-        """A robot that its living node cannot reach any more loses the task to another dog."""
+        """If a node loses the link to its robot, another dog takes over the task."""
         team = self.start_team()
         team.run_demo()
         self.until(team, lambda: bool(self.executing(team)))

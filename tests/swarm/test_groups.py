@@ -1,4 +1,4 @@
-"""Whole teams in memory with several tasks that are divided together."""
+"""Tests of whole teams in memory with several tasks in one group."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class GroupTests(TeamCase):
         self.agreed = False
 
     def busy_team(self, dogs: tuple[str, ...] = DOGS, strategy: str = "group_optimal") -> VirtualTeam:
-        """A team that has just been given the tasks, one after the other."""
+        """Start a team and submit the tasks, one after the other."""
         team = self.start_team(5, dogs)
         team.clock.advance(0.5)
         for name, towards in TASKS.items():
@@ -37,7 +37,7 @@ class GroupTests(TeamCase):
         return team
 
     def look(self, team: VirtualTeam) -> None:
-        """Note the first costs, who began what, and who acts on two at a time."""
+        """Record the first costs, the dogs that start each task, and dogs that act on two tasks at a time."""
         acting: dict[str, list[str]] = {}
         for name in TASKS:
             for member in self.members(team, name):
@@ -52,21 +52,21 @@ class GroupTests(TeamCase):
         self.twice += [pair for pair in acting.items() if len(pair[1]) > 1]
 
     def are_done(self, team: VirtualTeam) -> bool:
-        """Whether all tasks are completed."""
+        """Return whether all tasks are completed."""
         return [task["status"] for task in team.state()["tasks"]] == ["COMPLETED"] * len(TASKS)
 
     def by(self, team: VirtualTeam) -> dict[str, str]:
-        """Who did each task that is done."""
+        """Return the dog that did each completed task."""
         return {task["id"]: task["result"]["by"] for task in team.state()["tasks"] if task["result"] is not None}
 
     def ruling(self, team: VirtualTeam, name: str) -> Ruling:
-        """What all say together of the newest decision on a task."""
+        """Return the explanation of the newest decision on a task."""
         return explained(self.verdicts(team, name)).epochs[0]
 
     def test_each_dog_does_one(self) -> None:
-        """Three dogs do three tasks at once, one each; of what they reported no assignment costs less; all agree.
+        """Three dogs do three tasks at once, one each, with the lowest total cost; all agree.
 
-        They agree on the reports on all three tasks: there is one digest.
+        All reports on the three tasks have the same digest.
         """
         team = self.busy_team()
         self.until(team, lambda: len(self.began) == len(TASKS))
@@ -85,7 +85,7 @@ class GroupTests(TeamCase):
         self.assertAlmostEqual(sum(self.costs[name][dog] for name, dog in by.items()), best)
 
     def test_nearest_one_by_one_costs_more(self) -> None:
-        """The same tasks under ``nearest`` are divided as well, one by one, and cost more: so the strategy is asked."""
+        """With ``nearest`` the same tasks are assigned one by one, at a higher total cost."""
         team = self.busy_team(strategy="nearest")
         self.until(team, lambda: self.are_done(team), 60.0)
         best = min(sum(self.costs[t][d] for t, d in zip(TASKS, order, strict=True)) for order in permutations(DOGS))
@@ -93,7 +93,7 @@ class GroupTests(TeamCase):
         self.assertEqual(self.twice, [])
 
     def test_task_of_a_dead_dog_is_done_by_another(self) -> None:
-        """A dog that dies at its task leaves it to one of the others, as soon as one of them is free; theirs go on."""
+        """The task of a dead dog goes to the next free dog; the other tasks continue."""
         team = self.busy_team()
         self.until(team, lambda: len(self.began) == len(TASKS))
         lost = max(TASKS, key=lambda name: self.costs[name][self.began[name][0]])
@@ -109,7 +109,7 @@ class GroupTests(TeamCase):
         self.assertEqual(self.twice, [])
 
     def test_operator_gives_a_group(self) -> None:
-        """Predefined tasks that are assigned to a group are done at once, one by each dog; the page names the group."""
+        """Predefined tasks in one group are done at once, one by each dog, and the page shows the group."""
         team = self.start_team(5)
         for _ in DOGS:
             team.desk.assign("turn-around", group="yard")
@@ -121,7 +121,7 @@ class GroupTests(TeamCase):
         self.assertLess(max(began) - min(began), 3.0)
 
     def test_newcomer_takes_what_is_left(self) -> None:
-        """Two dogs leave the third task alone while they are busy; a dog that joins takes it."""
+        """Two busy dogs leave the third task open, and a dog that joins takes it."""
         team = self.busy_team(("dog1", "dog2"))
         self.until(team, lambda: len(self.began) == 2)
         (left,) = set(TASKS) - set(self.began)

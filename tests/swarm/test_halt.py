@@ -1,4 +1,4 @@
-"""A whole team in memory is stopped in the middle of its work, and goes on from there."""
+"""Tests of the emergency stop of a whole team in memory, and of its release."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ class HaltTests(TeamCase):
         self.halts = TeamHalts(self.team.client)
 
     def node(self, name: str) -> Any:
-        """The node of a device."""
+        """Return the node of a device."""
         return self.team.services[name].assembly.node
 
     def moved_in(self, seconds: float) -> set[str]:
-        """The dogs that move in the next seconds."""
+        """Return the dogs that move in the next seconds."""
         moved: set[str] = set()
         for _ in range(round(seconds / 0.05)):
             self.team.clock.advance(0.05)
@@ -32,21 +32,21 @@ class HaltTests(TeamCase):
         return moved
 
     def told(self, asked: Deferred[dict[str, str]]) -> dict[str, str]:
-        """What each device says, by name."""
+        """Return the answer of each device by name."""
         return {name: said for uuid, said in self.successResultOf(asked).items() if (name := self.name_of(uuid))}
 
     def name_of(self, uuid: str) -> str:
-        """The name of a node."""
+        """Return the name of a node."""
         return next(name for name, service in self.team.services.items() if service.assembly.node.uuid == uuid)
 
     def until_executing(self) -> str:
-        """Run the demonstration until one acts; its name."""
+        """Run the demonstration until a dog acts, and return its name."""
         self.team.run_demo()
         self.until(self.team, lambda: bool(self.executing(self.team) and self.moving(self.team)))
         return self.executing(self.team)[0]
 
     def test_all_stand_at_once_and_go_on(self) -> None:
-        """Pressed while one acts, all dogs stand in 0.2 s and none moves for 10 s; released, the same one goes on."""
+        """After a stop all dogs stand within 0.2 s and for 10 s; after the release the same dog continues."""
         acting = self.until_executing()
         token = self.team.services[acting].assembly.agent.engagement.lessee.token  # type: ignore[union-attr]
         asked = self.halts.halt("ann")
@@ -67,7 +67,7 @@ class HaltTests(TeamCase):
         self.assertEqual((state["tasks"][0]["status"], state["tasks"][0]["result"]["by"]), ("COMPLETED", acting))
 
     def test_nobody_takes_over(self) -> None:
-        """The dog that acted dies while all stand: no other moves until the team is released, and then one does."""
+        """If the acting dog dies during a stop, no dog moves before the release; then another takes over."""
         acting = self.until_executing()
         self.halts.halt("ann")
         self.team.clock.advance(1.0)
@@ -77,7 +77,7 @@ class HaltTests(TeamCase):
         self.assertTrue(self.moved_in(5.0) - {acting})
 
     def test_who_comes_later_stands(self) -> None:
-        """A dog that joins a halted team, and finds a task there, does not move until the team is released."""
+        """A dog that joins a stopped team with an open task does not move before the release."""
         team = self.start_team(6, ("dog1", "dog2"))
         halts = TeamHalts(team.client)
         halts.halt("ann")
@@ -95,7 +95,7 @@ class HaltTests(TeamCase):
         self.assertTrue(self.moving(team))
 
     def test_who_cannot_be_told_reads_it(self) -> None:
-        """A dog that is out of reach is told of as such, and stands as soon as it hears the others again."""
+        """An unreachable dog is reported as unreachable, and stops as soon as it hears the others again."""
         self.team.run_demo()
         self.team.clock.advance(1.0)
         self.team.silence("dog2")
@@ -108,7 +108,7 @@ class HaltTests(TeamCase):
         self.assertEqual(self.moved_in(3.0), set())
 
     def test_a_release_ends_the_stops_that_it_names(self) -> None:
-        """Two operators stop the team, and one lets go on what was shown before the second stop: the team stands."""
+        """A release covers only the stops that it lists: a later stop by another operator remains."""
         self.halts.halt("ann")
         self.team.clock.advance(0.5)
         shown = [stop["id"] for stop in self.team.state()["halt"]["stops"]]
@@ -122,7 +122,7 @@ class HaltTests(TeamCase):
         self.assertFalse(self.team.state()["halted"])
 
     def test_nobody_waits_for_who_is_silent(self) -> None:
-        """Another device that does not answer delays nobody, and the page does not say that the team is stopped."""
+        """A silent device does not delay the stop of the others, and the page does not show the team as stopped."""
         acting = self.until_executing()
         silent = "dog2" if acting == "dog1" else "dog1"
         self.team.silence(silent)
@@ -135,7 +135,7 @@ class HaltTests(TeamCase):
         self.assertEqual((state["halted"], [other["name"] for other in state["halt"]["others"]]), (False, [silent]))
 
     def test_a_release_that_was_not_heard_shows(self) -> None:
-        """A robot that did not hear the release is named as one that still stands, and goes on when it hears it."""
+        """A robot that misses the release is shown as standing, and continues when it receives the release."""
         self.halts.halt("ann")
         self.team.clock.advance(1.0)
         self.assertTrue(self.team.state()["halted"])
@@ -149,7 +149,7 @@ class HaltTests(TeamCase):
         self.assertEqual(self.team.state()["halt"]["stops"], [])
 
     def test_a_record_that_is_no_statement_is_nothing(self) -> None:
-        """What a peer writes there that is no statement halts nobody and breaks nothing."""
+        """A record in the stop's slot that is not a valid statement has no effect."""
         for value in (b"", b"\xc1", b"\x93\x01\x02\x03", b"\x93\xff\xc3\xa1x", b"\x80"):
             self.node("vaio").entangled.put(HALT, SLOT, value, "team")
             self.team.clock.advance(0.5)
@@ -157,7 +157,7 @@ class HaltTests(TeamCase):
         self.assertFalse(self.node("dog1").halt.is_on)
 
     def test_the_device_says_who(self) -> None:
-        """Each device has a line that says who stopped it, and who released it."""
+        """Each device logs the operator that stopped it and the operator that released it."""
         self.halts.halt("ann")
         self.team.clock.advance(0.5)
         self.halts.release("bob")

@@ -1,4 +1,4 @@
-"""Whole teams in memory: the dog that acts is lost, in each of the ways of ``make bench-takeover``."""
+"""Tests of the loss of the acting dog in a whole team in memory, for each cause of ``make bench-takeover``."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from tests.swarm.case import TeamCase
 
 class TakeoverTests(TeamCase):
     def test_each_way_to_be_lost(self) -> None:
-        """Whatever befalls the dog that acts, another completes the task, soon, and no two ever move at once.
+        """After each kind of loss another dog completes the task within 2.5 s, and no two dogs ever move at once.
 
-        A frozen dog does nothing when it goes on; one that the others do not hear stops before another moves; and where
-        the robot of a dog hears its node no more, it stands by itself.
+        A frozen dog does nothing after the thaw; a dog that the others do not hear stops before another dog moves; a
+        robot without a link to its node stops by itself.
         """
         seeds = {Cause.POLITE_LEAVE: (2,), Cause.LOST_LINK: (1, 2, 3)}
         for cause in (each for each in Cause if each is not Cause.TRIPLE_KILL):
@@ -31,9 +31,9 @@ class TakeoverTests(TeamCase):
                 self.assertLess(one.takeover or 99.0, 2.5, one)
 
     def test_dog_and_page_at_once(self) -> None:
-        """The demonstration's dog on its way and the node that serves the page are lost at once: another dog goes on.
+        """If the acting dog and the node that serves the page are lost at the same time, another dog takes over.
 
-        In both of these runs a council of three would have had the two among its members.
+        In both runs a council of three would contain the two lost nodes.
         """
         for seed in (6, 7):
             team = self.start_team(seed, others=("pi",))
@@ -46,7 +46,7 @@ class TakeoverTests(TeamCase):
             self.assertLess(team.clock.seconds() - began, 3.0, seed)
 
     def moving_for_it(self, team: VirtualTeam, besides: str) -> str:
-        """The dog that has a lease and moves, as soon as one other than ``besides`` does."""
+        """Return the first dog other than ``besides`` that holds a lease and moves."""
 
         def going() -> list[str]:
             acting = [
@@ -63,11 +63,11 @@ class TakeoverTests(TeamCase):
 
 class JudgeTests(SynchronousTestCase):
     def judge(self, cause: Cause = Cause.CRASH) -> Judge:
-        """One that watches the loss of dog1 at 100 s, for 25 s, and 1 s after the end."""
+        """Return a judge for the loss of dog1 at 100 s, with a limit of 25 s and 1 s of observation after the end."""
         return Judge(cause, 1, "dog1", 100.0, random.Random(1), 25.0, 1.0)
 
     def test_counts_from_the_loss(self) -> None:
-        """The takeover is when the first other moves; two at once, and the lost one afterwards, are counted apart."""
+        """The takeover ends when another dog moves; two moving dogs and motion of the lost dog count separately."""
         judge = self.judge()
         looks = [["dog1"], [], ["dog2"], ["dog1", "dog2"], ["dog1"], ["dog3"]]
         for number, moving in enumerate(looks, start=1):
@@ -75,7 +75,7 @@ class JudgeTests(SynchronousTestCase):
         self.assertEqual(judge.verdict(), Trial("crash", 1, "dog1", "", False, 3.0, 1, 2))
 
     def test_goes_on_after_the_end(self) -> None:
-        """It is over a second after the end is seen, or when nothing has come for long."""
+        """A trial is over a second after the result, or at the time limit."""
         judge = self.judge()
         self.assertFalse(judge.is_over(124.9))
         self.assertTrue(judge.is_over(125.0))
@@ -86,7 +86,7 @@ class JudgeTests(SynchronousTestCase):
         self.assertEqual(judge.verdict(), Trial("crash", 1, "dog1", "dog2", True, 3.0, 0, 0))
 
     def test_thaws_the_frozen_once(self) -> None:
-        """Only who is frozen goes on, once, and the trial is not over before that."""
+        """Only a frozen dog is thawed, once, and the trial is not over before that."""
         judge = self.judge(Cause.FREEZE)
         self.assertFalse(judge.is_over(999.0))
         self.assertEqual([judge.thaws(now) for now in (102.9, 105.1, 105.2)], [False, True, False])
@@ -96,23 +96,23 @@ class JudgeTests(SynchronousTestCase):
 
 class ReportTests(SynchronousTestCase):
     def trials(self, *seconds: float | None) -> list[Trial]:
-        """Crashes that took so long to be mended."""
+        """Return crash trials with these takeover times."""
         return [Trial("crash", n, "dog1", "dog2", s is not None, s, 0, 0) for n, s in enumerate(seconds)]
 
     def test_table_says_who_held_and_whether_the_target_is_reached(self) -> None:
-        """Counts, percentiles and the verdict of each cause stand in its line."""
+        """The line of each cause has the counts, percentiles and the verdict on the target."""
         line = table(self.trials(1.0, 1.2, 1.4, None)).splitlines()[1].split()
         self.assertEqual(line[:7], ["crash", "4", "3", "1.20", "1.40", "1.40", "1.40"])
         self.assertEqual(line[-1], "yes")
         self.assertTrue(table(self.trials(1.0, 2.1)).endswith("no"))
 
     def test_zombie_is_no_success(self) -> None:
-        """A trial in which the lost one moved after the takeover did not hold."""
+        """A trial fails if the lost dog moves after the takeover or completes the task."""
         self.assertFalse(Trial("freeze", 1, "dog1", "dog2", True, 1.0, 0, 1).held)
         self.assertFalse(Trial("freeze", 1, "dog1", "dog1", True, 1.0, 0, 0).held)
 
     def test_picture_has_a_bar_for_each_tenth(self) -> None:
-        """The highest bar stands where most trials are."""
+        """The histogram has a bar for each tenth of a second, and the largest bin has the highest bar."""
         picture = drawn(self.trials(1.01, 1.02, 1.55))
         self.assertIn('height="60.0"', picture)
         self.assertIn('height="30.0"', picture)

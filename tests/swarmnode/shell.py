@@ -1,4 +1,4 @@
-"""A shell beside a node of a virtual team: the ``swarm`` command asks the real verbs, on a turned clock."""
+"""Runs ``swarm`` verbs against a node of a virtual team in virtual time."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PATIENCE = 5.0
 
 
 def runtime_folder(case: SynchronousTestCase, node: str = "vaio") -> Path:
-    """A folder in which commands find the control socket of ``node``, until the test ends.
+    """Create a folder in which commands find the control socket of ``node``, until the test ends.
 
     Trial's own folders are deeper than the path of a socket may be.
     """
@@ -37,7 +37,7 @@ def runtime_folder(case: SynchronousTestCase, node: str = "vaio") -> Path:
 
 
 class Shell:
-    """What a person types beside ``node`` and reads; each answer may take ``PATIENCE`` seconds of the team's time."""
+    """Runs commands on the machine of ``node``; an answer may take ``PATIENCE`` seconds of the team's time."""
 
     def __init__(self, team: VirtualTeam, node: SwarmNode) -> None:
         self._team = team
@@ -45,7 +45,7 @@ class Shell:
         self.said = ""
 
     def ask(self, path: Path, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
-        """Answer as the control socket does."""
+        """Answer a request like the control socket."""
         answers: list[dict[str, Any]] = []
         work = self._verbs.run(request["verb"], request["with"], lambda event: None)
         work.addCallbacks(
@@ -59,7 +59,7 @@ class Shell:
         yield from answers
 
     def run(self, main: Main, words: Sequence[str]) -> tuple[int, str]:
-        """Exit code and output; what is complained of is in ``said``."""
+        """Run a command; return exit code and output, and store the error output in ``said``."""
         output, complaint = io.StringIO(), io.StringIO()
         with contextlib.redirect_stderr(complaint):
             code = main(list(words), output, self.ask)

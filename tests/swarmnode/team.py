@@ -1,4 +1,4 @@
-"""Nodes as the front door makes them, on one turned clock, for its tests."""
+"""Nodes of the command line in virtual time, for tests."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ KEY = "of tests, and of nobody else"
 
 
 class Page(Service):
-    """A page that only counts."""
+    """A page that records that it exists."""
 
     def __init__(self, pages: list[Page]) -> None:
         pages.append(self)
 
 
 class World:
-    """A board, a clock and nodes on it."""
+    """A switchboard, a clock and the nodes on them."""
 
     def __init__(self) -> None:
         self.clock = HeapClock()
@@ -33,7 +33,7 @@ class World:
         self.pages: list[Page] = []
 
     def seams(self, name: str, port: int, store: MemoryStore | None = None) -> Seams:
-        """The seams of one node."""
+        """Return the environment of one node."""
         return Seams(
             self.clock,
             lambda: self.board.network("127.0.0.1", port),
@@ -43,7 +43,7 @@ class World:
         )
 
     def service(self, name: str, port: int, is_web: bool = False) -> NodeService:
-        """A node that joins through port 7000."""
+        """Return a node that joins through port 7000."""
         known = [] if port == 7000 else ["127.0.0.1:7000"]
         settings = Settings.from_mapping(
             {"node": {"name": name, "port": port, "known_nodes": known, "team_key": KEY}}, "test"
@@ -51,6 +51,6 @@ class World:
         return NodeService(settings, self.seams(name, port), [self.page] if is_web else [])
 
     def page(self, node: SwarmNode) -> Page:
-        """The page of a node, which has to run."""
+        """Return the page of a running node."""
         assert node.running
         return Page(self.pages)

@@ -1,4 +1,4 @@
-"""Tests of the verbs by which a closed team is made, joined and left: at a shell beside a whole virtual team."""
+"""Tests of the verbs that create, join and leave a closed team, at a node of a virtual team."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class AdmissionTests(SynchronousTestCase):
         self.newcomers = 0
 
     def run_verb(self, main: Callable[..., int], *words: str, **more: Any) -> tuple[int, str]:
-        """Exit code and output of a verb; what is complained of is in ``said``."""
+        """Run a verb; return exit code and output, and store the error output in ``said``."""
         out, complaint = io.StringIO(), io.StringIO()
         desk = Desk(out, self.shell.ask, self.team.clock.seconds, self.dice)
         with contextlib.redirect_stderr(complaint):
@@ -58,13 +58,13 @@ class AdmissionTests(SynchronousTestCase):
         return code, out.getvalue()
 
     def done(self, main: Callable[..., int], *words: str, **more: Any) -> Any:
-        """The answer of a verb that succeeds."""
+        """Return the answer of a verb that succeeds."""
         code, output = self.run_verb(main, *words, "--json", **more)
         self.assertEqual(code, 0, self.said)
         return json.loads(output)
 
     def knock(self, code: Code, seed: bytes, wish: str, doors: Sequence[Address], timeout: float) -> Membership:
-        """Knock as the verb does, on the team's clock and wire."""
+        """Send a join request like the verb, in the team's virtual time and network."""
         self.newcomers += 1
         network = self.team.board.network("127.0.0.1", 9000 + self.newcomers)
         work = Newcomer(code, seed, network, self.team.clock, self.dice, wish).join(doors, timeout)
@@ -83,7 +83,7 @@ class AdmissionTests(SynchronousTestCase):
         return [each["name"] for each in self.done(members.main)["members"]]
 
     def test_init_makes_a_team(self) -> None:
-        """``swarm init`` makes a key, a membership and settings that a node starts from; a second time it refuses."""
+        """``swarm init`` creates a key, a membership and valid settings; a second run is rejected."""
         where = self.folder / "made"
         words = ("yard", "--operator", str(self.folder / "yard"), "--folder", str(where), "--at", "127.0.0.1:7000")
         found = self.done(init.main, *words, "--set", "presence_lease=2.5")
@@ -97,7 +97,7 @@ class AdmissionTests(SynchronousTestCase):
         self.assertIn("is there already", self.said)
 
     def test_init_with_options(self) -> None:
-        """Without ``--at`` the first node listens everywhere, ``--page`` opens its page, ``--member`` adds one."""
+        """By default the first node listens on all interfaces; ``--page`` enables its page, ``--member`` adds one."""
         words = ("yard", "--operator", str(self.folder / "yard"), "--folder", str(self.folder), "--first", "vaio")
         for twice in (("--member", "vaio"), ("--member", "dog1", "--member", "dog1=gateway")):
             self.assertEqual(self.run_verb(init.main, *words, *twice)[0], 2)
@@ -113,7 +113,7 @@ class AdmissionTests(SynchronousTestCase):
         self.assertEqual(MembershipFile(Path(node.membership)).membership.member.roles, ("operator", "gateway"))
 
     def test_newcomer_hears_more_than_its_own_machine(self) -> None:
-        """Who joins by a bootstrap node of another machine listens where that one reaches it."""
+        """A node that joins through another machine listens on all interfaces, otherwise on the loopback address."""
         found = self.done(invite.main, "dog9")
 
         def elsewhere(*knock: Any) -> Membership:
@@ -126,7 +126,7 @@ class AdmissionTests(SynchronousTestCase):
         self.assertEqual(Settings.load(near["settings"]).node.host, "127.0.0.1")
 
     def test_invite_and_join(self) -> None:
-        """A code made at the laptop makes a newcomer a member, with files from which its node starts and is seen."""
+        """A code from the laptop admits a new member and creates files with which its node starts."""
         code, output = self.run_verb(invite.main, "dog9")
         self.assertEqual(code, 0, self.said)
         self.assertIn("admits dog9, once, within 24 h", output)
@@ -144,7 +144,7 @@ class AdmissionTests(SynchronousTestCase):
         self.assertEqual(made_node.entangled.identity, kept.membership.identity)
 
     def test_killed_while_joining(self) -> None:
-        """Who was let in and killed before it could keep that says the same again, and the code still counts once."""
+        """A node that is killed after its admission can join again with the same code, which counts once."""
         found = self.done(invite.main, "dog9")
         words = (found["text"], "--folder", str(self.folder / "new"))
 
@@ -163,13 +163,13 @@ class AdmissionTests(SynchronousTestCase):
         self.assertEqual(self.joined(other, "more")["name"], "dog8")
 
     def test_place_of_a_member(self) -> None:
-        """Where a member is stands in words that mean something to people."""
+        """The address of a member is described in words for tunnels, relays and unknown addresses."""
         places = {"10.0.0.7:8484": "10.0.0.7:8484", "": "no known address", "~wss-1fa56333f510:1": "by a tunnel"}
         for address, words in {**places, f"~{'ab' * 20}:1": "by a relay"}.items():
             self.assertEqual(members.place(address), words)
 
     def test_settings_that_were_there(self) -> None:
-        """Settings that lie there already are left as they are, and that is said; the same again is no news."""
+        """Existing settings are kept and reported; new settings are not reported."""
         where = self.folder / "new"
         where.mkdir()
         (where / "swarm.toml").write_text('[node]\nname = "mine"\n')
@@ -182,7 +182,7 @@ class AdmissionTests(SynchronousTestCase):
         self.assertNotIn("was there already", output)
 
     def test_key_of_another_code_is_not_used(self) -> None:
-        """A join that was broken off and one by another code are two newcomers."""
+        """A repeated join with the same code uses the same key, a join with another code another key."""
         seeds: list[bytes] = []
         first, other = (self.done(invite.main, name)["text"] for name in ("dog8", "dog9"))
 
@@ -196,7 +196,7 @@ class AdmissionTests(SynchronousTestCase):
         self.assertEqual((seeds[0], len(set(seeds))), (seeds[1], 2))
 
     def test_bad_codes_are_named(self) -> None:
-        """A mistyped code is refused before anything is sent; a used one by its bootstrap, each with the remedy."""
+        """A mistyped code is rejected before a request is sent, a used code by the bootstrap node, with remedies."""
         found = self.done(invite.main, "dog9")
         wrong = found["code"][:-1] + ("0" if found["code"][-1] != "0" else "1")
         self.assertEqual(self.run_verb(join.main, wrong, "--at", "127.0.0.1:7000", knocking=self.knock)[0], 2)
@@ -210,7 +210,7 @@ class AdmissionTests(SynchronousTestCase):
         self.assertIn("--at HOST:PORT", self.said)
 
     def test_code_alone(self) -> None:
-        """A code without an address is tried on the LAN; a member already is told so before its new code is spent."""
+        """A code without address is tried on the LAN; a member that joins again does not spend its new code."""
         code = self.done(invite.main, "dog8")["code"]
         around = [Address("127.0.0.1", 7077), Address("127.0.0.1", 7000)]
         self.assertEqual(self.joined(code, around=lambda: around)["name"], "dog8")
@@ -223,7 +223,7 @@ class AdmissionTests(SynchronousTestCase):
         self.assertIn("the team already has a member dog1", self.said)
 
     def test_revoke(self) -> None:
-        """A revoked member is one no more, and its code and name can be told from a slip of the pen."""
+        """A revoked member is removed from the list, and an unknown name is rejected with the known names."""
         self.joined(self.done(invite.main, "dog9")["text"])
         self.assertEqual(self.run_verb(revoke.main, "dgo9")[0], 1)
         self.assertIn("members: dog1, dog9, vaio", self.said)
@@ -232,7 +232,7 @@ class AdmissionTests(SynchronousTestCase):
         self.assertEqual([each["name"] for each in self.done(members.main)["revoked"]], ["dog9"])
 
     def test_invitations_are_listed(self) -> None:
-        """Each code that can be used is listed with what is left of it; with ``--all`` the others, with who came."""
+        """Valid invitations are listed with their remaining uses, and with ``--all`` also the others."""
         text = self.done(invite.main, "dog8", "--uses", "2", "--role", "viewer")["text"]
         self.done(invite.main, "dog9")
         name = self.joined(text)["name"]
@@ -249,7 +249,7 @@ class AdmissionTests(SynchronousTestCase):
         self.assertIn("dog8", self.run_verb(invitations.main)[1])
 
     def test_revoke_invitation(self) -> None:
-        """With an invitation go all that came by it, and they are named."""
+        """Revoking an invitation revokes all members that joined with it, and lists them."""
         text = self.done(invite.main, "pupil", "--uses", "3")["text"]
         self.joined(text)
         found = self.done(revoke.main, "pupil")
@@ -257,14 +257,14 @@ class AdmissionTests(SynchronousTestCase):
         self.assertEqual(self.names(), ["dog1", "vaio"])
 
     def test_rotate(self) -> None:
-        """A rotation is for all members, and each has the new secret in its membership afterwards."""
+        """A rotation gives each member the new secret."""
         self.assertEqual(self.done(rotate.main, "--grace", "1h")["members"], ["dog1", "vaio"])
         self.team.clock.advance(2.0)
         numbers = {name: kept.membership.secrets[0][0] for name, kept in self.team._memberships.items()}
         self.assertEqual(numbers, {"vaio": 2, "dog1": 2})
 
     def test_promote(self) -> None:
-        """A promoted member has the role at once, for a whole life; what is not renewed ends as it did."""
+        """A promoted member has the role at once with a new lifetime; a member with a fixed end keeps that end."""
         self.team.clock.advance(100.0)
         ends = {row["name"]: row for row in self.done(members.main)["members"]}
         self.assertEqual(self.done(promote.main, "dog1")["roles"], ["device", "bootstrap"])
@@ -283,7 +283,7 @@ class AdmissionTests(SynchronousTestCase):
         self.assertLess(row["until"], self.team.clock.seconds() + 3600.0)
 
     def test_renew_who_has_expired(self) -> None:
-        """A member whose certificate has ended is shown as expired, and is back in place when it is renewed."""
+        """A member with an expired certificate is listed as expired, and is a member again after a renewal."""
         self.done(renew.main, "dog1", "--for", "60s")
         self.team.clock.advance(70.0)
         shown = self.done(members.main)
@@ -299,7 +299,7 @@ class AdmissionTests(SynchronousTestCase):
         self.assertEqual(self.run_verb(renew.main, "dog1")[0], 1)
 
     def renewer_after(self, *words: str) -> bytes:
-        """Who renewed the laptop, when the bootstrap node that did so was revoked with these words."""
+        """Return the renewer of the laptop's certificate after the bootstrap node that renewed it is revoked."""
         dog, laptop = self.team.services["dog1"].assembly.node.team, self.laptop.team
         assert dog is not None and laptop is not None
         self.done(promote.main, "dog1")
@@ -313,15 +313,15 @@ class AdmissionTests(SynchronousTestCase):
         return laptop.door.me.renewer
 
     def test_revoke_keeps_renewals(self) -> None:
-        """The renewals that it signed for present members go on to count."""
+        """Renewals that a revoked node signed for present members stay valid."""
         self.assertNotEqual(self.renewer_after(), b"")
 
     def test_revoke_with_all_renewals(self) -> None:
-        """With ``--all`` they do not count: the members have again what they had before."""
+        """With ``--all`` the renewals of a revoked node become invalid."""
         self.assertEqual(self.renewer_after("--all"), b"")
 
     def test_keys_of_others(self) -> None:
-        """Another team's key, one that others can read, and none at all are each refused with the remedy."""
+        """A key of another team, a key that others can read, and a missing key are rejected with a remedy."""
         other = self.folder / "other"
         operators.made(other, operators.drawn("other", random.Random(2)))
         self.assertEqual(self.run_verb(invite.main, "dog9", "--operator", str(other))[0], 1)
@@ -334,7 +334,7 @@ class AdmissionTests(SynchronousTestCase):
         self.assertIn("swarm init", self.said)
 
     def test_node_takes_statements_only(self) -> None:
-        """What the control socket is told counts only when this team's operator signed it."""
+        """A statement over the control socket is accepted only with the signature of the team's operator."""
         strange = operators.drawn("other", random.Random(2)).revoke(b"r" * 32, "dog1", self.team.clock.seconds())
         told = {"statement": {"base64": base64.b64encode(strange).decode()}}
         [line] = self.shell.ask(self.folder, {"verb": "team tell", "with": told})
@@ -347,12 +347,12 @@ class TeamSettingsTests(SynchronousTestCase):
         return str(self.assertRaises(BadSetting, assembled, settings, World().seams("a", 7000)))
 
     def test_neither_and_both(self) -> None:
-        """A node of no team is refused and told of swarm init and swarm join; one of two teams is refused, too."""
+        """A node without a team is rejected with a hint to ``swarm join``, and so is a node with two teams."""
         self.assertIn("swarm join CODE", self.refusal())
         self.assertIn("closed or open", self.refusal(team_key=KEY, membership="m"))
 
     def test_membership_opens_the_door(self) -> None:
-        """A membership makes the node's identity and its door; no team key is needed."""
+        """A membership sets the node's identity and certificate; no team key is needed."""
         dice = random.Random(1)
         membership = operators.drawn("yard", dice).founded("a", ("device",), 0, dice)
         seams = World().seams("a", 7000)

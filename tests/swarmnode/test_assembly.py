@@ -1,4 +1,4 @@
-"""Tests of ``swarmnode.assembly``: what settings make of a node."""
+"""Tests of ``swarmnode.assembly``: the node that results from settings."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from tests.swarmnode.team import KEY, World
 
 class AssemblyTests(SynchronousTestCase):
     def settings(self, **tables: Any) -> Settings:
-        """Settings of a node called a."""
+        """Return settings of a node called a."""
         return Settings.from_mapping(
             {"node": {"name": "a", "team_key": KEY, **tables.pop("node", {})}, **tables}, "test"
         )
 
     def test_driver_brings_kind_and_capabilities(self) -> None:
-        """A node with a driver is of the robot's kind and has its capabilities; what the settings say wins."""
+        """A node with a driver takes kind and capabilities from the robot; the settings override them."""
         world = World()
         settings = self.settings(
             node={"capabilities": {"base2d": {"max": 1}, "horn": {}}},
@@ -41,7 +41,7 @@ class AssemblyTests(SynchronousTestCase):
         self.assertIsNotNone(made.agent)
 
     def test_parts_bring_their_capabilities(self) -> None:
-        """A robot with a camera on its back is a device that has both, and whose pictures can be asked for."""
+        """A robot with a camera as part has the capabilities of both, and its pictures can be requested."""
         parts = [{"kind": "camera", "options": {"source": "/pictures"}}]
         driver = {"kind": "create2", "options": {"port": "/dev/robot"}, "parts": parts}
         made = assembled(self.settings(driver=driver), World().seams("a", 7000))
@@ -52,25 +52,25 @@ class AssemblyTests(SynchronousTestCase):
         self.assertIn("[driver] parts: are set, but there is no robot", str(caught.exception))
 
     def test_node_without_body_has_no_agent(self) -> None:
-        """A laptop has neither driver nor agent, and its kind is what the settings say."""
+        """A laptop has no driver and no agent, and takes its kind from the settings."""
         made = assembled(self.settings(node={"kind": "laptop"}), World().seams("a", 7000))
         self.assertEqual((made.agent, made.driver, made.node.presence.device.kind), (None, None, "laptop"))
 
     def test_identity_is_kept_in_the_store(self) -> None:
-        """The store keeps the identity: whatever the dice say, a node is the same after a restart."""
+        """The store keeps the node's identity over restarts with any random generator."""
         store = MemoryStore()
         first = identity_in(store, random.Random(1))
         self.assertEqual(identity_in(store, random.Random(2)).node_id, first.node_id)
         self.assertNotEqual(identity_in(MemoryStore(), random.Random(2)).node_id, first.node_id)
 
     def test_spoiled_identity_is_made_anew(self) -> None:
-        """A note that is no seed does not keep the node from starting."""
+        """An invalid stored identity is replaced, so the node starts."""
         store = MemoryStore()
         store.note("identity", b"short")
         self.assertEqual(identity_in(store, random.Random(1)).node_id, identity_in(store, random.Random(1)).node_id)
 
     def test_lost_identity_is_said(self) -> None:
-        """A node whose store was there before and has no identity any more says that it is a new one."""
+        """A node logs a warning if its existing store has lost the identity, and none if its store is new."""
         lost = MemoryStore()
         lost.origin = "replaced"
         for store, words in ((MemoryStore(), []), (lost, ["the data store has lost the node's identity"])):

@@ -1,4 +1,4 @@
-"""Tests of ``swarmnode.ballast``: processes that speak no TLS leave pyOpenSSL alone, though it is installed."""
+"""Tests of ``swarmnode.ballast``: processes without TLS do not import pyOpenSSL, even if it is installed."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from twisted.internet import reactor
 
 class BallastTests(SynchronousTestCase):
     def said(self, *words: str) -> str:
-        """What Python prints with these words, where a pyOpenSSL is installed that says so when it is loaded."""
+        """Run Python with a stub of pyOpenSSL that prints a line when it is imported, and return the output."""
         folder = Path(self.mktemp()) / "OpenSSL"
         folder.mkdir(parents=True)
         text = f"print({LOADED!r})\nraise ImportError('it is none')\n"
@@ -43,17 +43,17 @@ class BallastTests(SynchronousTestCase):
         return child.stdout + child.stderr
 
     def test_load_nothing_for_plain_nodes(self) -> None:
-        """A node without TLS has a reactor without pyOpenSSL, also if it serves the page."""
+        """A node without TLS does not import pyOpenSSL, even if it serves the page."""
         for roles in ("edge", "edge,web"):
             told = self.said("-c", NODE, "--roles", roles)
             self.assertEqual(told, "", roles)
 
     def test_load_it_for_tls(self) -> None:
-        """A node that serves the page over TLS gets it."""
+        """A node that serves the page over TLS imports pyOpenSSL."""
         self.assertIn(LOADED, self.said("-c", NODE, "--roles", "web", "--web-tls", "auto"))
 
     def test_load_nothing_for_commands(self) -> None:
-        """The demonstration, the yard and the other commands have none, by either name."""
+        """The demonstration, the simulator and other commands do not import pyOpenSSL."""
         nowhere = ("--host", "203.0.113.1")
         for words in (("-m", "sim.demo", "--help"), ("-m", "sim.robots.server", *nowhere)):
             told = self.said(*words)
@@ -65,7 +65,7 @@ class BallastTests(SynchronousTestCase):
             self.assertNotIn("Traceback", told)
 
     def test_look_at_what_is_new_only(self) -> None:
-        """What was there before is looked through no more for garbage; what came after is."""
+        """After ``warmed_up`` the garbage collector skips older objects and checks newer ones."""
         self.addCleanup(gc.unfreeze)
         before: list[object] = [[]]
         warmed_up()

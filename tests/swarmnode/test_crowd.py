@@ -1,4 +1,4 @@
-"""Tests of ``swarmnode.crowd``: real nodes, agents and drivers in a yard for many."""
+"""Tests of ``swarmnode.crowd``: real nodes, agents and drivers in the crowd simulator."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ print(search(CrowdTeam(4, 3, Ground(30, 5.0, 5.0)), 4, 6.0, lambda: 0.0).digest)
 
 class CrowdTeamTests(SynchronousTestCase):
     def made(self, seed: int, agents: int = 5) -> CrowdTeam:
-        """A team among thirty robots on 5 x 5 m."""
+        """Return a team among thirty robots on 5 x 5 m."""
         team = CrowdTeam(seed, agents, Ground(30, 5.0, 5.0))
         self.addCleanup(team.stop)
         return team
 
     def test_search_among_others(self) -> None:
-        """The thesis' experiment among many: they search, agree on the nearest that has found it, and it gets there.
+        """The thesis' experiment in a crowd: the agents agree on the nearest, which reaches the target.
 
-        The desk has no body, each agent has one, and each node an address of its own.
+        The desk has no robot, each agent has one, and each node has its own address.
         """
         team = self.made(3)
         self.assertEqual(list(team.services), [DESK, *team.yard.names])
@@ -43,7 +43,7 @@ class CrowdTeamTests(SynchronousTestCase):
         self.assertLess(float(crowd.x[body] - target.x) ** 2 + float(crowd.y[body] - target.y) ** 2, 0.4**2)
 
     def test_seed_replays_it(self) -> None:
-        """Processes of any hash seed exchange the same datagrams and end at the same places; another seed does not."""
+        """Processes with different hash seeds exchange the same datagrams; another seed gives another digest."""
         digest = replayed(self, RUN)
         other = search(self.made(2, 3), 2, 6.0, lambda: 0.0).digest
         self.assertNotEqual(*(half.split("-") for half in (digest, other)))

@@ -1,4 +1,4 @@
-"""Tests of ``swarmnode.deploy`` and of deployment on a whole team: three dogs in a yard, and a shell at the laptop."""
+"""Tests of ``swarmnode.deploy`` and of deployment on a whole team: three simulated dogs and the laptop's shell."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class DeployTests(SynchronousTestCase):
         self.shelves = {name: MemoryShelf() for name in self.team.DOGS}
 
     def let_in(self, *modules: str, refusing: str = "") -> None:
-        """Start the dogs, each with a shelf of its own; all but ``refusing`` allow the laptop to push ``modules``."""
+        """Start the dogs, each with its own module store; all but ``refusing`` accept ``modules`` from the laptop."""
         allowed = {"allow": True, "operators": [self.laptop.entangled.identity.public.hex()], "modules": list(modules)}
         for name in self.team.DOGS:
             tables = {} if name == refusing else {"deployment": allowed}
@@ -57,13 +57,13 @@ class DeployTests(SynchronousTestCase):
             self.team.clock.advance(0.5)
 
     def swarm(self, line: str) -> str:
-        """What ``swarm deploy LINE`` prints, without trouble."""
+        """Run ``swarm deploy LINE``, which must succeed, and return its output."""
         code, output = self.shell.run(main, line.split())
         self.assertEqual((code, self.shell.said), (0, ""))
         return output
 
     def refused(self, line: str) -> str:
-        """What ``swarm deploy LINE`` complains of."""
+        """Run ``swarm deploy LINE``, which must fail, and return its error output."""
         code, _ = self.shell.run(main, line.split())
         self.assertTrue(code in (1, 2))
         return self.shell.said
@@ -74,7 +74,7 @@ class DeployTests(SynchronousTestCase):
         return str(path)
 
     def push(self, text: str = FARTHEST, name: str = "farthest", more: str = "") -> str:
-        """Push a strategy, and let the team hear of it."""
+        """Push a strategy and let it reach the team."""
         told = self.swarm(f"push {self.file(text)} --name {name} --kind strategy {more}")
         self.team.clock.advance(2.0)
         return told
@@ -84,12 +84,12 @@ class DeployTests(SynchronousTestCase):
         return " | ".join(text for _, text in device.messages)
 
     def deployed(self) -> dict[str, str]:
-        """What the devices say that they run, as the page shows it."""
+        """Return the version that each device runs, as the page shows it."""
         devices = self.team.state()["devices"]
         return {d["name"]: d["deployed"].get("farthest", "") for d in devices if d["name"] != "vaio"}
 
     def verdicts(self, strategy: str, seconds: float) -> list[Verdict]:
-        """What the dogs decide about a task, and by which rule."""
+        """Submit a task with a strategy and return the decision records of the dogs."""
         task = replace(TASKS[DEMO], task_id=f"t{self.team.clock.seconds():.0f}", strategy=strategy, waiting_period=30.0)
         task = replace(task, created=self.team.clock.seconds())
         submitted = Deferred.fromCoroutine(self.laptop.submit(task))
@@ -102,7 +102,7 @@ class DeployTests(SynchronousTestCase):
         return [verdict for each in records if (verdict := verdict_of(each)) is not None]
 
     def test_team_runs_what_is_pushed(self) -> None:
-        """A strategy pushed to a running team is loaded by all three dogs, shown, and decides the next task."""
+        """All three dogs load a pushed strategy, show it, and use it for the next task."""
         self.let_in("farthest")
         told = self.push()
         self.assertIn("pushed strategy farthest 1 ", told)
@@ -118,7 +118,7 @@ class DeployTests(SynchronousTestCase):
         self.assertEqual(first.winner, max(costs, key=lambda agent: costs[agent]))
 
     def test_node_with_deployment_off_refuses_by_name(self) -> None:
-        """A dog that allows nothing has loaded nothing, and says by name that it cannot do a task decided so."""
+        """A dog that does not allow deployment loads nothing, and reports that it cannot take part in the task."""
         self.let_in("farthest", refusing="dog3")
         self.push()
         self.assertEqual(self.deployed()["dog3"], "")
@@ -129,7 +129,7 @@ class DeployTests(SynchronousTestCase):
         self.assertNotIn("is not deployed", self.messages("dog1"))
 
     def test_rollback_and_next_version(self) -> None:
-        """The operator's word takes version 2 back; an older word changes nothing; version 3 comes after both."""
+        """A rollback restores version 1; versions up to 2 are then rejected, and version 3 replaces both."""
         self.let_in("farthest")
         self.push()
         first = self.deployed()
@@ -147,7 +147,7 @@ class DeployTests(SynchronousTestCase):
         self.assertEqual({label[:2] for label in self.deployed().values()}, {"3 "})
 
     def test_wrong_commands(self) -> None:
-        """What the command can see is wrong is refused before anything is sent, with the line of the module."""
+        """Invalid commands are rejected before anything is sent, syntax errors with the line of the module."""
         self.let_in("farthest")
         path = self.file("def f(:\n")
         self.assertIn("line 1", self.refused(f"push {path} --name farthest --kind strategy"))
@@ -163,7 +163,7 @@ class DeployTests(SynchronousTestCase):
         self.assertEqual(self.swarm("status").count("farthest"), 1)
 
     def test_keys_and_json(self) -> None:
-        """``keys`` tells each device's public key, of which its uuid is the hash; ``--json`` is one line of JSON."""
+        """``keys`` prints the public key of each device, which hashes to its uuid; ``--json`` prints one line."""
         self.let_in("farthest")
         keys = json.loads(self.swarm("keys --json"))
         devices = {d["name"]: d["uuid"] for d in self.team.state()["devices"]}
@@ -173,7 +173,7 @@ class DeployTests(SynchronousTestCase):
         self.assertEqual((row["name"], row["version"], row["by"]), ("farthest", 1, "vaio"))
         self.assertEqual(sorted(row["devices"]), ["dog1", "dog2", "dog3", "vaio"])
         self.assertEqual(json.loads(self.swarm(f"push {self.file('1')} --name o --kind strategy --json"))["version"], 1)
-        # What devices say reaches the terminal without its control characters.
+        # Control characters in a device's texts do not reach the terminal.
         self.team.services["dog1"].assembly.node.presence.change(deployed={"farthest": "1\x1b[2J\nx"})
         self.team.clock.advance(1.0)
         self.assertIn("\n  dog1  1 [2J x\n", self.swarm("status"))

@@ -1,4 +1,4 @@
-"""Tests of what people see of a directory that is split: the page and the shell still have all devices."""
+"""Tests of the page and the shell with a directory that is split by prefix: both list all devices."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ COUNT = 9
 
 
 class NoVerbs:
-    """Nothing else is asked."""
+    """Verbs that the test does not expect."""
 
     def run(self, name: object, arguments: object, tell: Callable[[Any], None]) -> Deferred[Any]:
-        """Refuse."""
+        """Fail the test."""
         raise AssertionError(name)
 
 
 class SplitTests(FleetCase):
     def apart(self) -> SwarmFleet:
-        """Nodes that stand as those of a large team do."""
+        """Return nodes with a split directory, as in a large team."""
         fleet = self.swarm(COUNT)
         for node in fleet.nodes:
             node.directory.depth = 3
@@ -40,7 +40,7 @@ class SplitTests(FleetCase):
         return fleet
 
     def test_page(self) -> None:
-        """The page of a web node shows every device of a directory that is split."""
+        """The page of a web node shows every device of a split directory."""
         fleet = self.apart()
         desk = TeamDesk(TeamClient(fleet.nodes[2]), {}, "")
         fleet.run(3.0)
@@ -48,7 +48,7 @@ class SplitTests(FleetCase):
         self.assertEqual([device["name"] for device in state["devices"]], [f"dog{n}" for n in range(COUNT)])
 
     def test_shell(self) -> None:
-        """What ``swarm links``, ``chaos`` and ``deploy`` ask for is every device, in the order of joining."""
+        """``swarm links``, ``chaos`` and ``deploy`` see every device, in the order of joining."""
         fleet = self.apart()
         runtime_folder(self, "dog2")
         verbs = TeamVerbs(NoVerbs(), fleet.nodes[2])

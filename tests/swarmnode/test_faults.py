@@ -1,4 +1,4 @@
-"""Tests of ``swarmnode.faults`` and ``middleware.faults.scenario``: what a person reads who lets devices fail."""
+"""Tests of ``swarmnode.faults`` and ``middleware.faults.scenario``: injected faults and their output."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ class ChaosTests(SynchronousTestCase):
         self.folder = runtime_folder(self)
 
     def team(self, faults: bool = True) -> None:
-        """A team, and a shell beside its laptop."""
+        """Start a team, with a shell at its laptop."""
         self.virtual = VirtualTeam(4, faults=faults)
         self.addCleanup(self.virtual.stop)
         self.virtual.clock.advance(2.0)
         self.shell = Shell(self.virtual, self.virtual.services["vaio"].assembly.node)
 
     def chaos(self, line: str) -> tuple[int, str]:
-        """Exit code and output of ``swarm chaos LINE``, on the team's clock."""
+        """Run ``swarm chaos LINE`` in the team's time; return exit code and output."""
         clock = self.virtual.clock
 
         def command(words: list[str], out: Any, ask: Any) -> int:
@@ -39,7 +39,7 @@ class ChaosTests(SynchronousTestCase):
         return self.shell.run(command, line.split())
 
     def test_one_fault(self) -> None:
-        """Who acts is cut off by a word; the line says who took over and after how long, and the exit code is 0."""
+        """A fault in the acting device is reported with the successor and the takeover time, and exit code 0."""
         self.team()
         self.virtual.desk.assign("turn-around")
         code, output = self.chaos("executing radio --seconds 4")
@@ -50,14 +50,14 @@ class ChaosTests(SynchronousTestCase):
         self.assertIn("dog1        kill, freeze, radio, one-way, delay, loss, skew, battery", self.chaos("list")[1])
 
     def test_not_allowed(self) -> None:
-        """Devices that allow no faults say what to write into their settings."""
+        """A device that does not allow faults is reported with the setting that allows them."""
         self.team(faults=False)
         code, output = self.chaos("dog1 loss")
         self.assertEqual((code, output), (1, ""))
         self.assertIn('dog1: it does not allow faults; set "allow = true" in [faults]', self.shell.said)
 
     def test_wrong_words(self) -> None:
-        """A kind, a number and a device that there are not are one line each, which says what to give."""
+        """An unknown kind, an invalid amount and an unknown device are rejected in one line with a remedy."""
         self.team()
         for line, code, said in (
             ("dog1 fly", 2, "there is no fault 'fly'; choose one of kill, freeze"),
@@ -69,30 +69,30 @@ class ChaosTests(SynchronousTestCase):
             self.assertIn(said, self.shell.said)
 
     def rehearsed(self, name: str, *words: str) -> list[str]:
-        """The lines of a rehearsed scenario, which held."""
+        """Run a scenario in a simulated team, which must succeed, and return its lines."""
         output = io.StringIO()
         code = main(["run", str(SCENARIOS / name), "--rehearse", *words], output)
         self.assertEqual(code, 0, output.getvalue())
         return output.getvalue().splitlines()
 
     def test_same_seed_same_run(self) -> None:
-        """Rehearsed twice a scenario gives the same lines and the same digest; another seed gives another run."""
+        """A simulated scenario gives the same lines and digest twice; another seed gives another run."""
         first = self.rehearsed("takeover.toml")
         self.assertEqual(sum("took over" in line for line in first), 2)
         self.assertEqual(self.rehearsed("takeover.toml"), first)
         self.assertNotEqual(self.rehearsed("takeover.toml", "--seed", "8")[-1], first[-1])
 
     def test_bad_day(self) -> None:
-        """With loss, also of the answer to the order, and a wrong clock, two devices are still replaced in time."""
+        """In spite of packet loss and a wrong clock two devices are replaced in time."""
         lines = self.rehearsed("bad-day.toml")
         self.assertEqual(sum("took over" in line for line in lines), 2)
-        for seed in ("12", "24"):  # where the first answer does not arrive
+        for seed in ("12", "24"):  # with these seeds the first answer is lost
             self.rehearsed("bad-day.toml", "--seed", seed)
 
 
 class ScenarioTests(SynchronousTestCase):
     def test_examples(self) -> None:
-        """Each scenario among the examples is lawful, and its steps are in the order of their time."""
+        """Each example scenario is valid, and its steps are in chronological order."""
         files = sorted(SCENARIOS.glob("*.toml"))
         self.assertGreater(len(files), 1)
         for file in files:
@@ -100,12 +100,12 @@ class ScenarioTests(SynchronousTestCase):
             self.assertEqual([step.at for step in steps], sorted(step.at for step in steps))
 
     def test_short(self) -> None:
-        """What is left out is usual: at once, whoever acts, for fifteen seconds."""
+        """The defaults of a step are: at once, the acting device, fifteen seconds."""
         (step,) = scenario_of({"fault": [{"kind": "radio"}]}, "x").steps
         self.assertEqual((step.at, step.device, step.fault), (0.0, "executing", Fault("radio")))
 
     def test_wrong(self) -> None:
-        """What is unlawful is refused by file and key."""
+        """Invalid values are rejected with file and key."""
         wrong: list[tuple[dict[str, Any], str]] = [
             ({}, "[[fault]]"),
             ({"fault": []}, "[[fault]]"),

@@ -1,4 +1,4 @@
-"""Tests of ``swarmnode.gateway``: phones as nodes of a team on one turned clock."""
+"""Tests of ``swarmnode.gateway``: phones as nodes of a team in virtual time."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ CAN = {"width": 208, "height": 156, "orientation": False, "position": True}
 
 
 class Phone:
-    """A visitor's phone at one gateway, which looks while time passes."""
+    """A phone at one gateway that sends pictures as time passes."""
 
     def __init__(self, case: GatewayTests, at: Gateway, secret: bytes = b"s" * 32, name: str = "anna") -> None:
         self.case = case
@@ -68,7 +68,7 @@ class GatewayTests(SynchronousTestCase):
         )
 
     def live(self, seconds: float) -> None:
-        """Let time pass, in which phones look ten times a second."""
+        """Advance the time while the phones send ten pictures a second."""
         for _ in range(round(seconds / STEP)):
             self.team.clock.advance(STEP)
             for phone in self.phones:
@@ -80,7 +80,7 @@ class GatewayTests(SynchronousTestCase):
         return dict(found[0]) if found else {}
 
     def test_is_a_device_like_any_other(self) -> None:
-        """A phone that joins is an idle device with its own address and place, whose very pictures can be looked at."""
+        """A phone that joins is an idle device with its own address and position, and its pictures can be watched."""
         phone = Phone(self, self.gateways["vaio"])
         self.sees = {"position.lat": 52.123456789, "position.lon": 13.0, "position.accuracy": 12.4}
         self.live(1.5)
@@ -99,7 +99,7 @@ class GatewayTests(SynchronousTestCase):
         self.assertEqual(set(seen), {jpeg()})
 
     def test_wins_and_is_taken_over(self) -> None:
-        """The phone is the nearest and has the task; when it leaves, a dog that sees the target goes on at once."""
+        """The nearest phone gets the task; when it leaves, a dog that sees the target takes over at once."""
         phone = Phone(self, self.gateways["vaio"])
         self.team.yard.world.place_target(1.5, 1.2)
         self.sees = {"target.bearing": 0.0, "target.distance": 0.05}
@@ -120,7 +120,7 @@ class GatewayTests(SynchronousTestCase):
         self.until(lambda: self.team.state()["tasks"][0]["status"] == "COMPLETED", 60.0)
 
     def test_silence_is_leaving(self) -> None:
-        """A phone that falls silent has left after a second, and another has its task within two."""
+        """A phone that falls silent is removed, and another device has its task within two seconds."""
         phone = Phone(self, self.gateways["vaio"])
         self.team.yard.world.place_target(1.5, 1.2)
         self.sees = {"target.bearing": 0.0, "target.distance": 0.05}
@@ -135,7 +135,7 @@ class GatewayTests(SynchronousTestCase):
         self.assertLess(self.team.clock.seconds() - began, 2.0 + SILENCE_S)
 
     def test_first_look_may_take_longer(self) -> None:
-        """Who has joined may be asked for the camera first; who never looks is let go all the same."""
+        """The first picture may take up to ``FIRST_S``; after it a phone that falls silent is removed."""
         phone = Phone(self, self.gateways["vaio"])
         phone.looks = False
         self.live(FIRST_S - 0.2)
@@ -144,11 +144,11 @@ class GatewayTests(SynchronousTestCase):
         self.assertEqual(self.assertRaises(Refusal, phone.look, {}).status, 404)
 
     def test_is_the_same_device_elsewhere(self) -> None:
-        """When its web node dies, the phone goes on through another: one device with the same uuid, place and name."""
+        """After the death of its web node a phone joins through another with the same uuid, position and name."""
         phone = Phone(self, self.gateways["vaio"])
         self.live(1.5)
         before = self.device(phone.uuid)
-        # The web node dies, and with it all that it did for its phones.
+        # The web node dies with the nodes of its phones.
         lost = self.gateways.pop("vaio")
         for each in lost._phones.values():
             each._node.vanish()
@@ -167,13 +167,13 @@ class GatewayTests(SynchronousTestCase):
         self.assertEqual(names.count("anna"), 1)
 
     def test_identity_is_of_team_and_phone(self) -> None:
-        """Neither another phone nor another team makes the same identity."""
+        """Another phone or another team results in another identity."""
         seeds = {seed_of(team, phone) for team in (b"a" * 32, b"b" * 32) for phone in (b"1" * 32, b"2" * 32)}
         self.assertEqual(len(seeds), 4)
         self.assertEqual(seed_of(b"a" * 32, b"1" * 32), seed_of(b"a" * 32, b"1" * 32))
 
     def test_comes_back_while_it_leaves(self) -> None:
-        """A phone that is still giving back its task when it comes again waits for that, and is there once."""
+        """A phone that joins again while it releases its task waits for that, and is listed once."""
         phone = Phone(self, self.gateways["vaio"])
         self.sees = {"target.bearing": 0.0, "target.distance": 0.05}
         self.team.desk.assign("watch-target")
@@ -189,7 +189,7 @@ class GatewayTests(SynchronousTestCase):
         self.until(lambda: self.device(phone.uuid).get("status") == "EXECUTING", 40.0)
 
     def test_leaves_with_its_web_node(self) -> None:
-        """A web node that is shut lets its phones go politely: they are no devices any more when it says that it is."""
+        """A web node that stops removes its phones, which are gone when the stop is complete."""
         phones = [Phone(self, self.gateways["vaio"], bytes([n]) * 32, f"p{n}") for n in (1, 2)]
         self.live(1.0)
         self.phones.clear()
@@ -199,7 +199,7 @@ class GatewayTests(SynchronousTestCase):
         self.assertEqual(told, ["GONE", "GONE"])
 
     def test_names_are_of_one_device_each(self) -> None:
-        """Where a dog or another phone has the name, the phone gets one like it; its own name it keeps."""
+        """A phone with the name of another device gets a suffix; otherwise it keeps its name."""
         first = Phone(self, self.gateways["vaio"], b"1" * 32, "dog1")
         second = Phone(self, self.gateways["vaio"], b"2" * 32, "anna")
         third = Phone(self, self.gateways["vaio"], b"3" * 32, "anna")
@@ -208,7 +208,7 @@ class GatewayTests(SynchronousTestCase):
         self.assertEqual(told, [f"dog1-{first.uuid[:4]}", "anna", f"anna-{third.uuid[:4]}"])
 
     def test_takes_so_many(self) -> None:
-        """The ninth phone is told that there is no room, until one leaves; who is here may join again."""
+        """A phone beyond ``MOST`` is rejected until another one leaves; a connected phone may join again."""
         gateway = self.gateways["vaio"]
         phones = [Phone(self, gateway, bytes([n]) * 32, f"p{n}") for n in range(MOST)]
         refusal = self.failureResultOf(gateway.join(b"x" * 32, "late", CAN), Refusal).value
@@ -221,7 +221,7 @@ class GatewayTests(SynchronousTestCase):
         self.assertTrue(self.successResultOf(gateway.join(b"x" * 32, "late", CAN)))
 
     def test_sent_away_stays_away(self) -> None:
-        """An operator takes a phone off the network for a while, as any device; until then it may not come back."""
+        """A phone that an operator disconnects may not join again before the time is over."""
         phone = Phone(self, self.gateways["vaio"])
         self.live(1.0)
         self.team.desk.disconnect(phone.uuid, 3.0)
@@ -233,7 +233,7 @@ class GatewayTests(SynchronousTestCase):
         self.successResultOf(phone.at.join(b"s" * 32, "anna", CAN))
 
     def test_refuses_what_is_no_look(self) -> None:
-        """No picture, too large a picture, too many pictures, and pictures of a stranger are refused by status."""
+        """An invalid or too large picture, too many pictures, and pictures of an unknown phone are rejected."""
         phone = Phone(self, self.gateways["vaio"])
         self.assertEqual(sides(jpeg(MOST_SIDE, 10)), (MOST_SIDE, 10))
         for body in (b"", b"GIF89a", jpeg()[:-2], jpeg(MOST_SIDE + 1, 10), jpeg(10, MOST_SIDE + 1), jpeg(0, 10)):
@@ -249,7 +249,7 @@ class GatewayTests(SynchronousTestCase):
         phone.look({})
 
     def test_says_that_the_team_stands(self) -> None:
-        """While the team is stopped the phone says so."""
+        """While the team is stopped, the phone shows it."""
         phone = Phone(self, self.gateways["vaio"])
         self.live(1.0)
         node = self.team.services["vaio"].assembly.node
@@ -258,7 +258,7 @@ class GatewayTests(SynchronousTestCase):
         self.assertEqual(phone.said, "The team is stopped. Wait.")
 
     def until(self, is_so: object, limit: float) -> None:
-        """Let time pass until it is so."""
+        """Advance the time until a condition holds."""
         assert callable(is_so)
         for _ in range(round(limit / STEP)):
             if is_so():

@@ -1,4 +1,4 @@
-"""Tests of ``swarmnode.invitation`` and of ``swarm web``: where the page is, and how to sign in."""
+"""Tests of ``swarmnode.invitation`` and ``swarm web``: the address of the page and its access code."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ OWN = Invitation("vaio", "http://127.0.0.1:8080/", "quiet-otter", os.getpid())
 
 class InvitationTests(SynchronousTestCase):
     def setUp(self) -> None:
-        # Not under the folder of the tests: a socket's path, beside which the note lies, is short.
+        # The note is next to a control socket, so its path must be short, outside the test folder.
         self.where = Path(self.mktemp())
         self.patch(os, "environ", {**os.environ, "XDG_RUNTIME_DIR": str(self.where)})
 
     def test_leave_a_note(self) -> None:
-        """A node that serves leaves its address and code, for its own user alone; the next start replaces them."""
+        """A web node writes its address and code to a private file; the next start replaces it."""
         self.patch(sys.modules["middleware.entangled.control.place"], "MAX_PATH", 4096)
         for code in ("quiet-otter", "loud-otter"):
             invited("vaio", "0.0.0.0", lambda: 8080, code)
@@ -35,7 +35,7 @@ class InvitationTests(SynchronousTestCase):
         self.assertEqual(stat.S_IMODE(note.stat().st_mode), 0o600)
 
     def test_show_the_code_at_a_terminal(self) -> None:
-        """Who started the node at a terminal is shown the code there; what is no terminal, or is closed, shows none."""
+        """A node that is started at a terminal prints the code; other or closed streams get none."""
         self.patch(sys.modules["middleware.entangled.control.place"], "MAX_PATH", 4096)
         screen = io.StringIO()
         invited("vaio", "0.0.0.0", lambda: 8080, "quiet-otter", terminal=screen)
@@ -49,7 +49,7 @@ class InvitationTests(SynchronousTestCase):
             self.assertIsNone(at_terminal())
 
     def test_pass_over_what_is_no_note(self) -> None:
-        """The note of a node that has ended, and what is no note, are passed over."""
+        """The note of a node that has ended, and invalid notes, are ignored."""
         (self.where / "swarm-node").mkdir(mode=0o700, parents=True)
         for name, words in (
             ("a", "{}"),
@@ -60,7 +60,7 @@ class InvitationTests(SynchronousTestCase):
         self.assertEqual(invitations(), [])
 
     def test_name_an_address_for_this_machine(self) -> None:
-        """An address that stands for all of the machine's is told as one that a browser there can open."""
+        """A wildcard address is shown as an address that a browser on this machine can open."""
         self.assertEqual(url_of("0.0.0.0", 80), "http://127.0.0.1:80/")
         self.assertEqual(url_of("::", 80), "http://[::1]:80/")
         self.assertEqual(url_of("192.168.0.2", 8080), "http://192.168.0.2:8080/")
@@ -74,7 +74,7 @@ class WebCodeTests(SynchronousTestCase):
         return code, out.getvalue(), errors.getvalue()
 
     def test_tell_the_code(self) -> None:
-        """The code is told, and the link that carries it; as JSON for programs; without signing in, that is said."""
+        """The code and a link with it are printed, also as JSON; without sign-in the output says so."""
         code, out, _ = self.asked()
         self.assertEqual(code, 0)
         self.assertIn("vaio: http://127.0.0.1:8080/  code quiet-otter, or open", out)
@@ -85,7 +85,7 @@ class WebCodeTests(SynchronousTestCase):
         self.assertIn("no sign-in", self.asked(here=[Invitation("a", "http://127.0.0.1:1/", "", 1)])[1])
 
     def test_tell_that_there_is_none(self) -> None:
-        """Where there is no page, or not that one, one line says which there are, and the exit code is 2."""
+        """If no page or no such node runs, one line lists the nodes with a page, and the exit code is 2."""
         code, out, errors = self.asked("--node", "dog1")
         self.assertEqual((code, out), (2, ""))
         self.assertIn("no node 'dog1' with a page runs on this machine; nodes with a page: vaio", errors)

@@ -1,4 +1,4 @@
-"""Tests of ``swarm links``: what is printed of the ways to a node's peers."""
+"""Tests of ``swarm links``: the paths to a node's peers."""
 
 from __future__ import annotations
 
@@ -23,23 +23,23 @@ NEAR = {"id": "ef" * 20, "address": "192.168.1.9:8484", "way": "lan", "by": "", 
 
 
 class LinksTests(SynchronousTestCase):
-    """Behaviour of the command."""
+    """Tests of the command."""
 
     def setUp(self) -> None:
         runtime_folder(self, "vaio")
         self.links: Any = [{**NEAR, "times": [0.002] * 10}, {**FAR, "times": [0.08] * 9 + [None]}]
 
     def ask(self, path: Path, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
-        """What the node answers; it has no records."""
+        """Answer in place of the node, without records."""
         yield {"answer": self.links if request["verb"] == "links" else []}
 
     def run_it(self, *words: str) -> tuple[int, str]:
-        """The exit code, and what was printed."""
+        """Run the command and return exit code and output."""
         out = io.StringIO()
         return main(words, out, self.ask), out.getvalue()
 
     def test_worst_first(self) -> None:
-        """Each peer is a line with score, way, figures and since when; the worst is the first."""
+        """Each peer has a line with score, path, measurements and duration; the worst is first."""
         score = link([0.08] * 9 + [None], True).score
         self.assertLess(score, 100)
         code, printed = self.run_it()
@@ -55,24 +55,24 @@ class LinksTests(SynchronousTestCase):
         )
 
     def test_silent_peer(self) -> None:
-        """A peer that answers nothing has 0 points, and the command ends with 1."""
+        """A peer that does not answer has a score of 0, and the exit code is 1."""
         self.links = [{**NEAR, "way": "none", "for": None, "times": [None] * 10}]
         self.assertEqual(self.run_it(), (1, "efefefefef    0/100  no path yet  does not reply\n"))
 
     def test_no_peer(self) -> None:
-        """A node alone says so, and what tells why."""
+        """A node without peers is reported with the next command."""
         self.links = []
         self.assertEqual(self.run_it(), (0, "this node has no peers; run swarm doctor to see why\n"))
 
     def test_json(self) -> None:
-        """With --json it is one line with the same figures."""
+        """With --json the output is one line with the same values."""
         code, printed = self.run_it("--json")
         rows = json.loads(printed)["links"]
         self.assertEqual((code, [row["way"] for row in rows], rows[1]["score"]), (0, ["carried", "lan"], 100))
         self.assertEqual((rows[0]["loss"], rows[0]["by"], rows[0]["for"]), (0.1, "ef" * 20, 150.0))
 
     def test_real_node(self) -> None:
-        """A running node names its peers as the devices are called."""
+        """A running node lists its peers by their device names."""
         team = VirtualTeam(3)
         self.addCleanup(team.stop)
         shell = Shell(team, team.services["vaio"].assembly.node)
@@ -83,7 +83,7 @@ class LinksTests(SynchronousTestCase):
 
 
 class TeamTests(SynchronousTestCase):
-    """What a node of a closed team says of it, and of whom it met that was not let in."""
+    """A node of a closed team reports the members and the refused nodes."""
 
     def setUp(self) -> None:
         self.team = VirtualTeam(5, dogs=("dog1", "dog2"))
@@ -92,13 +92,13 @@ class TeamTests(SynchronousTestCase):
         self.dog = self.team.services["dog1"].assembly.node
 
     def tell(self, statement: bytes) -> None:
-        """Let the operator's word spread."""
+        """Distribute a statement of the operator."""
         assert self.laptop.team is not None
         self.laptop.later(0.0, lambda: Deferred.fromCoroutine(self.laptop.team.tell(statement)))  # type: ignore[union-attr]
         self.team.clock.advance(3.0)
 
     def test_members(self) -> None:
-        """A closed team has a name, the fingerprint that strangers see, and its members with roles."""
+        """A closed team reports its kind, its public fingerprint, and its members with their roles."""
         told = team(self.laptop)
         assert self.laptop.team is not None
         self.assertEqual((told["kind"], told["me"]), ("closed", self.laptop.uuid))
@@ -109,7 +109,7 @@ class TeamTests(SynchronousTestCase):
         self.assertTrue(told["is_renewable"] and all(member["is_renewable"] for member in told["members"]))
 
     def test_ending_certificate(self) -> None:
-        """Whose certificate ends within two weeks stands first, and is said to be so."""
+        """A certificate that ends within two weeks is listed first and marked."""
         dog = self.team.services["dog2"].assembly.node
         begin = int(self.team.clock.seconds()) + 1
         public = dog.entangled.identity.public
@@ -121,7 +121,7 @@ class TeamTests(SynchronousTestCase):
         self.assertEqual([member["is_renewable"] for member in told["members"]], [False, True, True])
 
     def test_refusals(self) -> None:
-        """Who was revoked is named with the remedy by those that put it out, and by itself."""
+        """A revoked node is reported with the remedy, by the nodes that reject it and by itself."""
         self.tell(self.team.operator.revoke(self.dog.entangled.identity.public, "dog1", self.team.clock.seconds()))
         self.team.clock.advance(3.0)
         ours, theirs = links(self.laptop)["refusals"], links(self.dog)["refusals"]
@@ -131,7 +131,7 @@ class TeamTests(SynchronousTestCase):
         self.assertNotIn("dog1", [member["name"] for member in team(self.laptop)["members"]])
 
     def test_refused_call(self) -> None:
-        """A member that asks for what its role does not allow is named by whom it asked, as a call."""
+        """A call that the caller's role does not allow is reported by the called node."""
         asked = self.dog.entangled.call(self.laptop.entangled.contact, "device.message", "sit", changes=True)
         self.team.clock.advance(1.0)
         self.failureResultOf(asked, Refused)

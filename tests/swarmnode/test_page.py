@@ -1,4 +1,4 @@
-"""Tests of ``swarmnode.page``: the names by which a browser may open a page."""
+"""Tests of ``swarmnode.page``: the host names that a page accepts."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class HostsTests(SynchronousTestCase):
         skip = f"THE PAGE IS NOT TESTED: missing {', '.join(MISSING)}"
 
     def test_name_the_machine(self) -> None:
-        """The machine's name and the node's, bare and on the LAN, and those of the settings; no other."""
+        """The page accepts the names of machine and node, bare and on the LAN, and those in the settings only."""
         web = {"names": ["robots.lan", "page.example.org"]}
         settings = Settings.from_mapping({"node": {"name": "Dog1", "team_key": "t"}, "web": web}, "")
         found = hosts_of(settings, "Vaio.corp.example")

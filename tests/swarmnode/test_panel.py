@@ -1,4 +1,4 @@
-"""Tests of a task for many: real nodes and agents, of whom only a panel writes records."""
+"""Tests of a task with many bidders: real nodes and agents, of which only the reporters write records."""
 
 from __future__ import annotations
 
@@ -26,29 +26,29 @@ STEP = 0.05
 
 
 class Stand:
-    """A task that nobody gets done, at a cost that dice say."""
+    """A behaviour that never finishes, with a random cost."""
 
     def __init__(self, parameters: Mapping[str, float | str], rng: random.Random) -> None:
         self.cost = round(1.0 + rng.random(), 3)
 
     def look(self, seen: Observation, now: float) -> None:
-        """Nothing that it senses matters."""
+        """Ignore the observation."""
 
     def search(self, now: float) -> Action:
-        """Stand."""
+        """Stand still."""
         return STAND
 
     def hold(self, now: float) -> Action:
-        """Stand."""
+        """Stand still."""
         return STAND
 
     def execute(self, context: Context) -> Action:
-        """Stand, and go on doing so."""
+        """Stand still, without an end."""
         return STAND
 
 
 class ManyTests(SynchronousTestCase):
-    """Two dozen agents and one task for one of them."""
+    """Two dozen agents bid for one task."""
 
     def setUp(self) -> None:
         KINDS["stand"] = f"{__name__}:Stand"
@@ -63,21 +63,21 @@ class ManyTests(SynchronousTestCase):
         Deferred.fromCoroutine(node.submit(task))
 
     def heard(self, records: list[Record]) -> None:
-        """Take down what stands under the task's key."""
+        """Store the records under the task's key."""
         self.records = records
 
     def engagements(self) -> dict[str, Engagement]:
-        """What each agent that lives is at."""
+        """Return the engagement of each running agent."""
         named = {name: self.team.services[name] for name in self.team.yard.names}
         agents: dict[str, Any] = {name: one.assembly.agent for name, one in named.items() if one.running}
         return {name: agent.engagement for name, agent in agents.items() if agent.engagement is not None}
 
     def acting(self) -> list[str]:
-        """Who executes, by name."""
+        """Return the names of the agents that execute the task."""
         return [name for name, one in self.engagements().items() if one.course.state is State.EXECUTING]
 
     def run_until_one_acts(self, limit: float) -> tuple[str, float]:
-        """Who does, and after how many seconds; there are never two."""
+        """Run until an agent acts, never two at once; return its name and the seconds."""
         began = self.team.clock.seconds()
         while not (acting := self.acting()):
             self.team.clock.advance(STEP)
@@ -86,12 +86,12 @@ class ManyTests(SynchronousTestCase):
         return acting[0], self.team.clock.seconds() - began
 
     def ranked(self) -> list[str]:
-        """Those that live, the best first."""
+        """Return the running agents, the best first."""
         every = self.engagements()
         return sorted(every, key=lambda name: (every[name].me.cost or 0.0, every[name].me.uuid))
 
     def test_best_acts_and_the_next_takes_over(self) -> None:
-        """The best of all acts, few write, all name it, each sends some datagrams; the next best takes over in 3 s."""
+        """The best agent acts with few records and datagrams, all agree, and the next best takes over within 3 s."""
         name, _ = self.run_until_one_acts(5.0)
         self.assertEqual(name, self.ranked()[0])
         self.team.clock.advance(2.0)
@@ -99,7 +99,7 @@ class ManyTests(SynchronousTestCase):
         sent = self.team.board.counters["sent"] - self.sent
         self.assertLess(sent / AGENTS, 1000)
         members = {member.uuid for record in self.records if (member := member_of(record)) is not None}
-        self.assertLessEqual(len(members), SEATS + 2 * ANNOUNCED)  # some write before they hear of the last
+        self.assertLessEqual(len(members), SEATS + 2 * ANNOUNCED)  # some write before the last announcement
         uuid = self.engagements()[name].me.uuid
         self.assertEqual({one.me.assigned for one in self.engagements().values()}, {uuid})
         self.team.services[name].vanish()

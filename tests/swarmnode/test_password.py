@@ -25,7 +25,7 @@ class PasswordCommandTests(SynchronousTestCase):
         return main([], out, ask, bytes), out.getvalue(), errors.getvalue()
 
     def test_print_a_line_for_the_settings(self) -> None:
-        """What is printed is a line of TOML that the settings take, and it lets in whoever knows the password."""
+        """The output is a line of TOML for the settings, and its hash matches the password."""
         code, out, _ = self.typed("correct horse", "correct horse")
         self.assertEqual(code, 0)
         path = self.mktemp()
@@ -35,7 +35,7 @@ class PasswordCommandTests(SynchronousTestCase):
         self.assertNotIn("horse", out)
 
     def test_refuse_in_one_line(self) -> None:
-        """Too short, not the same twice, not to be typed into a page, or none: one line says so, and exit code 1."""
+        """A short, mistyped, untypable or missing password is rejected in one line with exit code 1."""
         for answers, words in (
             (("short",), "5 characters"),
             (("correct horse", "correct hors"), "not the same"),

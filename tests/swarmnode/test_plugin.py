@@ -1,4 +1,4 @@
-"""Tests of ``swarmnode.plugin``: options, and what each bad input says."""
+"""Tests of ``swarmnode.plugin``: options and error messages."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 class RefusalTests(SynchronousTestCase):
-    """What each bad input says."""
+    """The error messages for invalid input."""
 
     def setUp(self) -> None:
         self.folder = Path(self.mktemp())
         self.folder.mkdir()
 
     def file(self, text: str) -> str:
-        """A settings file."""
+        """Write a settings file."""
         path = self.folder / "node.toml"
         path.write_text(text, encoding="utf-8")
         return str(path)
 
     def refusal(self, *arguments: str, is_made: bool = False) -> str:
-        """The one line that the command line is refused with."""
+        """Return the one line with which the command line is rejected."""
         errors = io.StringIO()
         with contextlib.redirect_stderr(errors), self.assertRaises(SystemExit) as caught:
             options = Options()
@@ -51,12 +51,12 @@ class RefusalTests(SynchronousTestCase):
         return errors.getvalue().strip()
 
     def assert_says(self, line: str, *parts: str) -> None:
-        """The line has each part."""
+        """Check that the line has each part."""
         for part in ("swarm-node: ", *parts):
             self.assertIn(part, line)
 
     def test_refuse_before_the_start(self) -> None:
-        """What is wrong in file or flags is refused with its place, what is wrong, and what to write instead."""
+        """Invalid files and flags are rejected with place, problem and remedy."""
         node = '[node]\nname = "a"\nteam_key = "t"\n'
         texts: tuple[tuple[str, tuple[str, ...]], ...] = (
             (f"{node}prot = 7\n", ("[node] prot", "the nearest is port")),
@@ -77,7 +77,7 @@ class RefusalTests(SynchronousTestCase):
             self.assert_says(self.refusal(*words), *parts)
 
     def test_refuse_what_cannot_be_made(self) -> None:
-        """Agents, drivers and stores that are not there, or do not go together, are refused with those that are."""
+        """Unknown agents, drivers and stores, and invalid combinations, are rejected with the valid values."""
         known = "known are " + ", ".join(kinds())
         (self.folder / "text.sqlite").write_text("this is a letter " * 99, encoding="utf-8")
         driver = '[driver]\nkind = "sim"\n'
@@ -94,7 +94,7 @@ class RefusalTests(SynchronousTestCase):
             self.assert_says(self.refusal("--config", path, is_made=True), path, *parts)
 
     def test_refuse_foreign_store(self) -> None:
-        """A SQLite file of another program is refused, named, and left as it was."""
+        """A SQLite file of another program is rejected by name and not changed."""
         foreign = self.folder / "foreign.sqlite"
         with contextlib.closing(sqlite3.connect(foreign)) as connection:
             connection.execute("CREATE TABLE birds(name TEXT)")
@@ -104,7 +104,7 @@ class RefusalTests(SynchronousTestCase):
         self.assertEqual(foreign.read_bytes(), before)
 
     def test_refuse_name_without_address(self) -> None:
-        """A known node whose name has no address is refused with the key and the name."""
+        """A known node without an address is rejected with the key and the name."""
 
         def nothing(*_: object, **__: object) -> Any:
             raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
@@ -119,7 +119,7 @@ class RefusalTests(SynchronousTestCase):
         )
 
     def test_say_which_setting_to_mend(self) -> None:
-        """A fault that knows no file gets the file and the key in front of it, on one line."""
+        """An error without a file is reported in one line after the file and the key."""
         self.assertEqual(told(PortInUse("UDP 1:2: taken"), "a.toml"), "a.toml: [node] port: UDP 1:2: taken")
         self.assertEqual(
             told(TunnelPortInUse("TCP 1:2: taken"), "a.toml"), "a.toml: [node] tunnel_port: TCP 1:2: taken"
@@ -130,7 +130,7 @@ class RefusalTests(SynchronousTestCase):
 
 class CheckedServiceTests(SynchronousTestCase):
     def test_take_the_next_port(self) -> None:
-        """A node whose usual port was taken since it was looked up starts at the next; one that was set is refused."""
+        """A node with a default port that is in use starts at the next port; a configured port is rejected."""
         world = World()
         world.board.network("127.0.0.1", NODE_PORT).listen(lambda datagram, source: None)
 
@@ -155,7 +155,7 @@ class CheckedServiceTests(SynchronousTestCase):
 
 class OptionsTests(SynchronousTestCase):
     def test_flags_win_over_the_file(self) -> None:
-        """A flag replaces what the file says, and leaves everything else."""
+        """A flag overrides a value of the file and no other value."""
         path = Path(self.mktemp())
         path.write_text('[node]\nname = "a"\nteam_key = "t"\nport = 7001\nkind = "dog"\n', encoding="utf-8")
         options = Options()
@@ -164,7 +164,7 @@ class OptionsTests(SynchronousTestCase):
         self.assertEqual((node.name, node.port, node.kind, node.roles), ("a", 7002, "dog", ("edge", "bootstrap")))
 
     def test_flags_alone_are_enough(self) -> None:
-        """A node can be described by flags alone."""
+        """Flags are sufficient to configure a node."""
         options = Options()
         options.parseOptions(["--name", "b", "--known-nodes", "10.0.0.1:7000,10.0.0.2:7000", "--web-port", "0"])
         settings = options.settings
@@ -172,14 +172,14 @@ class OptionsTests(SynchronousTestCase):
         self.assertEqual(settings.node.known_nodes, (Address("10.0.0.1", 7000), Address("10.0.0.2", 7000)))
 
     def key_file(self) -> str:
-        """A file that holds a team's secret."""
+        """Return a file with a team's secret."""
         path = Path(self.mktemp())
         path.touch(mode=0o600)
         path.write_text("t\n", encoding="utf-8")
         return str(path)
 
     def test_every_setting_of_a_flag_exists(self) -> None:
-        """Each flag but the file's is a setting: all of them at once are accepted."""
+        """Each flag except ``--config`` corresponds to a setting."""
         values = {
             "name": "a", "kind": "k", "host": "127.0.0.1", "port": "0", "known-nodes": "10.0.0.1:1",
             "store": "s.sqlite", "membership": "m", "team-key-file": self.key_file(), "roles": "edge",
@@ -190,7 +190,7 @@ class OptionsTests(SynchronousTestCase):
         Options().parseOptions([word for name, value in values.items() for word in (f"--{name}", value)])
 
     def test_names_become_addresses_once(self) -> None:
-        """Host names of known nodes and of the yard are looked up at the start, in the family of the own port."""
+        """Host names of known nodes and of the simulator are resolved once, in the family of the node's address."""
         asked: list[tuple[str, int]] = []
 
         def look_up(host: str, port: int, family: int, type: int) -> Any:  # noqa: A002

@@ -1,4 +1,4 @@
-"""Tests of ``swarmnode.ports``: which port gives way, and which stays."""
+"""Tests of ``swarmnode.ports``: the choice of ports."""
 
 from __future__ import annotations
 
@@ -12,36 +12,36 @@ from swarmnode.ports import NEXT, IsFree, given_way
 
 
 def busy(*ports: int) -> IsFree:
-    """A machine on which these ports are in use."""
+    """Return the port check of a machine on which these ports are in use."""
     return lambda kind, host, port: port not in ports
 
 
 def settings(node: Collection[tuple[str, object]] = (), web: Collection[tuple[str, object]] = ()) -> Settings:
-    """A node with the page."""
+    """Return settings of a node with the page."""
     tables = {"node": {"name": "a", "roles": ["web"], **dict(node)}, "web": {"tls": "auto", **dict(web)}}
     return Settings.from_mapping(tables, "a.toml")
 
 
 class PortsTests(SynchronousTestCase):
-    """Behaviour of ``given_way``."""
+    """Tests of ``given_way``."""
 
     def test_free_ports_are_taken_as_usual(self) -> None:
-        """Where nothing is in use each port is the usual one."""
+        """If no port is in use, each port has its default."""
         found = given_way(settings(), busy())
         self.assertEqual((found.node.port, found.web.port, found.web.tls_port), (NODE_PORT, 8080, 8443))
 
     def test_usual_ports_give_way(self) -> None:
-        """A port that nobody set and that is in use is followed by the next free one."""
+        """A default port that is in use is replaced by the next free port."""
         found = given_way(settings(), busy(NODE_PORT, NODE_PORT + 1, 8080, 8443))
         self.assertEqual((found.node.port, found.web.port, found.web.tls_port), (NODE_PORT + 2, 8081, 8444))
 
     def test_many_busy_ports_leave_any(self) -> None:
-        """Where the next ones are in use as well, the system chooses."""
+        """If the next ports are in use as well, the system chooses the port."""
         found = given_way(settings(), busy(*range(NODE_PORT, NODE_PORT + NEXT)))
         self.assertEqual(found.node.port, 0)
 
     def test_a_port_that_was_set_stays(self) -> None:
-        """A port of the file or of the command line is not changed, also where it is the usual one."""
+        """A port from the file or the command line is not changed, even if it equals the default."""
         of_file = settings([("port", NODE_PORT)], [("port", 8080), ("tls_port", 8443)])
         of_flags = settings().with_flags(port=NODE_PORT, web_port="8080", web_tls_port="8443")
         for wanted in (of_file, of_flags):
@@ -49,7 +49,7 @@ class PortsTests(SynchronousTestCase):
             self.assertEqual((found.node.port, found.web.port, found.web.tls_port), (NODE_PORT, 8080, 8443))
 
     def test_a_node_without_page_looks_for_none(self) -> None:
-        """Only a web node's pages need ports."""
+        """Only a web node checks ports for its pages."""
         asked: list[socket.SocketKind] = []
 
         def is_free(kind: socket.SocketKind, host: str, port: int) -> bool:

@@ -1,4 +1,4 @@
-"""Tests of ``swarmnode.rehearsal``: a team that a seed replays."""
+"""Tests of ``swarmnode.rehearsal``: a simulated team that a seed reproduces."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ print(team.board.digest())
 
 class ReplayTests(SynchronousTestCase):
     def test_seed_replays_a_team_exactly(self) -> None:
-        """Two processes exchange the same datagrams whatever their hash seed is; another seed gives another run."""
+        """Processes with different hash seeds exchange the same datagrams; another seed gives another digest."""
         digest = replayed(self, RUN)
         self.assertEqual(len(digest), 64)
         team = VirtualTeam(8)

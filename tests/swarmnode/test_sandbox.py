@@ -1,4 +1,4 @@
-"""Tests of ``swarmnode.sandbox``: which libraries are there when the rights are given up."""
+"""Tests of ``swarmnode.sandbox``: the libraries that are imported before the process drops its rights."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ text = "import json"
 
 class SandboxTests(SynchronousTestCase):
     def test_only_listed_libraries_are_imported(self) -> None:
-        """Of what a source names at the beginning of a line the listed libraries are imported, and nothing else."""
+        """Only listed libraries that a source imports at the beginning of a line are imported."""
         self.assertEqual(
             wanted(SOURCE),
             [
@@ -39,7 +39,7 @@ class SandboxTests(SynchronousTestCase):
         )
 
     def test_any_bytes(self) -> None:
-        """Bytes that are no Python name nothing, and cost no more than their length."""
+        """Bytes that are not Python result in no imports, in linear time."""
         for source in (
             b"",
             b"\xff" * 1000,

@@ -13,10 +13,10 @@ from swarmnode.command import main
 
 
 class SchemaTests(SynchronousTestCase):
-    """The schema is that of the settings."""
+    """The schema describes the settings."""
 
     def test_has_every_setting(self) -> None:
-        """Each table has each of its keys, with its bounds, and no others; a name is all that is needed."""
+        """Each table lists exactly its keys, with their bounds; only the name is required."""
         out = io.StringIO()
         self.patch(__import__("sys"), "stdout", out)
         self.assertEqual(main(["schema"]), 0)

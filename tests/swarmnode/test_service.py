@@ -1,4 +1,4 @@
-"""Tests of ``swarmnode.service``: a node that comes and goes."""
+"""Tests of ``swarmnode.service``: start, stop, failure and return of a node."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ class NodeServiceTests(SynchronousTestCase):
         self.world.clock.advance(0.5)
 
     def end(self, service: NodeService) -> None:
-        """Stop it if it runs."""
+        """Stop the service if it runs."""
         if service.running:
             self.successResultOf(service.stopService())
 
     def seen(self) -> int:
-        """How many devices the first node sees."""
+        """Return the number of devices that the first node sees."""
         return len(self.devices.records)
 
     def test_service_leaves_in_order(self) -> None:
-        """A node that is stopped says goodbye: it is gone before its lease is over, its store is closed."""
+        """A node that stops leaves the directory before its lease ends, and stops its page."""
         self.assertEqual(self.seen(), 2)
         self.end(self.second)
         self.world.clock.advance(0.1)
@@ -39,7 +39,7 @@ class NodeServiceTests(SynchronousTestCase):
         self.assertFalse(self.world.pages[0].running)
 
     def test_service_vanishes_without_a_word(self) -> None:
-        """A node whose power fails is believed in until its lease is over, and sends nothing any more."""
+        """A node that loses power stays in the directory until its lease ends, and sends nothing more."""
         self.second.vanish()
         self.world.clock.advance(0.3)
         sent = self.world.board.counters["unsent"]
@@ -49,7 +49,7 @@ class NodeServiceTests(SynchronousTestCase):
         self.assertEqual(self.world.board.counters["unsent"], sent)
 
     def test_service_leaves_and_returns(self) -> None:
-        """A node told to leave is gone with its page, and comes back with its identity and a page of its new self."""
+        """A node that leaves for a time stops its page, and returns with its identity and a new page."""
         before = self.second.assembly.node
         self.second.leave(3.0)
         self.assertFalse(self.world.pages[0].running)
@@ -62,7 +62,7 @@ class NodeServiceTests(SynchronousTestCase):
         self.assertEqual([page.running for page in self.world.pages], [0, 1])
 
     def test_second_wish_to_leave_changes_nothing(self) -> None:
-        """Two wishes to leave, one shortly after the other, bring the node back once."""
+        """Two requests to leave within a short time restart the node once."""
         self.second.leave(2.0)
         self.second.leave(3.0)
         self.world.clock.advance(2.5)
@@ -72,7 +72,7 @@ class NodeServiceTests(SynchronousTestCase):
         self.assertEqual(self.seen(), 2)
 
     def test_stopped_while_away_stays_away(self) -> None:
-        """A node that is stopped while it is away does not come back."""
+        """A node that is stopped while it is away does not return."""
         self.second.leave(2.0)
         self.end(self.second)
         self.world.clock.advance(5.0)
@@ -80,7 +80,7 @@ class NodeServiceTests(SynchronousTestCase):
         self.assertFalse(self.second.assembly.node.running)
 
     def test_port_taken_meanwhile_is_tried_again(self) -> None:
-        """A node whose port was taken while it was away tries again until it is free."""
+        """A node that cannot return because its port is in use tries again until the port is free."""
         self.second.leave(1.0)
         squatter = self.world.board.network("127.0.0.1", 7001)
         squatter.listen(lambda datagram, source: None)
@@ -91,6 +91,6 @@ class NodeServiceTests(SynchronousTestCase):
         self.assertEqual(self.seen(), 2)
 
     def test_port_in_use_flies_at_the_start(self) -> None:
-        """A node whose port another holds does not start, and says so to its caller."""
+        """A node with a port in use does not start, and raises ``PortInUse``."""
         third = self.world.service("c", 7001)
         self.assertRaises(PortInUse, third.startService)

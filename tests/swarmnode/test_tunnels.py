@@ -1,4 +1,4 @@
-"""Tests of ``swarmnode.tunnels``: what settings and environment say, wired."""
+"""Tests of ``swarmnode.tunnels``: the network that results from settings and environment."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from swarmnode.tunnels import proxy_for, with_tunnels
 
 class WiringTests(SynchronousTestCase):
     def wired(self, **node: object) -> tuple[Network, list[Any], MemoryReactorClock]:
-        """The network of a node with these settings, the addresses that it knows, and its reactor."""
+        """Return a node's network for these settings, its tunnel addresses, and its reactor."""
         settings = Settings.from_mapping({"node": {"name": "a", **node}}, "test").node
         board = Switchboard(HeapClock(), random.Random(1))
         reactor = MemoryReactorClock()
@@ -30,21 +30,21 @@ class WiringTests(SynchronousTestCase):
         return network, detours_of(FaultyNetwork(network, HeapClock(), random.Random(1))), reactor
 
     def test_nothing_without_tunnels(self) -> None:
-        """A node with neither tunnels nor a port for them has its plain network, and listens at no TCP port."""
+        """A node without tunnels and tunnel port has a plain network and opens no TCP port."""
         for node in ({}, {"known_nodes": ["127.0.0.1:7000"]}, {"known_nodes": ["10.0.0.7:7000"], "tunnels": []}):
             network, addresses, reactor = self.wired(**node)
             self.assertNotIsInstance(network, JointNetwork)
             self.assertEqual((addresses, reactor.tcpServers), ([], []))
 
     def test_known_nodes_may_be_dialled(self) -> None:
-        """A node with known nodes knows a virtual address for each; nothing is dialled or served for that."""
+        """A node has a virtual tunnel address for each known node, and connects to none of them at once."""
         network, addresses, reactor = self.wired(known_nodes=["10.0.0.7:7000"])
         self.assertIsInstance(network, JointNetwork)
         self.assertEqual(addresses, [Url.of("wss://10.0.0.7").address])
         self.assertEqual((reactor.tcpServers, reactor.tcpClients), ([], []))
 
     def test_port(self) -> None:
-        """A port for tunnels is opened where the node listens; one without TLS to this machine alone."""
+        """The tunnel port opens on the node's address, without TLS on the loopback address only."""
         for tls, host in ((True, "10.0.0.5"), (False, "127.0.0.1")):
             reactor = MemoryReactorClock()
             settings = Settings.from_mapping(
@@ -66,7 +66,7 @@ class WiringTests(SynchronousTestCase):
             self.assertEqual((opened, detours_of(network)), ([(443, host)], []))
 
     def test_proxy(self) -> None:
-        """A proxy of the environment is used for TLS, but not for those whom ``no_proxy`` names, nor a wrong one."""
+        """A valid proxy of the environment is used for TLS, except for hosts in ``no_proxy``."""
         url, plain = Url.of("wss://node.example"), Url.of("ws://node.example")
         said = {"https_proxy": "http://10.0.0.1:8080"}
         self.assertEqual(proxy_for(said, url), Proxy("10.0.0.1", 8080))
@@ -82,7 +82,7 @@ class _Port:
     class socket:  # noqa: N801
         @staticmethod
         def setsockopt(*options: int) -> None:
-            """Take any option."""
+            """Accept any option."""
 
     def stopListening(self) -> None:
-        """Close."""
+        """Do nothing."""

@@ -1,4 +1,4 @@
-"""Tests of ``swarmnode.why``: what a person reads who asks why a dog went, and why another took over."""
+"""Tests of ``swarmnode.why``: the explanation of a decision and of a takeover."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ class WhyTests(SynchronousTestCase):
         self.shell = Shell(self.team, self.team.services["vaio"].assembly.node)
 
     def why(self, line: str) -> str:
-        """What ``swarm why LINE`` prints, without trouble."""
+        """Run ``swarm why LINE``, which must succeed, and return its output."""
         code, output = self.shell.run(main, line.split())
         self.assertEqual((code, self.shell.said), (0, ""))
         return output
 
     def until(self, status: str) -> str:
-        """Let the team go on until a dog has ``status``; returns its name."""
+        """Run the team until a dog has ``status``, and return its name."""
         for _ in range(400):
             self.team.clock.advance(0.2)
             for device in self.team.state()["devices"]:
@@ -37,7 +37,7 @@ class WhyTests(SynchronousTestCase):
         self.fail(f"nobody was ever {status}")
 
     def test_takeover_is_explained(self) -> None:
-        """Two epochs: who went first and who took over when it was gone, all agreeing, from the reports they name."""
+        """Both epochs are explained: first agent, successor, agreement, tokens and reports."""
         task = self.team.run_demo()
         first = self.until("EXECUTING")
         self.team.clock.advance(1.5)
@@ -62,7 +62,7 @@ class WhyTests(SynchronousTestCase):
         self.assertEqual([(each["chosen"], each["agree"]) for each in card["why"]], [(second, 2), (first, 3)])
 
     def test_errors_by_name(self) -> None:
-        """No task, no decision, an unknown id and a missing node are one line each, which names what there is."""
+        """No task, no decision, an unknown id and an unknown node are reported in one line with the known values."""
         self.assertEqual(self.shell.run(main, ["last"]), (1, ""))
         self.assertEqual(self.shell.said, "swarm why: the team has no task; assign one on the page of its web node\n")
         task = self.team.run_demo()
@@ -75,14 +75,14 @@ class WhyTests(SynchronousTestCase):
         self.assertIn("no node 'nobody' runs", self.shell.said)
 
     def test_title_cannot_move_the_cursor(self) -> None:
-        """What a task is called reaches the terminal without its control characters."""
+        """Control characters in a task's title do not reach the terminal."""
         node = self.team.services["vaio"].assembly.node
         Deferred.fromCoroutine(node.submit(Task("evil", "search", "red\x1b[2J\n target")))
         self.team.clock.advance(1.0)
         self.assertTrue(self.shell.run(main, ["evil"])[1].startswith("task evil: red [2J  target\n"))
 
     def test_ids_cannot_move_the_cursor(self) -> None:
-        """The ids of the tasks that a refusal names reach the terminal without their control characters."""
+        """Control characters in the task ids of an error message do not reach the terminal."""
         node = self.team.services["vaio"].assembly.node
         for task_id in ("a\x1b[2J", "a\n"):
             Deferred.fromCoroutine(node.submit(Task(task_id, "search", "red")))
@@ -93,7 +93,7 @@ class WhyTests(SynchronousTestCase):
         self.assertEqual(self.shell.said, "swarm why: 2 tasks begin with 'a': a , a [2J; give more of the id\n")
 
     def test_prefix(self) -> None:
-        """A beginning that fits several is refused with their names; a whole id is meant, also where others go on."""
+        """An ambiguous prefix is rejected with the matching ids; a complete id matches even if it is a prefix."""
         tasks = [Task(name, "k", name, created=float(n)) for n, name in enumerate(("ab", "abc", "b"))]
         self.assertEqual(chosen("last", tasks).task_id, "b")
         self.assertEqual(chosen("ab", tasks).task_id, "ab")

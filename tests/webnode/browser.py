@@ -1,4 +1,4 @@
-"""A browser of bytes: HTTP requests through a real ``Site`` to a transport in memory, on a turned clock."""
+"""HTTP requests as bytes through a real ``Site`` to a transport in memory, in virtual time."""
 
 from __future__ import annotations
 
@@ -38,28 +38,28 @@ class Connection:
         return self
 
     def taken(self) -> bytes:
-        """What has come since the last look."""
+        """Return the data received since the last call."""
         data: bytes = self.transport.value()
         self.transport.clear()
         return data
 
     def pause(self) -> None:
-        """Read no more: the transport tells its producer to wait."""
+        """Stop reading, so that the transport pauses its producer."""
         producer: Any = self.transport.producer
         producer.pauseProducing()
 
     def resume(self) -> None:
-        """Read again."""
+        """Continue reading."""
         producer: Any = self.transport.producer
         producer.resumeProducing()
 
     def leave(self) -> None:
-        """Close."""
+        """Close the connection."""
         self.protocol.connectionLost(Failure(ConnectionDone()))
 
 
 def site_of(root: IResource, clock: Clock, limits: AddressLimits | None = None) -> Site:
-    """A site on ``clock`` with the web node's own kind of requests, and of connections where there are ``limits``."""
+    """Create a site on ``clock`` with the web node's requests and, if ``limits`` are given, its connections."""
     site = QuietSite(root, requestFactory=CappedRequest, reactor=clock, timeout=None)
     if limits is not None:
         limited(site, limits)

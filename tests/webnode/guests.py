@@ -1,4 +1,4 @@
-"""Guests: sessions whose tokens are the names of roles; whoever shows none is anyone."""
+"""Sessions for tests, in which the token is the name of the role."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from webnode.visitor import OpenSessions, Role, Visitor
 
 class Guests(OpenSessions):
     def visitor(self, token: str, now: float) -> Visitor:
-        """Who is of the role that the token names."""
+        """Return a visitor with the role that the token names."""
         for role in get_args(Role):
             if token == role:
                 return Visitor(token, role, f"id of {token}")

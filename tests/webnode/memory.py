@@ -21,7 +21,7 @@ from webnode.team import TeamDesk
 
 
 class MemorySurvey(TeamSurvey):
-    """Answers that it was made with: of the network, of each device by uuid, of the links and of the team."""
+    """A survey that returns fixed answers for the network, each device, the links and the team."""
 
     def __init__(self, network: Json, inventories: Mapping[str, Json], links: Json = None, team: Json = None) -> None:
         self._told_network = network
@@ -30,48 +30,48 @@ class MemorySurvey(TeamSurvey):
         self._told_team = team
 
     def network(self) -> Deferred[Json]:
-        """Return it."""
+        """Return the network."""
         return succeed(self._told_network)
 
     def links(self) -> Deferred[Json]:
-        """Return them."""
+        """Return the links."""
         return succeed(self._told_links)
 
     def team(self) -> Json:
-        """Return it."""
+        """Return the team."""
         return self._told_team
 
     def inventory(self, uuid: str) -> Deferred[Json]:
-        """Return it, or fail with 504: the device did not answer."""
+        """Return the inventory, or fail with 504 for a device that does not answer."""
         if uuid not in self._inventories:
             return fail(Refusal("device", "it did not answer", "wait a moment, then try again", 504))
         return succeed(self._inventories[uuid])
 
 
 class MemoryHalts(TeamHalts):
-    """The button of a team that obeys; ``devices`` are the uuids of those that say so, ``said`` who pressed what."""
+    """The emergency stop of a team that obeys: ``devices`` are the answering uuids, ``said`` the requests."""
 
     def __init__(self, *devices: str) -> None:
         self.devices = devices
         self.said: list[tuple[str, str]] = []
 
     def halt(self, by: str) -> Deferred[dict[str, str]]:
-        """All stand."""
+        """Record a stop."""
         self.said.append(("halt", by))
         return succeed(dict.fromkeys(self.devices, "stands"))
 
     def release(self, by: str, stops: Sequence[str] | None = None) -> Deferred[dict[str, str]]:
-        """All go on."""
+        """Record a release."""
         self.said.append(("release", by))
         return succeed(dict.fromkeys(self.devices, "goes on"))
 
     def is_halted(self) -> bool:
-        """Whether the last that was pressed was the halt."""
+        """Return whether the last request was a stop."""
         return bool(self.said) and self.said[-1][0] == "halt"
 
 
 class MemoryFaults(FaultControl):
-    """Faults that are only written down, in ``caused`` as (uuid, kind, seconds, amount); ``rows`` are those told of."""
+    """Fault control that only records: ``caused`` has (uuid, kind, seconds, amount), ``rows`` the active faults."""
 
     def __init__(self, *kinds: str) -> None:
         self.caused: list[tuple[str, str, float, float | None]] = []
@@ -79,11 +79,11 @@ class MemoryFaults(FaultControl):
         self._can = kinds
 
     def kinds(self, uuid: str) -> Sequence[str]:
-        """Return what it was made with."""
+        """Return the given kinds."""
         return self._can
 
     def cause(self, uuid: str, kind: str, seconds: float, amount: float | None) -> Deferred[None]:
-        """Write it down; nothing comes of it."""
+        """Record the fault without an effect."""
         self.caused.append((uuid, kind, seconds, amount))
         row: dict[str, Json] = {
             "n": len(self.caused),
@@ -97,14 +97,14 @@ class MemoryFaults(FaultControl):
         return succeed(None)
 
     def active(self) -> list[dict[str, Json]]:
-        """Those that were caused, the newest first."""
+        """Return the recorded faults, the newest first."""
         return self.rows
 
 
 class MemoryPhones:
-    """Phones that are only counted: ``here`` maps each uuid to its name, ``looks`` are (uuid, bytes, values).
+    """Phones that are only counted: ``here`` maps uuids to names, ``looks`` has (uuid, bytes, values).
 
-    ``check`` raises ``Refusal`` for what is no picture.
+    ``check`` raises ``Refusal`` for data that is not a picture.
     """
 
     def __init__(self, most: int = 8, check: Callable[[bytes], object] = lambda jpeg: None) -> None:
@@ -115,7 +115,7 @@ class MemoryPhones:
         self._check = check
 
     def join(self, secret: bytes, name: str, can: Mapping[str, Any]) -> Deferred[str]:
-        """Count it; its uuid is the end of its secret."""
+        """Add the phone; its uuid is the end of its secret."""
         uuid = secret[-20:].hex()
         if uuid not in self.here and len(self.here) >= self._most:
             return fail(Refusal("phone", "too many take part", "wait until one leaves", 409))
@@ -123,7 +123,7 @@ class MemoryPhones:
         return succeed(uuid)
 
     def look(self, uuid: str, jpeg: bytes, values: Mapping[str, float]) -> Wanted:
-        """Keep it."""
+        """Record the picture."""
         self._check(jpeg)
         if uuid not in self.here:
             raise Refusal("uuid", "this phone takes no part here", "join by POST /api/v1/phones", 404)
@@ -131,17 +131,17 @@ class MemoryPhones:
         return Wanted(10.0, "Look for the red target: turn slowly.")
 
     def leave(self, uuid: str) -> None:
-        """Forget it."""
+        """Remove the phone."""
         self.here.pop(uuid, None)
 
     def close(self) -> Deferred[Any]:
-        """Forget all."""
+        """Remove all phones."""
         self.here.clear()
         return succeed(None)
 
 
 class MemoryInvites(TeamInvites):
-    """Pages that it was made with, and drawings that only say of what they are."""
+    """Invitations with given pages, and drawings that contain only their text."""
 
     def __init__(self, *urls: str, authority: bytes = b"", fingerprint: str = "") -> None:
         self.pages = list(urls)
@@ -149,11 +149,11 @@ class MemoryInvites(TeamInvites):
         self.fingerprint = fingerprint
 
     def urls(self) -> list[str]:
-        """Return them."""
+        """Return the pages."""
         return self.pages
 
     def drawn(self, text: str) -> Deferred[str]:
-        """Return an empty picture with ``text`` for its title, or nothing where there is none."""
+        """Return an empty picture with the title ``text``, or nothing for an empty text."""
         if not text:
             return succeed("")
         title = text.replace("&", "&amp;").replace("<", "&lt;")
@@ -161,26 +161,26 @@ class MemoryInvites(TeamInvites):
 
 
 class MemoryFrames:
-    """A frame source in memory: ``show`` hands over a picture; ``watched`` says whose pictures are wanted."""
+    """A frame source in memory: ``show`` delivers a picture; ``watched`` has the watched devices."""
 
     def __init__(self) -> None:
         self.watched: dict[str, OnFrame] = {}
         self.opened = 0
 
     def watch(self, uuid: str, on_frame: OnFrame) -> Callable[[], None]:
-        """Watch ``uuid``; every device has a camera here."""
+        """Watch ``uuid``; every device has a camera."""
         self.watched[uuid] = on_frame
         self.opened += 1
         return lambda: self.watched.pop(uuid, None) and None
 
     def show(self, uuid: str, seq: int, jpeg: bytes, age: float = 0.0) -> None:
-        """Hand over one picture, if somebody watches."""
+        """Deliver a picture if the device is watched."""
         if uuid in self.watched:
             self.watched[uuid](seq, jpeg, age)
 
 
 class MemoryDesk(TeamDesk):
-    """A desk that writes down what it is asked, in ``asked``, and keeps the target of its own small yard."""
+    """A desk that records each request in ``asked``, and has its own small map."""
 
     def __init__(self, catalogue: Sequence[Mapping[str, Any]] = (), yard: Mapping[str, Any] | None = None) -> None:
         self.asked: list[tuple[Any, ...]] = []
@@ -203,7 +203,7 @@ class MemoryDesk(TeamDesk):
         *arguments: Any,
         refused: Callable[[Refused], Refusal | None] = lambda refused: None,
     ) -> Deferred[Any]:
-        """Answer with the rows of ``settings``, changed as asked; fails where the device has no such setting."""
+        """Apply the changes to ``settings`` and return its rows; fail for an unknown setting."""
         rows = self.settings.get(uuid, [])
         for changes in arguments:
             for key, value in changes.items():
@@ -215,61 +215,61 @@ class MemoryDesk(TeamDesk):
         return succeed(rows)
 
     def run_demo(self, task_id: str = "") -> str:
-        """Return ``demo-N``, or the id that it is to have."""
+        """Return ``demo-N``, or the given id."""
         noted = self._noted("demo")
         return task_id or noted
 
     def assign(self, name: str, tolerates: int = 1, group: str = "", task_id: str = "") -> dict[str, Any]:
-        """Return ``assign-N``, or the id that it is to have; nobody is able, nobody is refused."""
+        """Return ``assign-N``, or the given id, without any able or refused device."""
         if name not in [task["name"] for task in self.tasks]:
             raise Refusal("name", f"there is no task {name!r}", "choose one of /api/v1/catalogue", 404)
         noted = self._noted("assign", name)
         return {"id": task_id or noted, "able": [], "refused": {}}
 
     def preview(self, name: str, group: str = "") -> dict[str, Any]:
-        """Return what is in ``previews``, else that nobody is able and nobody refused."""
+        """Return the entry of ``previews``, or a result without any able or refused device."""
         if name not in [task["name"] for task in self.tasks]:
             raise Refusal("name", f"there is no task {name!r}", "choose one of /api/v1/catalogue", 404)
         told = self.previews.get(name, {"able": [], "refused": {}, "likely": None})
         return {**told, "together": self.together.get(group, [])}
 
     def catalogue(self) -> list[Mapping[str, Any]]:
-        """Return what the desk was made with."""
+        """Return the given catalogue."""
         return self.tasks
 
     def cancel(self, task_id: str) -> None:
-        """Write it down."""
+        """Record the request."""
         self._noted("cancel", task_id)
 
     def pause(self, task_id: str) -> None:
-        """Write it down."""
+        """Record the request."""
         self._noted("pause", task_id)
 
     def resume(self, task_id: str) -> None:
-        """Write it down."""
+        """Record the request."""
         self._noted("resume", task_id)
 
     def message(self, uuid: str, text: str) -> Deferred[dict[str, Any]]:
-        """Write it down; nobody is here to have it."""
+        """Record the request; the message reaches no device."""
         self._noted("message", uuid, text)
         return succeed({"delivered": [], "failed": {}})
 
     def disconnect(self, uuid: str, seconds: float) -> Deferred[Any]:
-        """Write it down."""
+        """Record the request."""
         return succeed(self._noted("disconnect", uuid, seconds))
 
     def move_target(self, x: float, y: float) -> Deferred[bool]:
-        """Move it."""
+        """Move the target."""
         self._change(target={"x": x, "y": y, "radius": 0.08})
         return succeed(bool(self._noted("target", x, y)))
 
     def clear_target(self) -> Deferred[bool]:
-        """Take it away."""
+        """Remove the target."""
         self._change(target=None)
         return succeed(bool(self._noted("clear")))
 
     def move_robot(self, name: str, x: float, y: float, heading: float) -> Deferred[bool]:
-        """Move it."""
+        """Move the robot."""
         place = {"x": x, "y": y, "heading": heading}
         if self.ground is not None:
             self._change(dogs=[{**dog, **place} if dog["name"] == name else dog for dog in self.ground["dogs"]])
@@ -280,7 +280,7 @@ class MemoryDesk(TeamDesk):
             self.ground = {**self.ground, **changes}
 
     def yard(self) -> dict[str, Any] | None:
-        """Return the ground."""
+        """Return the map."""
         return self.ground
 
     def _noted(self, *wish: Any) -> str:

@@ -1,4 +1,4 @@
-"""The routes of what an operator does: stopping the team, asking before assigning, lifting robots."""
+"""Tests of operator routes: stop of the team, preview of tasks, moves of robots, settings and messages."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ class ActionTests(SynchronousTestCase):
         self.client: FlaskClient = app.test_client()
 
     def ask(self, method: str, path: str, body: Any = None, role: str = "operator") -> tuple[int, Any]:
-        """Status and JSON of an answer."""
+        """Send a request and return status and JSON of the answer."""
         headers = {"Authorization": f"Bearer {role}", "X-Swarm": "1"}
         answer = self.client.open(f"{API}/{path}", method=method, json=body, headers=headers)
         return answer.status_code, answer.get_json()
 
     def test_stop_and_go_on(self) -> None:
-        """Both are answered with what each device does, and noted with who asked; whether it is stopped can be read."""
+        """Stop and release return the state of each device and are audited; viewers can read the stop state."""
         stopped = (200, {"halted": True, "devices": {"01": "stands", "02": "stands"}})
         self.assertEqual(self.ask("POST", "halt", {}), stopped)
         self.assertEqual(self.ask("GET", "halt", role="viewer"), (200, {"halted": True}))
@@ -51,7 +51,7 @@ class ActionTests(SynchronousTestCase):
         )
 
     def test_stop_is_for_operators(self) -> None:
-        """A viewer stops nobody, and neither does a node without the means, which says so."""
+        """A viewer cannot stop the team, and a node without the function rejects the request with an explanation."""
         for method in ("POST", "DELETE"):
             self.assertEqual(self.ask(method, "halt", {}, "viewer")[0], 403)
         self.assertEqual(self.halts.said, [])
@@ -60,7 +60,7 @@ class ActionTests(SynchronousTestCase):
         self.assertEqual((status, answer["error"]["field"]), (409, "halt"))
 
     def test_preview_is_for_viewers(self) -> None:
-        """Who would take a task can be asked by who only looks; a task that is not there is named."""
+        """A viewer can read which devices would take a task; an unknown task is rejected by name."""
         preview = {"able": [{"uuid": "01", "name": "dog1", "busy": ""}], "refused": {"vaio": ["no camera"]}}
         self.desk.previews["search"] = {**preview, "likely": None}
         told = {**preview, "likely": None, "together": []}
@@ -70,13 +70,13 @@ class ActionTests(SynchronousTestCase):
         self.assertEqual(self.desk.asked, [])
 
     def test_lift_a_robot(self) -> None:
-        """A robot is set down where it is wanted, looking as before unless said otherwise."""
+        """A robot is moved to the given place, and keeps its heading unless another one is given."""
         self.assertEqual(self.ask("PUT", "yard/robots/dog1", {"x": 1, "y": 2})[0], 202)
         self.assertEqual(self.ask("PUT", "yard/robots/dog1", {"x": 1, "y": 2, "heading": -1.5})[0], 202)
         self.assertEqual(self.desk.asked, [("robot", "dog1", 1.0, 2.0, 0.25), ("robot", "dog1", 1.0, 2.0, -1.5)])
 
     def test_refuse_what_no_robot_can(self) -> None:
-        """A robot that is not there, a place outside, a heading that is none: each names the field and the remedy."""
+        """An unknown robot, a place outside the map and an invalid heading are rejected with field and remedy."""
         wrong: list[tuple[str, Any, int, str]] = [
             ("cat", {"x": 1, "y": 1}, 404, "name"),
             ("dog1", {"x": 9, "y": 1}, 400, "robot"),
@@ -93,7 +93,7 @@ class ActionTests(SynchronousTestCase):
         self.assertEqual(self.ask("PUT", "yard/robots/dog1", {"x": 1, "y": 1})[0], 409)
 
     def test_settings(self) -> None:
-        """A viewer reads the settings of a device, an operator changes them; the device's own refusal comes through."""
+        """A viewer reads the settings of a device, an operator changes them, and the device's errors are forwarded."""
         status, rows = self.ask("GET", "devices/01/settings", role="viewer")
         self.assertEqual(
             (status, rows[0]["key"], rows[0]["value"], rows[0]["most"]), (200, "description", "a dog", 200.0)
@@ -112,7 +112,7 @@ class ActionTests(SynchronousTestCase):
             self.assertEqual((status, answer["error"]["field"]), (expected, field), body)
 
     def test_orders_answer_what_became_of_them(self) -> None:
-        """A message is answered with who has it; a device that was lost meanwhile is an error that says so."""
+        """A message is answered with its recipients; a device that left in the meantime is reported as an error."""
         self.assertEqual(self.ask("POST", "message", {"text": "sit"}), (202, {"delivered": [], "failed": {}}))
         self.assertEqual(self.ask("POST", "devices/01/message", {"text": "sit"})[1]["id"], "01")
         left = Refusal("device", "dog1 left during the request", "wait until it is back", 409)
@@ -127,7 +127,7 @@ class ActionTests(SynchronousTestCase):
         self.assertEqual(self.chronicle.since(0), [])
 
     def test_disconnecting_is_a_fault_on_purpose(self) -> None:
-        """A device that was told to leave is in the chronicle as such, so that the takeover is timed from there."""
+        """A device that is disconnected is a fault in the chronicle, so the takeover is timed from then on."""
         self.ask("POST", "devices/01/disconnect", {"seconds": 5})
         (entry,) = self.chronicle.since(0)
         self.assertEqual((entry.kind, entry.uuid, entry.at), ("fault", "01", 1e9))

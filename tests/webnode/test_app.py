@@ -1,4 +1,4 @@
-"""What ``webnode.app`` promises."""
+"""Tests of ``webnode.app``."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class AppTests(SynchronousTestCase):
         return app.test_client()
 
     def test_serve_page(self) -> None:
-        """The page names the node that serves it, carries the strict headers, and is revalidated by ETag."""
+        """The page names its node, has the strict headers, and is revalidated by ETag."""
         page = self.client.get("/")
         self.assertIn(b'<b id="node">vaio</b>', page.data)
         for name, value in HEADERS.items():
@@ -50,12 +50,12 @@ class AppTests(SynchronousTestCase):
         self.assertEqual(self.client.get("/", headers={"If-None-Match": page.headers["ETag"]}).status_code, 304)
 
     def test_page_escapes_names(self) -> None:
-        """A node whose name is markup is shown as text."""
+        """Markup in a node's name is escaped."""
         self.state["node"] = "<script>alert(1)</script>"
         self.assertNotIn(b"<script>alert", self.client.get("/").data)
 
     def test_read(self) -> None:
-        """State, devices in the order of joining, tasks and catalogue are JSON."""
+        """State, devices in the order of joining, tasks and catalogue are returned as JSON."""
         self.assertEqual(self.client.get("/api/v1/state").get_json(), self.state)
         devices = self.client.get("/api/v1/devices").get_json()
         self.assertEqual([device["name"] for device in devices], ["dog1", "dog2", "dog3"])
@@ -63,7 +63,7 @@ class AppTests(SynchronousTestCase):
         self.assertEqual([task["name"] for task in self.client.get("/api/v1/catalogue").get_json()], ["search"])
 
     def test_grant(self) -> None:
-        """Every lawful wish reaches the desk and is answered with 202."""
+        """Every valid request reaches the desk and is answered with 202."""
         wishes: list[tuple[str, Any]] = [
             ("/api/v1/demo", {}),
             ("/api/v1/tasks", {"name": "search"}),
@@ -97,7 +97,7 @@ class AppTests(SynchronousTestCase):
         )
 
     def test_tell_who_can(self) -> None:
-        """Assigning answers the id, who is able, and who was refused and why."""
+        """Assigning returns the id, the able devices, and the refused devices with reasons."""
         answer = {"id": "t2", "able": ["dog1"], "refused": {"dog2": ["no camera"]}}
         self.desk.assign = lambda name, tolerates=1, group="", task_id="": {**answer, "for": tolerates}  # type: ignore
         told = self.client.post("/api/v1/tasks", json={"name": "search"}).get_json()
@@ -106,7 +106,7 @@ class AppTests(SynchronousTestCase):
         self.assertEqual(told["for"], 3)
 
     def test_groups(self) -> None:
-        """A task may be assigned to a group, by a name of 1 to 64 characters."""
+        """A task can be assigned to a group with a name of 1 to 64 characters."""
         asked: list[Any] = []
         self.desk.assign = lambda *wish: asked.append(wish) or {"id": "t"}  # type: ignore
         for body, code in (({"group": "yard"}, 202), ({}, 202), ({"group": "x" * 65}, 400), ({"group": 5}, 400)):
@@ -114,7 +114,7 @@ class AppTests(SynchronousTestCase):
         self.assertEqual(asked, [("search", 1, "yard", ""), ("search", 1, "", "")])
 
     def test_id_of_a_named_wish(self) -> None:
-        """A wish that its visitor named makes a task whose id every web node derives alike, and no other wish has."""
+        """The id of a task follows from the request's idempotency key, equally on every web node."""
         other = self.client_of(lambda: self.state)
 
         def asked(client: FlaskClient, path: str, key: str) -> str:
@@ -128,7 +128,7 @@ class AppTests(SynchronousTestCase):
         self.assertEqual([asked(other, path, key) for path, key in wishes], ids)
 
     def test_refuse(self) -> None:
-        """Every unlawful wish gets its code and an error with field, problem and remedy, and reaches nobody."""
+        """Every invalid request gets its status and an error with field, problem and remedy, and has no effect."""
         wishes: list[tuple[str, Any, int, str]] = [
             ("/api/v1/tasks", {"name": "fly"}, 404, "name"),
             ("/api/v1/tasks", {}, 400, "name"),
@@ -157,14 +157,14 @@ class AppTests(SynchronousTestCase):
         self.assertEqual(self.desk.asked, [])
 
     def test_refuse_broken_bodies(self) -> None:
-        """No body, however broken, nested or not a number, becomes anything but a 400."""
+        """Malformed, deeply nested and non-finite bodies are answered with 400."""
         headers = {"Content-Type": "application/json"}
         for body in (b"{", b"\xff", b'{"x": NaN, "y": 1}', b'{"x": 1e999, "y": 1}', b"[" * 60000):
             answer = self.client.post("/api/v1/target", data=body, headers=headers)
             self.assertEqual(answer.status_code, 400, body[:20])
 
     def test_do_once_what_is_asked_twice(self) -> None:
-        """An order that is repeated with its id is given once; an id that is no name is refused."""
+        """A request that is repeated with its idempotency key runs once; an invalid key is rejected."""
         answers = [self.client.post("/api/v1/demo", json={}, headers={"Idempotency-Key": "a1"}) for _ in range(2)]
         self.assertEqual([answer.status_code for answer in answers], [202, 202])
         self.assertEqual(answers[0].get_json(), answers[1].get_json())
@@ -173,7 +173,7 @@ class AppTests(SynchronousTestCase):
         self.assertEqual((bad.status_code, bad.get_json()["error"]["field"]), (400, "Idempotency-Key"))
 
     def test_share_with_the_team(self) -> None:
-        """A page of another web node of the team may look and order here; the browser is told so beforehand."""
+        """Pages of other web nodes of the team may read and send requests, also by CORS preflight; others may not."""
         other, evil = {"Origin": "http://other:8080"}, {"Origin": "http://evil:8080"}
         for headers, told in ((other, "http://other:8080"), (evil, None)):
             answer = self.client.get("/api/v1/state", headers=headers)
@@ -183,7 +183,7 @@ class AppTests(SynchronousTestCase):
         self.assertEqual(self.client.post("/api/v1/demo", json={}, headers=other).status_code, 202)
 
     def test_hide_failures(self) -> None:
-        """A failure inside is answered with 500 and no trace; an unknown path and method with theirs, all as JSON."""
+        """An internal error is answered with 500 without details; unknown paths and methods get JSON errors, too."""
 
         def fail() -> State:
             raise RuntimeError("secret path")
@@ -197,7 +197,7 @@ class AppTests(SynchronousTestCase):
         self.assertEqual(self.client.get("/api/state").status_code, 404)
 
     def test_weigh_page(self) -> None:
-        """What is loaded at first stays under 64 kB, 28 kB packed, and no file of the page names another origin."""
+        """The first load stays below 64 kB, compressed below 28 kB, and no file of the page names another origin."""
         room = Path(__file__).parents[2] / "webnode"
         first, wanted = [], [room / "templates" / "index.html"]
         for path in wanted:

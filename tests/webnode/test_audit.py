@@ -1,4 +1,4 @@
-"""Tests of ``webnode.audit``: who changed what, in a file that outlives the node."""
+"""Tests of ``webnode.audit``: the log of changes, in a file that outlives the node."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class AuditTests(SynchronousTestCase):
         return Audit(self.path, lambda: self.now, most)
 
     def test_keep_each_line(self) -> None:
-        """Each change is one line of JSON with time, who, from where, what and how it ended, for the owner alone."""
+        """Each change is one line of JSON with time, visitor, address, route, target and outcome, in a private file."""
         self.audit().note(ANN, "10.0.0.9", "POST /x/{uuid}", "01\n\x1b[2J", "202")
         (line,) = self.path.read_text().splitlines()
         told = {"at": 1000.0, "who": "ann", "role": "operator", "from": "10.0.0.9", "session": "ab12"}
@@ -39,7 +39,7 @@ class AuditTests(SynchronousTestCase):
         self.assertEqual(stat.S_IMODE(self.path.stat().st_mode), 0o600)
 
     def test_outlive_the_node(self) -> None:
-        """After a start the lines of before are told, the newest first; what is broken in the file is passed over."""
+        """After a restart earlier lines are returned, the newest first, and invalid lines are skipped."""
         first = self.audit()
         for number in range(3):
             first.note(ANN, "h", "POST /x", str(number), "202")
@@ -51,7 +51,7 @@ class AuditTests(SynchronousTestCase):
         self.assertEqual(again.counts(), {("operator", "202"): 1})
 
     def test_stay_within_its_room(self) -> None:
-        """A full file is put aside once, so the two never take more than twice the most; the newest lines stay."""
+        """A full file is rotated once, so both files stay below twice the limit; the newest lines remain."""
         audit = self.audit(2000)
         for number in range(200):
             audit.note(ANN, "h", "POST /x", str(number), "202")
@@ -62,7 +62,7 @@ class AuditTests(SynchronousTestCase):
         self.assertEqual(len(audit.newest(1000)), AUDITED)
 
     def test_let_nobody_flood_it(self) -> None:
-        """What a stranger does again and again is one line a minute that says how often; others' lines stay."""
+        """Repeated requests of an unknown visitor are one line a minute with a count; other lines remain."""
         audit = self.audit()
         audit.note(ANN, "h", "POST /x", "", "202")
         for _ in range(1000):
@@ -76,7 +76,7 @@ class AuditTests(SynchronousTestCase):
         self.assertEqual(audit.counts()["anyone", "429"], 1002)
 
     def test_go_on_without_a_file(self) -> None:
-        """Where the file cannot be written, or there is to be none, the newest lines are still told."""
+        """Without a file, or if it cannot be written, the newest lines are still available."""
         self.path = Path(self.mktemp()) / "missing" / "audit"
         audit = self.audit()
         for number in range(2):
@@ -89,7 +89,7 @@ class AuditTests(SynchronousTestCase):
 
 class AuditRouteTests(SynchronousTestCase):
     def test_tell_operators(self) -> None:
-        """An operator reads who did what, the newest first, as many as it wants; a viewer does not."""
+        """An operator reads the requested number of lines, the newest first; a viewer may not."""
         state = state_of([], [], {}, node="vaio")
         client = create_app(lambda: state, Board(MemoryDesk(), Guests())).test_client()
         bearer = {"Authorization": "Bearer operator"}

@@ -1,4 +1,4 @@
-"""Tests of ``webnode.board``: what every web node has, and what only some have."""
+"""Tests of ``webnode.board``: the required and the optional parts of a web node."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from webnode.visitor import OpenSessions
 
 class BoardTests(SynchronousTestCase):
     def test_let_everybody_in(self) -> None:
-        """Open sessions make an operator of whoever comes, with or without a token."""
+        """Open sessions give every visitor the role of operator, with or without a token."""
         sessions = OpenSessions()
         token = self.successResultOf(sessions.sign_in("whatever", "10.0.0.9", 5.0))
         sessions.revoke(sessions.visitor(token.text, 6.0).token_id)
@@ -19,7 +19,7 @@ class BoardTests(SynchronousTestCase):
         self.assertGreater(token.until, 5.0)
 
     def test_say_what_it_has(self) -> None:
-        """What a node lacks is not said to the page; a yard counts where there is one."""
+        """``has`` lists only the optional parts that the node has; the map counts if it exists."""
         self.assertEqual(Board(MemoryDesk(), OpenSessions()).has, [])
         yard = MemoryDesk(yard={"walls": [3.0, 2.4], "dogs": [], "target": None})
         self.assertEqual(Board(yard, OpenSessions()).has, ["yard"])

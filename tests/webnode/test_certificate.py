@@ -1,4 +1,4 @@
-"""Tests of ``webnode.certificate``: an authority for each web node, which vouches for the local network alone."""
+"""Tests of ``webnode.certificate``: each web node has an authority that is limited to the local network."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class AuthorityTests(SynchronousTestCase):
         skip = SKIP
 
     def test_be_the_same_after_each_start(self) -> None:
-        """One secret gives one authority, byte for byte and for good; another secret another one, by another name."""
+        """A secret always gives the same authority, byte for byte; another secret another one with another name."""
         first, second, other = authority(SECRET, "vaio"), authority(SECRET, "vaio"), authority(bytes(32), "vaio")
         self.assertEqual(first.pem, second.pem)
         self.assertTrue(first.fingerprint.startswith("BC:95:A9:E3:43:30"), first.fingerprint)
@@ -39,7 +39,7 @@ class AuthorityTests(SynchronousTestCase):
         self.assertNotEqual(other.certificate.subject, first.certificate.subject)
 
     def test_vouch_for_the_local_network_alone(self) -> None:
-        """What it signs is believed of private addresses and local names, and of no site of the internet."""
+        """A client accepts the authority's certificates for private addresses and local names, not for public sites."""
         signer = authority(SECRET, "vaio")
         for name in ("192.168.0.7", "10.1.2.3", "127.0.0.1", "fd00::7", "vaio.local", "vaio.home.arpa", "localhost"):
             self.assertTrue(self.is_believed(signer, leaf(signer, "vaio", [name], NOW, random.Random(1)), name), name)
@@ -48,7 +48,7 @@ class AuthorityTests(SynchronousTestCase):
             self.assertNotIn(name, nameable([name]))
 
     def is_believed(self, signer: Authority, made: Leaf, name: str) -> bool:
-        """Whether a strict client that trusts the authority takes the leaf for ``name``."""
+        """Return whether a strict client that trusts the authority accepts the certificate for ``name``."""
         try:
             wanted: Any = x509.IPAddress(ipaddress.ip_address(name))
         except ValueError:
@@ -75,7 +75,7 @@ class LeafTests(SynchronousTestCase):
         return self.leaf.flaw(self.signer, self.names if names is None else names, now)
 
     def test_serve_for_a_year_less_a_month(self) -> None:
-        """It is good now and until a month before it ends; then, or before it is valid, it says so."""
+        """A certificate is valid until a month before its end; after that, and before its start, it has a flaw."""
         self.assertEqual(self.flaw(), "")
         self.assertEqual(self.flaw(NOW + (LASTS - LEFT).total_seconds() - 3 * DAY), "")
         self.assertEqual(self.flaw(NOW + (LASTS - LEFT).total_seconds()), "it expires soon")
@@ -84,26 +84,26 @@ class LeafTests(SynchronousTestCase):
         self.assertEqual(lasts, timedelta(days=365))
 
     def test_name_what_it_lacks(self) -> None:
-        """An address that it lacks is named; one for which nothing can be signed is not missed."""
+        """A missing address is a flaw; a name that the authority cannot sign is not."""
         self.assertEqual(self.flaw(names=["192.168.0.8"]), "it lacks 192.168.0.8")
         self.assertEqual(self.flaw(names=["8.8.8.8", "example.org", "fe80::1%eth0", "", "a b.local", "-"]), "")
         self.assertEqual(self.flaw(names=["::ffff:192.168.0.7", "VAIO.local.", "127.0.0.1", "localhost"]), "")
 
     def test_tell_a_foreign_one(self) -> None:
-        """One that another authority signed, or whose key is another one's, is not taken."""
+        """A certificate of another authority, or with the key of another certificate, is rejected."""
         self.assertIn("another authority", self.leaf.flaw(authority(bytes(32), "vaio"), self.names, NOW))
         other = leaf(self.signer, "vaio", self.names, NOW, random.Random(2))
         self.assertIn("key", Leaf(other.key, self.leaf.certificate).flaw(self.signer, self.names, NOW))
 
     def test_bear_any_clock(self) -> None:
-        """A clock that is decades off makes a lawful certificate all the same; it is renewed when the clock is set."""
+        """With a clock that is decades wrong a valid certificate is created, and replaced after the clock is set."""
         for now in (0.0, -1e12, 9e9, 1e300):
             made = leaf(self.signer, "pi", [], now, random.Random(1))
             self.assertLess(made.certificate.not_valid_before_utc, made.certificate.not_valid_after_utc)
             self.assertNotEqual(made.flaw(self.signer, [], NOW), "")
 
     def test_read_what_was_kept(self) -> None:
-        """What is written is read again; what is cut, empty, of another kind or no text at all is refused."""
+        """A stored certificate is read again; truncated, empty, binary and other PEM data are rejected."""
         again = read(self.leaf.pem_with_key)
         self.assertEqual((again.names, again.pem_with_key), (self.leaf.names, self.leaf.pem_with_key))
         key = rsa.generate_private_key(65537, 2048)
@@ -121,7 +121,7 @@ class LeafTests(SynchronousTestCase):
 
 
 def forged(signer: Authority, name: str) -> Leaf:
-    """What somebody who knows the secret would sign for a name that is not the team's."""
+    """Return a certificate that an attacker with the secret would sign for an arbitrary name."""
     made = leaf(signer, "vaio", [], NOW, random.Random(1))
     try:
         wanted: Any = x509.IPAddress(ipaddress.ip_address(name))

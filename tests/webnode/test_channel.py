@@ -1,4 +1,4 @@
-"""Tests of ``webnode.channel``: who sends too slowly, reads too slowly or has too much open is let go."""
+"""Tests of ``webnode.channel``: slow senders, slow readers and excess connections are closed."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ HEAD = b"POST / HTTP/1.1\r\nHost: vaio\r\nContent-Length: %d\r\n\r\n"
 
 
 class Echo(Resource):
-    """Answers GET at once, POST with its body's length, and ``/held`` never."""
+    """A resource that answers GET at once, POST with the length of its body, and never answers ``/held``."""
 
     isLeaf = True
 
@@ -64,7 +64,7 @@ class ChannelTests(SynchronousTestCase):
         return connection.transport.disconnecting or connection.transport.disconnected
 
     def assert_refused(self, connection: Connection, status: int, words: str) -> None:
-        """The connection was refused in JSON, with the headers that every answer has, and is closed."""
+        """Check that the connection got an error in JSON with the usual headers, and was closed."""
         head, _, body = connection.taken().partition(b"\r\n\r\n")
         self.assertTrue(head.startswith(b"HTTP/1.1 %d " % status), head)
         self.assertEqual(set(json.loads(body)["error"]), {"field", "problem", "remedy"})
@@ -74,7 +74,7 @@ class ChannelTests(SynchronousTestCase):
         self.assertTrue(self.is_closed(connection))
 
     def drip(self, connection: Connection, data: bytes, pause: float) -> float:
-        """Send byte by byte with pauses until it is closed; the seconds that it took."""
+        """Send byte by byte with pauses until the connection is closed; return the seconds."""
         began = self.clock.seconds()
         for byte in data:
             if self.is_closed(connection):
@@ -84,7 +84,7 @@ class ChannelTests(SynchronousTestCase):
         return self.clock.seconds() - began
 
     def test_answer_who_sends_whole_requests(self) -> None:
-        """Requests one after the other, at once, in pieces and with bodies are all answered on one connection."""
+        """Successive, pipelined and fragmented requests, and requests with bodies, share one connection."""
         connection = self.opened()
         for _ in range(3):
             self.assertIn(b"hello", connection.ask("/").taken())
@@ -96,7 +96,7 @@ class ChannelTests(SynchronousTestCase):
         self.assertEqual(self.echo.served, 7)
 
     def test_end_who_dribbles_a_head(self) -> None:
-        """A byte a second keeps no connection: ten seconds after the first one it is told why, and closed."""
+        """A connection that sends a byte a second is closed with 408 ten seconds after its first byte."""
         for before in (False, True):
             connection = self.opened()
             if before:
@@ -106,7 +106,7 @@ class ChannelTests(SynchronousTestCase):
             self.assert_refused(connection, 408, "in time")
 
     def test_end_who_dribbles_a_body(self) -> None:
-        """A body that comes with less than a kilobyte a second is ended after the grace; a steady one is taken."""
+        """A body of less than 1 kB a second is rejected after the grace period; a steady body is accepted."""
         slow, steady = self.opened(), self.opened("10.0.0.2")
         slow.send(HEAD % 5000)
         self.assertLess(self.drip(slow, b"x" * 100, 0.5), GRACE_S + 2.0)
@@ -118,7 +118,7 @@ class ChannelTests(SynchronousTestCase):
         self.assertIn(b"5000 bytes", steady.taken())
 
     def test_end_who_says_nothing(self) -> None:
-        """A connection without a request is closed after ten seconds, one that has had an answer after fifteen."""
+        """A connection without a request is closed after ten seconds, an idle one after fifteen."""
         silent, idle = self.opened(), self.opened("10.0.0.2")
         idle.ask("/")
         self.clock.advance(HEAD_S)
@@ -129,7 +129,7 @@ class ChannelTests(SynchronousTestCase):
         self.assertTrue(self.is_closed(idle))
 
     def test_abort_who_does_not_hang_up(self) -> None:
-        """Who is refused and neither reads nor closes is cut off soon after; what it sends meanwhile is not read."""
+        """A rejected client that does not close is disconnected soon after, and its further data is ignored."""
         connection = self.opened()
         connection.send(b"GET / HTTP/1.1\r\n")
         self.clock.advance(HEAD_S)
@@ -140,7 +140,7 @@ class ChannelTests(SynchronousTestCase):
         self.assertTrue(connection.transport.disconnected)
 
     def test_end_who_reads_nothing(self) -> None:
-        """A client that takes nothing of its answer for half a minute is cut off; one that is slow is not."""
+        """A client that reads nothing for half a minute is disconnected; a slow reader is not."""
         slow, deaf = self.opened(), self.opened()
         for connection in (slow, deaf):
             connection.ask("/held")
@@ -152,7 +152,7 @@ class ChannelTests(SynchronousTestCase):
         self.assertEqual((slow.transport.disconnected, deaf.transport.disconnected), (False, True))
 
     def test_bear_few_unfinished_of_an_address(self) -> None:
-        """The third request of an address that is not complete is refused; other addresses, and whole ones, are not."""
+        """The third incomplete request of an address is rejected; complete requests and other addresses are not."""
         for _ in range(2):
             self.opened().send(b"GET / HT")
         third = self.opened()
@@ -166,7 +166,7 @@ class ChannelTests(SynchronousTestCase):
         self.assertFalse(self.is_closed(self.opened().send(b"GET / HT")))
 
     def test_bear_some_streams_of_an_address(self) -> None:
-        """The third answer under way of an address is refused; when one ends, the next is taken."""
+        """The third open answer of an address is rejected; after one of them ends, the next is accepted."""
         held = [self.opened().ask("/held") for _ in range(2)]
         third = self.opened().ask("/held")
         self.assert_refused(third, 503, "open requests")
@@ -176,14 +176,14 @@ class ChannelTests(SynchronousTestCase):
         self.assertFalse(self.is_closed(self.opened().ask("/held")))
 
     def test_bear_some_connections_of_an_address(self) -> None:
-        """An address with as many connections as it may have gets no further one; another address does."""
+        """An address at its limit gets no further connection; another address does."""
         for _ in range(5):
             self.opened()
         self.assertTrue(self.opened().transport.disconnected)
         self.assertFalse(self.is_closed(self.opened("10.0.0.2")))
 
     def test_refuse_in_json_with_all_headers(self) -> None:
-        """What Twisted itself refuses, and a body that is too large, is answered as everything else is."""
+        """Errors of Twisted itself, and too large bodies, are answered like all other errors."""
         for data, status in (
             (b"nonsense\r\n\r\n", 400),
             (b"GET / HTTP/1.1\r\nno colon\r\n\r\n", 400),
@@ -201,7 +201,7 @@ class ChannelTests(SynchronousTestCase):
         self.assertEqual(self.echo.served, 0)
 
     def test_be_called_by_twisted(self) -> None:
-        """The names of Twisted that are overridden here still are those that it calls; an upgrade may change them."""
+        """The overridden methods exist in this version of Twisted, and Twisted calls them."""
         self.assertTrue(issubclass(Channel, HTTPChannel))
         for name in (
             *("connectionMade", "dataReceived", "allHeadersReceived", "allContentReceived", "requestDone"),

@@ -1,4 +1,4 @@
-"""What ``webnode.chronicle`` promises."""
+"""Tests of ``webnode.chronicle``."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class ChronicleTests(SynchronousTestCase):
         self.heard = 0
 
     def saw(self, now: float, *devices: dict[str, Any], tasks: Any = (), groups: Any = None, **more: Any) -> list[str]:
-        """What is told of a team of these; ``more`` stands in the state as well."""
+        """Return the new entries for a team of these devices; ``more`` is added to the state."""
         gone = self.departed.of(devices, now)
         state: State = {**state_of(devices, tasks, groups or {}, departed=gone, node="vaio"), **more}
         self.chronicle.saw(state, now)
@@ -45,7 +45,7 @@ class ChronicleTests(SynchronousTestCase):
         return [entry.text for entry in entries]
 
     def test_begin_with_who_is_here(self) -> None:
-        """It begins with when it began and who was here then; a state that is the same adds nothing."""
+        """The chronicle begins with its start and the present devices; an equal state adds nothing."""
         self.assertEqual(
             self.saw(1.0, dog(1), dog(2)),
             ["vaio starts to observe", "dog1 is here, number 1: idle", "dog2 is here, number 2: idle"],
@@ -53,7 +53,7 @@ class ChronicleTests(SynchronousTestCase):
         self.assertEqual(self.saw(2.0, dog(1), dog(2)), [])
 
     def test_tell_of_devices(self) -> None:
-        """Who changes, says something, leaves and comes back is told once each."""
+        """Each status change, message, loss and return of a device is described once."""
         self.saw(1.0, dog(1, messages=[[0.5, "ready"]]))
         told = self.saw(2.0, dog(1, "SEARCHING", "t1", messages=[[0.5, "ready"], [1.5, "seen"]]))
         self.assertEqual(told, ["dog1: idle → searching", "dog1: seen"])
@@ -62,7 +62,7 @@ class ChronicleTests(SynchronousTestCase):
         self.assertEqual(self.saw(5.0, dog(1)), ["dog1 is back: idle"])
 
     def test_tell_of_tasks(self) -> None:
-        """A task is told from its beginning to its end, with who ended it and how long that took."""
+        """A task is described from its start to its end, with the finishing device and the duration."""
         self.saw(1.0)
         self.assertEqual(self.saw(2.0, tasks=[job("OPEN")]), ["Find it: open"])
         self.assertEqual(self.saw(3.0, tasks=[job("OPEN", paused=True)]), ["Find it: paused"])
@@ -73,7 +73,7 @@ class ChronicleTests(SynchronousTestCase):
         self.assertEqual(self.chronicle.since(0)[-1].seconds, 13.24)
 
     def test_tell_of_consensus(self) -> None:
-        """That a group agrees is told with the bids, once, and not while some are undecided."""
+        """An agreement of all members is described once with the bids, and not before all have decided."""
         first = {**dog(1), "cost": 1.04, "assigned": uuid(2)}
         second = {**dog(2), "cost": 0.62, "assigned": ""}
         self.saw(1.0)
@@ -83,7 +83,7 @@ class ChronicleTests(SynchronousTestCase):
         self.assertEqual(self.saw(4.0, groups=agreed), [])
 
     def test_tell_of_no_consensus_on_what_is_over(self) -> None:
-        """Once a task has ended its reports go one by one; that those left agree is no news."""
+        """After the end of a task the remaining reports are not described as an agreement."""
         bids = [{**dog(n), "cost": float(n), "assigned": uuid(1)} for n in (1, 2)]
         self.saw(1.0, tasks=[job("EXECUTING")])
         self.assertEqual(len(self.saw(2.0, tasks=[job("EXECUTING")], groups={"t1": bids})), 1)
@@ -92,7 +92,7 @@ class ChronicleTests(SynchronousTestCase):
             self.assertEqual([line for line in told if "agree" in line], [], status)
 
     def test_tell_of_halting(self) -> None:
-        """That the whole team is halted, and goes on, is told."""
+        """The stop and the release of the whole team are described."""
         self.saw(1.0)
         self.assertEqual(self.saw(2.0, halted=True), ["the team is halted"])
         self.assertEqual(self.saw(3.0, halted=False), ["the team is released"])
@@ -102,7 +102,7 @@ class ChronicleTests(SynchronousTestCase):
         return [(entry.kind, entry.uuid, entry.seconds) for entry in self.chronicle.since(0) if entry.kind in kinds]
 
     def test_time_a_takeover(self) -> None:
-        """From when who acted was seen to be gone until another acts: that is a takeover, with its seconds."""
+        """A takeover lasts from the loss of the acting device until another device acts."""
         tasks = [job("EXECUTING")]
         self.saw(1.0, dog(1, "EXECUTING", "t1"), dog(2, "WAITING", "t1"), tasks=tasks)
         self.saw(10.0, dog(2, "WAITING", "t1"), tasks=tasks)
@@ -110,12 +110,12 @@ class ChronicleTests(SynchronousTestCase):
         told = self.saw(11.3, dog(2, "EXECUTING", "t1"), tasks=tasks)
         self.assertIn("dog2 takes over Find it from dog1: 1.3 s", told)
         self.assertEqual(self.takeover(), [("takeover", uuid(2), 1.3)])
-        # It comes back and stands by; nothing more has been taken over.
+        # The lost device returns and waits, which is not another takeover.
         self.saw(20.0, dog(1, "WAITING", "t1"), dog(2, "EXECUTING", "t1"), tasks=tasks)
         self.assertEqual(len(self.takeover()), 1)
 
     def test_time_a_takeover_from_the_fault(self) -> None:
-        """Where the fault was caused on purpose, the takeover is timed from that, not from when it showed."""
+        """For an injected fault the takeover is timed from the injection, not from the loss that follows."""
         tasks = [job("EXECUTING")]
         both = dog(1, "EXECUTING", "t1"), dog(2, "WAITING", "t1")
         self.saw(1.0, *both, tasks=tasks)
@@ -126,19 +126,19 @@ class ChronicleTests(SynchronousTestCase):
         self.assertEqual(self.takeover(), [("takeover", uuid(2), 1.5)])
 
     def test_take_no_handover_for_a_takeover(self) -> None:
-        """Where one is relieved that is still here, or whose fault is long over, nothing is timed."""
+        """A change from a present device, or long after a fault, is a handover without a time."""
         tasks = [job("EXECUTING")]
         self.saw(1.0, dog(1, "EXECUTING", "t1"), dog(2, "WAITING", "t1"), tasks=tasks)
         self.chronicle.faulted(uuid(1), "skew", 2.0)
         self.saw(70.0, dog(1, "EXECUTING", "t1"), dog(2, "WAITING", "t1"), tasks=tasks)
         self.saw(71.0, dog(1, "WAITING", "t1"), dog(2, "EXECUTING", "t1"), tasks=tasks)
         self.assertEqual(self.takeover(), [("handover", uuid(2), None)])
-        # One more who acts at the same time replaces nobody.
+        # A second device that acts at the same time replaces no device.
         self.saw(72.0, dog(1, "EXECUTING", "t1"), dog(2, "EXECUTING", "t1"), tasks=tasks)
         self.assertEqual(len(self.takeover()), 1)
 
     def test_forget_a_loss_that_mends(self) -> None:
-        """Who comes back and acts on was not taken over from, also when another relieves it later."""
+        """A device that returns and continues was not replaced, even if another device follows later."""
         tasks = [job("EXECUTING")]
         self.saw(1.0, dog(1, "EXECUTING", "t1"), tasks=tasks)
         self.saw(2.0, tasks=tasks)
@@ -147,7 +147,7 @@ class ChronicleTests(SynchronousTestCase):
         self.assertEqual(self.takeover(), [("handover", uuid(2), None)])
 
     def test_keep_so_many(self) -> None:
-        """Of a long story the newest entries are kept, their numbers going on; one can ask for one device or task."""
+        """Only the newest entries are kept, with increasing numbers; they can be filtered by device or task."""
         self.chronicle = TeamChronicle(kept=3)
         self.saw(1.0, dog(1), dog(2), tasks=[job("OPEN")])
         self.assertEqual([entry.n for entry in self.chronicle.since(0)], [2, 3, 4])
@@ -156,7 +156,7 @@ class ChronicleTests(SynchronousTestCase):
         self.assertEqual([entry.n for entry in self.chronicle.since(0, "t1")], [4])
 
     def test_ask_by_http(self) -> None:
-        """A viewer reads the chronicle whole, from a number on, or of one device; a wrong number is refused by name."""
+        """A viewer reads all entries, entries after a number, or entries of one device; a wrong number is rejected."""
         self.saw(1.0, dog(1), dog(2))
         app = create_app(lambda: state_of([], [], {}), Board(MemoryDesk(), Guests(), chronicle=self.chronicle))
         client = app.test_client()

@@ -1,4 +1,4 @@
-"""Tests of ``webnode.delay``: whoever guesses waits, and nobody else."""
+"""Tests of ``webnode.delay``: repeated guesses delay only their own source."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ class DelaysTests(SynchronousTestCase):
         self.delays = Delays()
 
     def guesses(self, source: str, seconds: float) -> int:
-        """How often somebody who tries as soon as it may can try in so many seconds."""
+        """Return the number of tries that a source can make in the given time."""
         now, count = 0.0, 0
         while now < seconds:
             wait = self.delays.wait(source, now)
@@ -23,19 +23,19 @@ class DelaysTests(SynchronousTestCase):
         return count
 
     def test_allow_few_guesses(self) -> None:
-        """At most 20 guesses come through in an hour, and about one an hour after that."""
+        """A source has at most 20 tries in the first hour, and about one an hour after that."""
         self.assertEqual(self.guesses("192.168.0.9", 3600.0), 19)
         self.setUp()
         self.assertLessEqual(self.guesses("192.168.0.9", 86400.0), 20 + 24)
 
     def test_lock_out_nobody_else(self) -> None:
-        """Another address may try at once, however much the one has guessed."""
+        """Guesses from one address do not delay another address."""
         self.guesses("192.168.0.9", 3600.0)
         self.assertGreater(self.delays.wait("192.168.0.9", 3600.0), 0.0)
         self.assertEqual(self.delays.wait("192.168.0.10", 3600.0), 0.0)
 
     def test_count_a_network_of_addresses_as_one(self) -> None:
-        """Whoever has a network of IPv6 addresses guesses no more often; IPv4 counts alone, however it is written."""
+        """Addresses of an IPv6 network share one delay; an IPv4 address has its own, in either notation."""
         for number in range(10):
             self.delays.tried(f"2001:db8::{number:x}", 0.0)
             self.delays.tried(f"::ffff:10.0.0.{number}", 0.0)
@@ -44,14 +44,14 @@ class DelaysTests(SynchronousTestCase):
         self.assertEqual(self.delays.wait("10.0.0.3", 0.0), 0.0)
 
     def test_forget(self) -> None:
-        """A right one forgets those before, and so does a day without any."""
+        """A successful sign-in, or a day without tries, resets the delay."""
         self.guesses("a", 3600.0)
         self.delays.held("a")
         self.assertEqual(self.guesses("a", 1.0), 10)
         self.assertEqual(self.delays.wait("a", FORGOTTEN_S + 1.0), 0.0)
 
     def test_remember_a_bounded_number(self) -> None:
-        """However many addresses guess, no more than so many are remembered; who guessed last is one of them."""
+        """The number of remembered sources is limited, and the latest source is always among them."""
         for number in range(SOURCES + 10):
             for _ in range(10):
                 self.delays.tried(f"10.{number >> 16}.{number >> 8 & 255}.{number & 255}", 0.0)
@@ -59,12 +59,12 @@ class DelaysTests(SynchronousTestCase):
         self.assertGreater(self.delays.wait(f"10.0.{SOURCES >> 8}.9", 0.0), 0.0)
 
     def test_survive_a_clock_that_is_set_back(self) -> None:
-        """Nobody waits longer than the longest pause because the clock was set back."""
+        """A clock that is set back delays no source beyond the maximum."""
         self.guesses("a", 10**6)
         self.assertLessEqual(self.delays.wait("a", 0.0), LONGEST_S)
 
     def test_take_a_try_back(self) -> None:
-        """Of tries that were right nothing is left, and those that were wrong count; with other numbers, too."""
+        """``undo`` removes a successful try, wrong tries count; the limits are configurable."""
         delays = Delays(free=3, longest_s=10.0, forgotten_s=100.0)
         for _ in range(20):
             delays.tried("everywhere", 0.0)

@@ -1,4 +1,4 @@
-"""What ``webnode.dispatch`` promises."""
+"""Tests of ``webnode.dispatch``."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class DispatchTests(SynchronousTestCase):
         return self.dispatch.carry_out(route, Ask({"uuid": "01", "x": 5}, visitor, self.board, {}, id, "10.0.0.9"))
 
     def test_do_once_what_is_asked_twice(self) -> None:
-        """An order with the id of an earlier one gets that one's answer, also while it is under way or was refused."""
+        """A request with a used id gets the answer of the first one, even if that is pending or an error."""
         self.assertEqual(self.successResultOf(self.asked("a")), {"id": 1})
         self.told = waiting = Deferred[Any]()
         self.assertEqual(self.successResultOf(self.asked("a")), {"id": 1})
@@ -55,14 +55,14 @@ class DispatchTests(SynchronousTestCase):
         self.assertEqual(len(self.called), 3)
 
     def test_tell_ids_apart(self) -> None:
-        """The same id of another visitor or for another route is another order; without an id each is one."""
+        """An id counts per visitor and route; requests without an id are all different."""
         for each in (self.asked("a"), self.asked("a", who="bob"), self.asked("a", path="/others"), self.asked()):
             self.successResultOf(each)
         self.successResultOf(self.asked())
         self.assertEqual(len(self.called), 5)
 
     def test_forget_old_ids(self) -> None:
-        """Only so many orders are remembered, the oldest go first."""
+        """Only the newest ``REMEMBERED`` ids are known."""
         for number in range(REMEMBERED + 1):
             self.successResultOf(self.asked(str(number)))
         self.successResultOf(self.asked("1"))
@@ -71,7 +71,7 @@ class DispatchTests(SynchronousTestCase):
         self.assertEqual(len(self.called), REMEMBERED + 2)
 
     def test_note_each_change(self) -> None:
-        """Each order is a line in the audit with who, from where, what, on what, and how it ended; a look is none."""
+        """Each change is audited with visitor, address, route, target and outcome; reads are not."""
         self.successResultOf(self.asked("a"))
         self.successResultOf(self.asked("a"))
         self.successResultOf(self.asked(method="GET"))

@@ -1,4 +1,4 @@
-"""What ``webnode.fallback`` promises."""
+"""Tests of ``webnode.fallback``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from webnode.fallback import REMEMBERED_S, Page, TeamFallbacks, origin_of, pages
 
 class UrlTests(SynchronousTestCase):
     def test_name_an_origin_as_browsers_do(self) -> None:
-        """Case, usual ports and the ways to say this machine make no difference; a path of its own is no page."""
+        """Case, default ports and names of this machine do not change an origin; a URL with a path is no page."""
         for url, origin in (
             ("http://192.168.0.5:8080", "http://192.168.0.5:8080"),
             ("http://VAIO.local:8080/", "http://vaio.local:8080"),
@@ -22,7 +22,7 @@ class UrlTests(SynchronousTestCase):
             self.assertEqual(origin_of(url), origin)
 
     def test_follow_no_url_out_of_the_house(self) -> None:
-        """What is no page of a machine in the local network is none, whoever signed it."""
+        """A URL that is no page of a machine in the local network is ignored."""
         for url in (
             "https://evil.example",
             "javascript:alert(1)",
@@ -40,7 +40,7 @@ class UrlTests(SynchronousTestCase):
         self.assertEqual(pages_of([device]), [Page("01", "http://192.168.0.5:8080")])
 
     def test_give_every_name_of_an_open_page(self) -> None:
-        """A page at one address has that URL alone; one that is served at all of them has the machine's names."""
+        """A page at one address has one URL; a page on all interfaces has a URL for each name of the machine."""
         self.assertEqual(urls_at("127.0.0.1", 8080, ["vaio.local"]), ["http://127.0.0.1:8080"])
         self.assertEqual(
             urls_at("0.0.0.0", 80, ["10.0.0.5", "", "v.local"]), ["http://10.0.0.5:80", "http://v.local:80"]
@@ -50,7 +50,7 @@ class UrlTests(SynchronousTestCase):
 
 class TeamFallbacksTests(FleetCase):
     def web_nodes(self) -> tuple[SwarmFleet, list[TeamFallbacks]]:
-        """Two nodes of which each serves the page at a port of its own."""
+        """Return two nodes, each of which serves the page on its own port."""
         swarm = self.swarm(2)
         webs = [TeamFallbacks(node, swarm.clock.seconds) for node in swarm.nodes]
         for place, web in enumerate(webs):
@@ -59,7 +59,7 @@ class TeamFallbacksTests(FleetCase):
         return swarm, webs
 
     def test_know_each_other(self) -> None:
-        """Each web node knows where the other serves, names its own first, and lets the other's page in."""
+        """Each web node lists its own page first and the other's page next, and accepts requests from it."""
         _, (first, second) = self.web_nodes()
         self.assertEqual([page.url for page in first.here()], ["http://127.0.0.1:8080", "http://127.0.0.1:8081"])
         self.assertEqual([page.is_self for page in second.here()], [True, False])
@@ -69,7 +69,7 @@ class TeamFallbacksTests(FleetCase):
         self.assertFalse(first.lets_in("http://192.168.0.9:8081"))
 
     def test_vouch_in_an_open_team(self) -> None:
-        """Where everybody may do everything those count that serve the page, or did within the hour."""
+        """In an open team a node may vouch if it serves the page, or served it within the last hour."""
         swarm = self.swarm(3)
         first, second = (TeamFallbacks(node, swarm.clock.seconds) for node in swarm.nodes[:2])
         for place, web in enumerate((first, second)):
@@ -87,7 +87,7 @@ class TeamFallbacksTests(FleetCase):
         self.assertFalse(second.may_vouch(keys[0]))
 
     def test_let_in_the_page_of_the_dead(self) -> None:
-        """A web node that dies is listed no more; its page, which still runs in a browser, is let in for an hour."""
+        """A dead web node is not listed, but its page in a browser is accepted for an hour."""
         swarm, (first, second) = self.web_nodes()
         swarm.nodes[0].vanish()
         swarm.run(3)

@@ -1,4 +1,4 @@
-"""Tests of ``webnode.faults`` and its routes: faults that a visitor causes, and the clock beside them."""
+"""Tests of ``webnode.faults`` and its routes: injected faults and the takeover time."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ class FaultControlTests(SynchronousTestCase):
         self.team.clock.advance(2.0)
 
     def uuid(self, name: str) -> str:
-        """The uuid of a device."""
+        """Return the uuid of a device."""
         return self.team.services[name].assembly.node.uuid
 
     def cause(self, uuid: str, kind: str, seconds: float = 4.0, amount: float | None = None) -> Any:
-        """The outcome of an order within two seconds: None, or the refusal."""
+        """Return the outcome of a fault request within two seconds: None, or the refusal."""
         came: list[Any] = []
         self.control.cause(uuid, kind, seconds, amount).addCallbacks(came.append, lambda f: came.append(f.value))
         for _ in range(40):
@@ -42,7 +42,7 @@ class FaultControlTests(SynchronousTestCase):
         return came[0]
 
     def acting(self) -> str:
-        """The uuid of who acts."""
+        """Return the uuid of the acting device."""
         for _ in range(200):
             self.team.clock.advance(0.05)
             for device in self.team.state()["devices"]:
@@ -51,7 +51,7 @@ class FaultControlTests(SynchronousTestCase):
         self.fail("nobody ever acted")
 
     def test_learn_what_can_fail(self) -> None:
-        """Each device is asked what it can suffer; of one that never came nothing is known."""
+        """The possible faults of each device are queried; an unknown device has none."""
         self.assertEqual(list(self.control.kinds(self.uuid("dog1"))), list(KINDS))
         self.assertNotIn("battery", self.control.kinds(self.uuid("vaio")))
         self.assertEqual(list(self.control.kinds("00" * 20)), [])
@@ -63,7 +63,7 @@ class FaultControlTests(SynchronousTestCase):
         self.assertIsNone(self.cause(self.uuid("dog1"), "loss"))
 
     def test_takeover_clock(self) -> None:
-        """Who acts is cut off: the clock runs, stops when another acts, below two seconds, and names who."""
+        """After a fault in the acting device the takeover time stops below two seconds, and names the successor."""
         self.team.desk.assign("turn-around")
         lost = self.acting()
         self.assertIsNone(self.cause(lost, "radio"))
@@ -79,13 +79,13 @@ class FaultControlTests(SynchronousTestCase):
         self.assertEqual(self.control.active(), [])
 
     def test_idle_device(self) -> None:
-        """Where the device was at no task, no clock runs."""
+        """A fault in an idle device has no takeover time."""
         self.assertIsNone(self.cause(self.uuid("dog2"), "loss", 4.0, 0.3))
         (row,) = self.control.active()
         self.assertEqual((row["task"], row["watched"], row["amount"]), ("", False, 0.3))
 
     def test_refuse(self) -> None:
-        """An amount out of bounds is 400, what a device cannot suffer 409, one that is gone 409, a silent one 504."""
+        """Invalid amounts give 400, impossible faults and lost devices 409, a silent device 504."""
         dog = self.uuid("dog3")
         for uuid, kind, amount, status, field in (
             (dog, "loss", 7.0, 400, "amount"),
@@ -102,7 +102,7 @@ class FaultControlTests(SynchronousTestCase):
         self.assertEqual(self.control.active(), [])
 
     def test_only_where_allowed(self) -> None:
-        """Devices that do not allow faults say so."""
+        """A device that does not allow faults is reported with the setting that allows them."""
         plain = VirtualTeam(4, dogs=("dog1",))
         self.addCleanup(plain.stop)
         control = FaultControl(plain.services["vaio"].assembly.node, plain.clock.seconds)
@@ -120,7 +120,7 @@ class RouteTests(SynchronousTestCase):
         self.open(self.faults)
 
     def open(self, faults: MemoryFaults | None) -> None:
-        """Serve a dog, with these faults."""
+        """Serve a dog with these faults."""
         state = state_of([{"uuid": "01", "name": "dog1", "joined": 1}], [], {}, node="vaio")
         board = Board(MemoryDesk(), OpenSessions(), chronicle=self.chronicle, faults=faults)
         app = create_app(lambda: state, board, wall=lambda: 1e9)
@@ -128,7 +128,7 @@ class RouteTests(SynchronousTestCase):
         self.client = app.test_client()
 
     def test_cause_and_tell(self) -> None:
-        """A fault is taken with 202, told to the chronicle, and listed with what can be caused where."""
+        """A fault is accepted with 202, added to the chronicle, and listed with the possible faults."""
         answer = self.client.post("/api/v1/devices/01/faults", json={"kind": "loss", "amount": 0.3})
         self.assertEqual((answer.status_code, answer.get_json()), (202, {"id": "01", "kind": "loss", "seconds": 15.0}))
         assert self.faults is not None
@@ -140,7 +140,7 @@ class RouteTests(SynchronousTestCase):
         self.assertEqual([row["kind"] for row in told["active"]], ["loss"])
 
     def test_refuse(self) -> None:
-        """What is unlawful is refused by its field, and reaches nobody."""
+        """Invalid requests are rejected by field and have no effect."""
         for path, body, code, field in (
             ("01", {}, 400, "kind"),
             ("01", {"kind": "fly"}, 400, "kind"),
@@ -155,7 +155,7 @@ class RouteTests(SynchronousTestCase):
         self.assertEqual(self.faults.caused, [])
 
     def test_node_without_faults(self) -> None:
-        """A node that causes none lists none, and says what to write into its settings."""
+        """A node without fault injection lists no faults, and names the setting that enables it."""
         self.open(None)
         self.assertEqual(self.client.get("/api/v1/faults").get_json(), {"kinds": [], "can": {}, "active": []})
         answer = self.client.post("/api/v1/devices/01/faults", json={"kind": "kill"})

@@ -1,4 +1,4 @@
-"""What ``webnode.field`` promises."""
+"""Tests of ``webnode.field``."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from webnode.field import count, distance, number, properties, text, texts
 
 class FieldTests(SynchronousTestCase):
     def test_take_lawful_values(self) -> None:
-        """Lawful values come through as they are."""
+        """Valid values are returned unchanged."""
         self.assertEqual(text("dog1"), "dog1")
         self.assertEqual(number(0.5), 0.5)
         self.assertEqual(count(3), 3)
@@ -22,14 +22,14 @@ class FieldTests(SynchronousTestCase):
         self.assertEqual(properties({"camera": {"fps": 30, "model": "x"}}), {"camera": {"fps": 30.0, "model": "x"}})
 
     def test_refuse_what_json_cannot_carry(self) -> None:
-        """NaN, infinities, huge integers, truth values and negative lengths become the fallback."""
+        """NaN, infinities, huge integers, booleans and negative lengths are replaced by the default."""
         for value in (float("nan"), float("inf"), 10**400, True, "1", None):
             self.assertEqual(number(value, -7.0), -7.0)
         self.assertEqual(count(2**60, 5), 5)
         self.assertIsNone(distance(-1.0))
 
     def test_clean_text(self) -> None:
-        """Control characters become blanks, and text is cut at its limit."""
+        """Control characters become spaces, and text is cut at its limit."""
         self.assertEqual(text("a\x00\x1b[31mb"), "a  [31mb")
         self.assertEqual(text("x" * 500, limit=10), "x" * 10)
         self.assertEqual(text("\x07", "nothing"), "nothing")
@@ -43,7 +43,7 @@ class FieldTests(SynchronousTestCase):
         )
     )
     def test_survive_anything(self, value: object) -> None:
-        """Whatever a record holds, the outcome is JSON that a browser can parse, in UTF-8."""
+        """Any value of a record is converted to valid JSON in UTF-8."""
         outcome = [text(value), number(value), count(value), distance(value), texts(value), properties(value)]
         sent = json.dumps(outcome, allow_nan=False, ensure_ascii=False).encode()
         self.assertEqual(json.loads(sent), outcome)

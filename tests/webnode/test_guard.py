@@ -1,4 +1,4 @@
-"""What ``webnode.guard`` promises."""
+"""Tests of ``webnode.guard``."""
 
 from __future__ import annotations
 
@@ -9,32 +9,32 @@ from webnode.guard import HEADERS, headers, is_local_name, is_own_host, is_own_o
 
 class GuardTests(SynchronousTestCase):
     def test_know_local_names(self) -> None:
-        """Addresses, bare names and names of the local network can be those of a machine there."""
+        """Addresses, bare names and names of the local network can belong to a local machine."""
         hosts = ["10.0.0.7:8080", "[::1]:8080", "[fe80::1]", "localhost:8080", "vaio", "vaio.local:80", "VAIO.LAN"]
         for host in hosts:
             self.assertTrue(is_local_name(host), host)
 
     def test_know_own_names(self) -> None:
-        """This machine is meant by an address, by localhost and by its own names, and by no other name of the LAN."""
+        """An address, localhost and the machine's names are own hosts; other names of the LAN are not."""
         for host in ("10.0.0.7:8080", "[::1]:8080", "localhost:80", "a.localhost", "VAIO.local", "vaio.local."):
             self.assertTrue(is_own_host(host, {"vaio.local"}), host)
         for host in ("evil.local", "vaio", "evil.lan:8080", "vaio.local.evil.lan", "evil-vaio.local", "", "a b", "["):
             self.assertFalse(is_own_host(host, {"vaio.local"}), host)
 
     def test_refuse_public_names(self) -> None:
-        """A name that somebody outside could point at this machine is refused, and so is nonsense."""
+        """Public names, which can point at any address, and invalid names are rejected."""
         for host in ("evil.example", "evil.example:8080", "", "a b", "[", "local.evil.com", "1.2.3.4.evil.com"):
             self.assertFalse(is_local_name(host), host)
 
     def test_compare_origins(self) -> None:
-        """Only the page's own origin counts; programs send none."""
+        """Only the page's own origin is accepted, or a request without an origin."""
         self.assertTrue(is_own_origin(None, "vaio:8080"))
         self.assertTrue(is_own_origin("http://vaio:8080", "vaio:8080"))
         for origin in ("http://vaio:9090", "http://evil.example", "null", ""):
             self.assertFalse(is_own_origin(origin, "vaio:8080"), origin)
 
     def test_be_strict(self) -> None:
-        """The content policy allows neither inline code nor other origins."""
+        """The content security policy allows neither inline code nor other origins."""
         policy = HEADERS["Content-Security-Policy"]
         self.assertIn("default-src 'self'", policy)
         self.assertNotIn("unsafe", policy)
@@ -42,14 +42,14 @@ class GuardTests(SynchronousTestCase):
         self.assertEqual(HEADERS["Cross-Origin-Opener-Policy"], "same-origin")
 
     def test_read_the_token(self) -> None:
-        """A bearer's header wins over the ticket in the query; without either there is nothing."""
+        """A bearer header has priority over a ticket in the query."""
         self.assertEqual(token_of("Bearer abc", "t"), "abc")
         self.assertEqual(token_of("bearer  abc ", ""), "abc")
         for header in ("", "Basic abc", "Bearer ", "abc"):
             self.assertEqual(token_of(header, "t"), "t")
 
     def test_let_in(self) -> None:
-        """Orders want the own page or one of the team, and a mark; looking wants only a name of this machine."""
+        """Changes need the own origin or a team page's, and the ``X-Swarm`` header; reads only need an own host."""
 
         def refused(method: str, origin: str | None = None, is_marked: bool = True, host: str = "vaio") -> str:
             no = refusal(method, host, origin, is_marked, ("vaio",), lambda origin: origin == "http://other")

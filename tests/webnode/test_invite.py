@@ -1,4 +1,4 @@
-"""Tests of ``webnode.invite``: where others find the page, and the code that says so."""
+"""Tests of ``webnode.invite``: the addresses of the page for guests, and their QR code."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ LINK = "https://192.168.0.7:8443/#code=AQUAagJ8oCVYkDIF5Q4LZ3Vlc3TsjPp7rFj9hsoSg
 
 class InviteTests(SynchronousTestCase):
     def test_offer_the_best_first(self) -> None:
-        """Pages that others reach come before those of this machine, and of each kind those over TLS before others."""
+        """Pages on the network come before pages on this machine, and TLS before plain HTTP."""
         here, plain, name = "https://127.0.0.1:8443", "http://192.168.0.7:8080", "https://vaio.local:8443"
         self.assertEqual(best_first([here, plain, name, plain]), [name, plain, here])
         anything: Any = None
         self.assertEqual(TeamInvites(lambda: [here, plain], b"", "", anything, anything).urls(), [plain, here])
 
     def test_draw_what_a_camera_reads(self) -> None:
-        """The code of a link is read again out of its drawing, which has a margin and no style of its own."""
+        """A decoder reads the link from the QR code, which has a margin and no style attribute."""
         import cv2
         import numpy as np
 
@@ -46,7 +46,7 @@ class InviteTests(SynchronousTestCase):
         test_draw_what_a_camera_reads.skip = f"NO CODE IS READ: missing {missing}"  # type: ignore[attr-defined]
 
     def test_draw_nothing_where_it_cannot(self) -> None:
-        """Of nothing nothing is drawn, nor where the library is missing: the link in words is enough."""
+        """An empty link, or a missing library, gives no drawing."""
         self.assertEqual(code(""), "")
         self.addCleanup(sys.modules.update, {"segno": sys.modules["segno"]} if "segno" in sys.modules else {})
         self.addCleanup(sys.modules.pop, "segno", None)

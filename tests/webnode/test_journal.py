@@ -1,4 +1,4 @@
-"""What ``webnode.journal`` promises."""
+"""Tests of ``webnode.journal``."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def state(**devices: Any) -> dict[str, Any]:
 
 
 def applied(known: dict[str, Any], content: Any) -> dict[str, Any]:
-    """What a page knows after a change, each list as a table."""
+    """Return the state of a page after a change, with each list as a table."""
     now = {name: dict(value) if name in KEYS else value for name, value in known.items()}
     for name, value in content.items():
         if name in KEYS:
@@ -39,7 +39,7 @@ class JournalTests(SynchronousTestCase):
         return None if change is None else change.content
 
     def test_tell_what_differs(self) -> None:
-        """A change names the rows that are new or other, those that are gone, and nothing else."""
+        """A change contains new or different rows, removed rows, and nothing else."""
         self.taken(state(a="IDLE", b="IDLE"))
         self.assertEqual(self.taken(state(a="DONE", b="IDLE")), {"devices": [{"uuid": "a", "status": "DONE"}]})
         self.assertEqual(self.taken(state(a="DONE")), {"devices": [], "without": {"devices": ["b"]}})
@@ -47,14 +47,14 @@ class JournalTests(SynchronousTestCase):
         self.assertIsNone(self.taken({**state(a="DONE"), "halted": True}))
 
     def test_resume(self) -> None:
-        """Who names what it heard last gets what came after it, in order."""
+        """A page that sends its last id gets the later changes in order."""
         self.taken(state(a="IDLE"), state(a="DONE"), state(b="DONE"))
         missed = self.journal.since(self.journal.number("ab-1"))
         self.assertEqual([change.n for change in missed or []], [2, 3])
         self.assertEqual(self.journal.since(self.journal.number(self.journal.id(3))), [])
 
     def test_tell_all_after_a_gap(self) -> None:
-        """An id that is too old, of another node or start, from the future, or no id is answered with everything."""
+        """An id that is too old, from another node or start, in the future or invalid requires the whole state."""
         for n in range(KEPT + 3):
             self.taken(state(a=n))
         for name in ("ab-1", "ab-2", "ac-60", "ab-999", "ab-", "ab-x", "ab--1", "", "ab-" + "9" * 40, "ab-²"):
@@ -62,14 +62,14 @@ class JournalTests(SynchronousTestCase):
         self.assertEqual(len(self.journal.since(self.journal.number("ab-3")) or []), KEPT)
 
     def test_take_nothing_that_json_cannot_carry(self) -> None:
-        """A state with what is no JSON is refused, and the next one is told against the last that was taken."""
+        """A state that is not valid JSON is rejected, and the next change refers to the last valid state."""
         self.taken(state(a="IDLE"))
         self.assertRaises(ValueError, self.journal.take, state(a=float("nan")))
         self.assertRaises(ValueError, self.journal.take, {**state(a="IDLE"), "halted": float("nan")})
         self.assertEqual((self.journal.n, self.taken(state(a="IDLE"))), (1, None))
 
     def test_end_where_the_state_is(self) -> None:
-        """Whatever happens, changes applied to any earlier state that is still kept give the newest one."""
+        """Any kept state and its later changes result in the newest state."""
         dice = random.Random(5)
         known = []
         for _ in range(200):

@@ -1,4 +1,4 @@
-"""Tests of ``webnode.keyfile``: a private key lies where nobody else reads it, or is not used."""
+"""Tests of ``webnode.keyfile``: private keys are stored with private modes only."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class KeyfileTests(SynchronousTestCase):
         return str(self.assertRaises(Unsafe, kept, self.path))
 
     def test_keep_for_the_user_alone(self) -> None:
-        """What is kept is read again, also over an older one, and by nobody else, whatever the umask is."""
+        """A stored key replaces an older one and is private, with any umask."""
         self.addCleanup(os.umask, os.umask(0))
         self.assertIsNone(kept(self.path))
         for content in (b"first", b"second"):
@@ -31,14 +31,14 @@ class KeyfileTests(SynchronousTestCase):
         self.assertEqual([each.name for each in self.path.parent.iterdir()], [self.path.name])
 
     def test_refuse_what_others_may_read(self) -> None:
-        """One that the group or the world may read or write is refused, with its mode."""
+        """A file that group or others can read or write is rejected with its mode."""
         keep(self.path, b"secret")
         for mode in (0o640, 0o604, 0o620, 0o602):
             self.path.chmod(mode)
             self.assertIn(f"mode {mode:o}", self.refusal())
 
     def test_refuse_what_is_no_file(self) -> None:
-        """A link, a folder and a pipe are refused and never waited for."""
+        """A link, a folder and a pipe are rejected without blocking."""
         other = self.path.with_name("other")
         keep(other, b"secret")
         self.path.symlink_to(other)

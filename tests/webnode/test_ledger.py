@@ -1,4 +1,4 @@
-"""What ``webnode.ledger`` promises of its glances; its states are tested over whole teams."""
+"""Tests of ``Glance`` in ``webnode.ledger``; tests of whole teams check its states."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from webnode.ledger import FRESH_S, Glance
 
 class GlanceTests(SynchronousTestCase):
     def test_read_once_for_many(self) -> None:
-        """Who asks within a tenth of a second gets what the one before got; later it is read again."""
+        """Reads within a tenth of a second share one state; a later read makes a new one."""
         clock, read = Clock(), [0]
 
         def state() -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Tests of ``webnode.limits``: what each address has open."""
+"""Tests of ``webnode.limits``: the limits of each address."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from webnode.limits import AddressLimits
 
 class AddressLimitsTests(SynchronousTestCase):
     def test_count_each_address_for_itself(self) -> None:
-        """An address that has as many as it may gets no more of that kind; another does, and it does once one ends."""
+        """An address at its limit gets no more of that kind until one ends; other addresses are not affected."""
         limits = AddressLimits({"unfinished": 2, "stream": 1, "open": 9})
         for _ in range(2):
             self.assertTrue(limits.may("unfinished", "a"))
@@ -22,7 +22,7 @@ class AddressLimitsTests(SynchronousTestCase):
         self.assertTrue(limits.may("unfinished", "a"))
 
     def test_keep_nothing_of_who_has_left(self) -> None:
-        """Of addresses that have nothing open nothing is kept, however many there were."""
+        """Addresses without open connections use no memory."""
         limits = AddressLimits()
         for number in range(1000):
             limits.may("open", str(number))

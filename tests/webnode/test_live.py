@@ -1,4 +1,4 @@
-"""What ``webnode.live`` promises."""
+"""Tests of ``webnode.live``."""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ def last_id(data: bytes) -> str:
 
 
 class Quiet(TeamChronicle):
-    """Tells of faults alone."""
+    """A chronicle that describes injected faults only."""
 
     def saw(self, state: State, now: float) -> None:
-        """Make nothing of it."""
+        """Ignore the state."""
 
 
 class EventsTests(SynchronousTestCase):
@@ -72,7 +72,7 @@ class EventsTests(SynchronousTestCase):
         return Connection(self.site).ask(f"/events{query}", **headers)
 
     def test_start_with_everything(self) -> None:
-        """A new page gets the whole state, the yard, the pages and a beat at once, in a stream that nobody caches."""
+        """A new page gets state, map, pages and beat at once, in a stream that is not cached."""
         data = self.connected().taken()
         self.assertIn(b"text/event-stream", data)
         self.assertIn(b"no-store", data)
@@ -81,7 +81,7 @@ class EventsTests(SynchronousTestCase):
         self.assertEqual(events_in(data), told)
 
     def test_tell_changes_only(self) -> None:
-        """A change is told within a tenth of a second, once; without one there are only beats, five a second."""
+        """A change is sent once within a tenth of a second; without changes only five beats a second are sent."""
         page = self.connected()
         page.taken()
         self.state["n"] = 1
@@ -93,7 +93,7 @@ class EventsTests(SynchronousTestCase):
         self.assertIn(len(told), (9, 10, 11))
 
     def test_spare_the_node_of_a_large_team(self) -> None:
-        """Where it takes a quarter of a second to make the state, that is done once a second, and no change is lost."""
+        """If the state takes a quarter of a second to build, it is built once a second, and no change is lost."""
         read = self.read
 
         def slow() -> dict[str, Any]:
@@ -113,7 +113,7 @@ class EventsTests(SynchronousTestCase):
         self.assertEqual(told[-1], self.state["n"])
 
     def test_tell_programs_whole_states(self) -> None:
-        """A program that asks for whole states gets one at each change, and need not put changes together."""
+        """A program that requests whole states gets one at each change."""
         program = self.connected("?whole=1")
         program.taken()
         self.state["n"] = 1
@@ -121,7 +121,7 @@ class EventsTests(SynchronousTestCase):
         self.assertEqual(events_in(program.taken()), [("state", {"resync": False, "n": 1})])
 
     def test_resume(self) -> None:
-        """A page that comes back with the last id that it heard, in either way, is told what it missed and no more."""
+        """A page that reconnects with its last id, as header or query, gets only the changes that it missed."""
         self.state["more"] = MORE
         page = self.connected()
         heard = last_id(page.taken())
@@ -138,7 +138,7 @@ class EventsTests(SynchronousTestCase):
         watcher.leave()
 
     def test_end_with_the_session(self) -> None:
-        """A stream is told an hour before its session runs out, once, where that can be put off; then it ends."""
+        """A stream warns once, an hour before its session ends, if a renewal is possible; then it ends."""
         whos = {"short": (10.0, 10.0), "long": (LEAD_S + 5.0, 2e9), "open": (2e9, 2e9)}
 
         class Sessions(OpenSessions):
@@ -162,7 +162,7 @@ class EventsTests(SynchronousTestCase):
         self.assertEqual(self.events.viewers, 1)
 
     def test_tell_pages(self) -> None:
-        """A web node that joins the team is told to every page that is open."""
+        """Every open page learns of a web node that joins the team."""
         page = self.connected()
         page.taken()
         self.board.fallbacks.pages.append(Page("01", "http://127.0.0.1:8081"))
@@ -171,7 +171,7 @@ class EventsTests(SynchronousTestCase):
         self.assertEqual(events_in(page.taken()), [("pages", [row])])
 
     def test_tell_what_happened(self) -> None:
-        """Entries of the chronicle are told once to each page, and to a new one from the start."""
+        """Each entry of the chronicle is sent once to each page, and all entries to a new page."""
         page = self.connected()
         page.taken()
         self.board.chronicle.faulted("01", "kill", 1e9)
@@ -183,7 +183,7 @@ class EventsTests(SynchronousTestCase):
         self.assertIn("event", [name for name, _ in events_in(self.connected().taken())])
 
     def test_read_what_changed_only(self) -> None:
-        """While the version says that nothing changed the state is read once a second; a change is told at once."""
+        """While the version stays equal the state is read once a second; a new version is sent at once."""
         self.version = 1
         page = self.connected()
         reads = self.reads
@@ -195,7 +195,7 @@ class EventsTests(SynchronousTestCase):
         self.assertIn(("change", {"n": 1}), events_in(page.taken()))
 
     def test_keep_the_chronicle_with_nobody_there(self) -> None:
-        """Once opened, the chronicle is told of states with no page open, each second, and no more when closed."""
+        """Between ``open`` and ``close`` the chronicle gets the state each second, even without a page."""
         self.events.open()
         self.clock.pump([0.5] * 6)
         self.assertEqual(self.reads, 3)
@@ -203,7 +203,7 @@ class EventsTests(SynchronousTestCase):
         self.assertEqual(self.clock.getDelayedCalls(), [])
 
     def test_limit_pace(self) -> None:
-        """However often the state changes, a page gets at most ten a second, and the newest last."""
+        """A page gets at most ten changes a second, in order."""
         page = self.connected()
         page.taken()
         for n in range(1, 101):
@@ -215,7 +215,7 @@ class EventsTests(SynchronousTestCase):
         self.assertEqual(told, sorted(told))
 
     def test_put_off_slow_pages(self) -> None:
-        """A page that does not read is written nothing; when it reads again it gets what it missed, and the count."""
+        """A page that does not read gets nothing; later it gets the missed changes and their number."""
         self.state["more"] = MORE
         slow, quick = self.connected(), self.connected()
         slow.taken()
@@ -232,7 +232,7 @@ class EventsTests(SynchronousTestCase):
         self.assertGreaterEqual([words for name, words in told if name == "beat"][-1]["skipped"], 5)
 
     def test_spare_slow_pages_the_past(self) -> None:
-        """A page that missed more than is kept, or more than the newest state is long, gets that, marked as such."""
+        """If the missed changes are too many or longer than the state, the page gets the state, marked as such."""
         for more, missed in ((MORE, KEPT + 2), ("", 4)):
             self.state.update({"more": more, "n": 0})
             slow = self.connected()
@@ -247,7 +247,7 @@ class EventsTests(SynchronousTestCase):
             self.assertEqual(told, [("state", {"resync": True, "n": missed, "more": more})])
 
     def test_rest_when_nobody_looks(self) -> None:
-        """When the last page has gone, nothing is read and no timer is left."""
+        """Without pages nothing is read and no timer is left."""
         pages = [self.connected(), self.connected()]
         for page in pages:
             page.leave()
@@ -257,7 +257,7 @@ class EventsTests(SynchronousTestCase):
         self.assertEqual(self.reads, reads)
 
     def test_live_through_failures(self) -> None:
-        """A state that cannot be read for a moment, or that JSON cannot carry, ends no stream and is logged once."""
+        """A state that cannot be serialized ends no stream and is logged once."""
         page = self.connected()
         page.taken()
         self.state["n"] = float("nan")
@@ -269,14 +269,14 @@ class EventsTests(SynchronousTestCase):
         self.assertIn(("change", {"n": 2}), events_in(page.taken()))
 
     def test_cap_pages(self) -> None:
-        """One page too many is told so, and costs no stream."""
+        """A page beyond ``MAX_VIEWERS`` is answered with 503."""
         for _ in range(MAX_VIEWERS):
             self.connected()
         self.assertIn(b" 503 ", self.connected().taken())
         self.assertEqual(self.events.viewers, MAX_VIEWERS)
 
     def test_close(self) -> None:
-        """Closing ends every stream and leaves no timer."""
+        """``close`` ends every stream and leaves no timer."""
         page = self.connected()
         self.events.close()
         self.assertTrue(page.taken().endswith(b"0\r\n\r\n"))
@@ -284,7 +284,7 @@ class EventsTests(SynchronousTestCase):
 
 
 def blind(uuid: str, on_frame: OnFrame) -> Callable[[], None]:
-    """No device has a camera."""
+    """Refuse to watch: no device has a camera."""
     raise Refusal("device", "it has no camera", "choose another", 404)
 
 
@@ -304,7 +304,7 @@ class ShotsTests(SynchronousTestCase):
         return Connection(self.site).ask(f"/shot/ab?after={after}&viewer={viewer}")
 
     def test_wait_for_the_next(self) -> None:
-        """A question is held until a picture comes, and is answered with it and its number."""
+        """A request waits for the next picture and returns it with its number."""
         page = self.asked()
         self.assertEqual(page.taken(), b"")
         self.frames.show("ab", 7, JPEG)
@@ -314,7 +314,7 @@ class ShotsTests(SynchronousTestCase):
         self.assertTrue(data.endswith(JPEG))
 
     def test_answer_with_the_newest(self) -> None:
-        """Who is behind gets the newest picture at once, never those between, and how old it is."""
+        """A request gets the newest picture at once, with its age, and no older one."""
         self.asked()
         for seq in (1, 2, 3):
             self.frames.show("ab", seq, JPEG, 0.5)
@@ -325,13 +325,13 @@ class ShotsTests(SynchronousTestCase):
         self.assertEqual(self.asked("3").taken(), b"")
 
     def test_take_a_lower_number_for_new(self) -> None:
-        """A camera that started anew counts from one: its picture is news all the same."""
+        """A picture with a lower number is new, because a restarted camera counts from one."""
         page = self.asked("900")
         self.frames.show("ab", 1, JPEG)
         self.assertIn(b"X-Seq: 1", page.taken())
 
     def test_give_up_after_five_seconds(self) -> None:
-        """Without a picture the answer after five seconds is 204, so that the page knows that the node lives."""
+        """Without a picture a request is answered with 204 after five seconds, so the page knows that the node runs."""
         page = self.asked()
         self.clock.advance(4.9)
         self.assertEqual(page.taken(), b"")
@@ -339,7 +339,7 @@ class ShotsTests(SynchronousTestCase):
         self.assertIn(b" 204 ", page.taken())
 
     def test_open_a_silent_upstream_anew(self) -> None:
-        """A silent upstream is opened anew while one looks: its device may be back at another address."""
+        """A silent upstream is reopened during requests, because its device may have another address."""
         self.asked()
         self.clock.advance(5)
         page = self.asked()
@@ -348,7 +348,7 @@ class ShotsTests(SynchronousTestCase):
         self.assertEqual(self.frames.opened, 2)
 
     def test_hold_one_question_a_viewer(self) -> None:
-        """A viewer that asks again has its older question answered with 204; others are left alone."""
+        """A viewer's new request ends its older one with 204; other viewers keep theirs."""
         first, other = self.asked(viewer="a"), self.asked(viewer="b")
         second = self.asked(viewer="a")
         self.assertIn(b" 204 ", first.taken())
@@ -357,7 +357,7 @@ class ShotsTests(SynchronousTestCase):
         self.assertIn(b" 200 ", other.taken())
 
     def test_watch_only_while_somebody_looks(self) -> None:
-        """The upstream starts with the first question and stops two seconds after the last, leaving no timer."""
+        """The upstream starts with the first request and stops two seconds after the last one, without a timer."""
         self.assertEqual(list(self.frames.watched), [])
         page = self.asked(viewer="a")
         again = self.asked(viewer="a")
@@ -372,7 +372,7 @@ class ShotsTests(SynchronousTestCase):
         self.assertTrue(page.taken() and again.taken())
 
     def test_forget_who_left(self) -> None:
-        """A viewer that closes its connection is waited for no longer."""
+        """A viewer that closes its connection is removed."""
         page = self.asked()
         page.leave()
         self.frames.show("ab", 1, JPEG)
@@ -380,7 +380,7 @@ class ShotsTests(SynchronousTestCase):
         self.assertEqual((page.taken(), self.shots.watched), (b"", []))
 
     def test_drop_what_is_no_picture(self) -> None:
-        """Bytes that are no whole JPEG, far too many, or a claim of far too many pixels, go to nobody."""
+        """Incomplete or oversized JPEG data, and pictures with too many pixels, are dropped."""
         page = self.asked()
         self.frames.show("ab", 1, b"<script>")
         self.frames.show("ab", 2, JPEG[:-2] + bytes(2_000_000) + JPEG[-2:])
@@ -389,7 +389,7 @@ class ShotsTests(SynchronousTestCase):
         self.assertEqual(page.taken(), b"")
 
     def test_tell_of_no_camera(self) -> None:
-        """A device without a camera is answered in words, and nothing is kept of it."""
+        """A request to a device without a camera is answered with 404 and leaves no state."""
         shots = Shots(blind, self.clock)
         data = Connection(self.site_with(shots)).ask("/shot/cd?after=").taken()
         self.assertIn(b" 404 ", data)
@@ -397,13 +397,13 @@ class ShotsTests(SynchronousTestCase):
         self.assertEqual(shots.watched, [])
 
     def test_cap_waiting(self) -> None:
-        """More questions than a camera holds are refused."""
+        """A request beyond ``MAX_WAITING`` is answered with 503."""
         for _ in range(MAX_WAITING):
             self.asked()
         self.assertIn(b" 503 ", self.asked().taken())
 
     def test_ignore_late_pictures(self) -> None:
-        """A picture that arrives after the upstream was stopped starts nothing again."""
+        """A picture after the stop of the upstream has no effect."""
         self.asked()
         late = self.frames.watched["ab"]
         self.shots.close()
@@ -411,7 +411,7 @@ class ShotsTests(SynchronousTestCase):
         self.assertEqual((self.clock.getDelayedCalls(), self.shots.watched), ([], []))
 
     def test_close(self) -> None:
-        """Closing answers whoever waits and stops the upstream now."""
+        """``close`` answers waiting requests and stops the upstream."""
         page = self.asked()
         self.shots.close()
         self.assertIn(b" 204 ", page.taken())

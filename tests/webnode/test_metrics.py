@@ -1,4 +1,4 @@
-"""Tests of ``webnode.routes.metrics``: figures for Prometheus."""
+"""Tests of ``webnode.routes.metrics``: metrics for Prometheus."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class MetricsTests(SynchronousTestCase):
         }
 
     def test_tell_the_team(self) -> None:
-        """Devices and tasks by status, what devices send, and groups are told, whatever the devices are called."""
+        """Devices and tasks by status, network counters and groups are exported, with any device name."""
         told = self.read()
         self.assertEqual(told["swarm_devices", ("IDLE",)], 1)
         self.assertEqual(told["swarm_tasks", ("EXECUTING",)], 1)
@@ -57,7 +57,7 @@ class MetricsTests(SynchronousTestCase):
         self.assertEqual(told["swarm_page_time_seconds", ()], 9.5)
 
     def test_tell_the_page(self) -> None:
-        """Connections by kind, and orders by role and status, are counted; a look at them is none."""
+        """Connections by kind, and requests by role and status, are counted; reading the metrics is not."""
         self.limits.count("stream", "10.0.0.1", 2)
         self.board.audit.note(Visitor("ann", "operator"), "h", "POST /x", "", "409 it left")
         told = self.read()
@@ -66,7 +66,7 @@ class MetricsTests(SynchronousTestCase):
         self.assertEqual(self.read(), told)
 
     def test_tell_of_a_missing_library(self) -> None:
-        """Where the library is not installed, that and what installs it is said."""
+        """If the library is not installed, the answer names the command that installs it."""
         hidden = {
             name: sys.modules.pop(name) for name in list(sys.modules) if name.split(".")[0] == "prometheus_client"
         }

@@ -1,4 +1,4 @@
-"""Tests of ``webnode.routes.openapi``: the document says what the table says."""
+"""Tests of ``webnode.routes.openapi``: the document corresponds to the table of routes."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class DocumentTests(SynchronousTestCase):
         return document([route])["paths"][route.path][route.method.lower()]
 
     def test_have_every_route(self) -> None:
-        """Every route of the table is in the document by method and path, under a name of its own, and none besides."""
+        """The document has exactly the routes of the table, each with a unique operation id."""
         told = document(TABLE)
         found = {f"{method.upper()} {path}" for path, each in told["paths"].items() for method in each}
         self.assertEqual(found, {route.name for route in TABLE})
@@ -40,7 +40,7 @@ class DocumentTests(SynchronousTestCase):
         self.assertEqual(json.loads(json.dumps(told)), told)
 
     def test_say_what_a_field_may_be(self) -> None:
-        """Bounds, choices, defaults, units and places of fields are those that are checked; no others may be given."""
+        """Bounds, choices, defaults, units and places of fields are documented as they are checked."""
         told = self.operation(Route("POST", "/api/v1/things/{uuid}", "About", "operator", lambda ask: {}, FIELDS))
         by_name = {each["name"]: each for each in told["parameters"]}
         self.assertEqual(by_name["uuid"]["schema"]["maxLength"], 64)
@@ -55,7 +55,7 @@ class DocumentTests(SynchronousTestCase):
         self.assertFalse(by_name["X-Swarm"]["required"])
 
     def test_say_who_may(self) -> None:
-        """What anyone may ask needs nothing; a viewer's looks take a token or a ticket, orders a token alone."""
+        """Public routes need nothing, reads by viewers a token or ticket, operator routes a token."""
         for role, method, wanted in (
             ("anyone", "GET", ()),
             ("viewer", "GET", ("token", "ticket")),
@@ -67,7 +67,7 @@ class DocumentTests(SynchronousTestCase):
             self.assertEqual((told["security"], told["x-role"]), ([{each: []} for each in wanted], role))
 
     def test_say_what_is_given(self) -> None:
-        """A media type stands as such, everything else as JSON in words, and whatever is refused as an error."""
+        """A media type is documented as such, other answers as JSON with a description, errors by reference."""
         picture = self.operation(Route("GET", "/shot", "A picture", "viewer", None, gives="image/jpeg"))
         self.assertEqual(list(picture["responses"]["200"]["content"]), ["image/jpeg"])
         order = self.operation(Route("POST", "/api/v1/x", "X", "operator", lambda ask: {}, gives="id", status=202))
@@ -75,7 +75,7 @@ class DocumentTests(SynchronousTestCase):
         self.assertEqual(order["responses"]["default"], {"$ref": "#/components/responses/Refused"})
 
     def test_refer_to_what_is_there(self) -> None:
-        """Every reference in the document leads to a part of it."""
+        """Every reference in the document points to an existing part."""
         told = document(TABLE)
         for reference in re.findall(r'"\$ref": "#/([^"]+)"', json.dumps(told)):
             part: Any = told
@@ -84,7 +84,7 @@ class DocumentTests(SynchronousTestCase):
             self.assertTrue(part)
 
     def test_be_served(self) -> None:
-        """A viewer is given the document of the table that is served, with the node's name."""
+        """A viewer gets the document of the served routes, with the node's name."""
         state = state_of([], [], {}, node="vaio")
         client = create_app(lambda: state, Board(MemoryDesk(), Guests())).test_client()
         self.assertEqual(client.get("/api/v1/openapi.json").status_code, 401)

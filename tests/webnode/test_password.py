@@ -9,7 +9,7 @@ from webnode.password import LOG_N, P, R, hashed, is_password, read
 
 class PasswordTests(SynchronousTestCase):
     def test_know_the_password_again(self) -> None:
-        """The password is known by its hash, any other is not; the same password hashes otherwise with another salt."""
+        """A hash matches its password only, and depends on the salt."""
         text = hashed("correct horse", bytes(16), 4)
         self.assertTrue(is_password(text, "correct horse"))
         for other in ("correct hors", "Correct horse", "", text):
@@ -18,12 +18,12 @@ class PasswordTests(SynchronousTestCase):
         self.assertNotIn("horse", text)
 
     def test_be_hard_to_guess(self) -> None:
-        """What is made without further words takes 16 MiB and five rounds of it."""
+        """The default hash needs 16 MiB and five rounds."""
         self.assertEqual(read(hashed("correct horse", bytes(16)))[:3], (LOG_N, R, P))
         self.assertEqual((128 * R * 2**LOG_N, P), (16 * 1024 * 1024, 5))
 
     def test_refuse_what_is_no_hash(self) -> None:
-        """What is no hash, or one that would take all the memory, is told at once."""
+        """Invalid hashes, and hashes that need too much memory, are rejected."""
         good = hashed("x", bytes(16), 4)
         tail = good.split("$", 4)[4]
         for text in (

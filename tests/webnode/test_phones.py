@@ -1,4 +1,4 @@
-"""Tests of ``webnode.routes.phones``: joining over the API, looks past Flask, and what is refused of both."""
+"""Tests of ``webnode.routes.phones``: joining over the API, pictures through native routes, and errors."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class PhoneRouteTests(SynchronousTestCase):
         return dict(answer.get_json())
 
     def send(self, path: str, body: bytes = b"", **headers: str) -> tuple[int, Any]:
-        """Status and JSON of what is sent natively."""
+        """Send a request to a native route and return status and JSON."""
         connection = Connection(self.site)
         head = {"Host": "localhost", "Content-Length": str(len(body)), **headers}
         lines = "".join(f"{name}: {value}\r\n" for name, value in head.items())
@@ -76,7 +76,7 @@ class PhoneRouteTests(SynchronousTestCase):
         return self.send(f"phones/{phone['uuid']}/look?{asked}", body)
 
     def test_join_look_and_leave(self) -> None:
-        """One joins with a secret, looks by the ticket alone as a page does, and leaves with a beacon's bare POST."""
+        """A phone joins with a secret, sends pictures with a ticket, and leaves with a plain POST."""
         phone = self.joined(orientation=True)
         self.assertEqual(self.phones.can, {"width": 208, "height": 156, "orientation": True, "position": False})
         status, told = self.look(phone, jpeg(), '{"target.bearing": 0.1, "target.distance": 1}')
@@ -89,7 +89,7 @@ class PhoneRouteTests(SynchronousTestCase):
         self.assertEqual([line["outcome"] for line in self.board.audit.newest(9)], ["200"] * 3)
 
     def test_ask_for_the_role(self) -> None:
-        """Phones and operators join; a viewer and a nobody do not, nor does who only holds another phone's ticket."""
+        """Phones and operators join; viewers, unknown visitors and phones with another phone's ticket do not."""
         self.assertEqual(self.join(self.token_of("operator")).status_code, 200)
         self.assertEqual(self.join(self.token_of("viewer")).status_code, 403)
         self.assertEqual(self.client.post("/api/v1/phones", json=JOIN).status_code, 401)
@@ -98,7 +98,7 @@ class PhoneRouteTests(SynchronousTestCase):
         self.assertEqual((answer.status_code, answer.get_json()["error"]["field"]), (403, "ticket"))
 
     def test_ticket_is_of_one_phone(self) -> None:
-        """With the ticket of one phone nobody looks or leaves for another, nor without one; an operator's token may."""
+        """The ticket of a phone is valid only at that phone's routes; the token of an operator at all of them."""
         one, other = self.joined(), self.joined(secret="1e" * 32, name="ben")
         self.assertEqual(self.look(one, jpeg(), ticket=other["ticket"])[0], 403)
         self.assertEqual(self.send(f"phones/{one['uuid']}/leave?ticket={other['ticket']}")[0], 403)
@@ -110,7 +110,7 @@ class PhoneRouteTests(SynchronousTestCase):
         self.assertEqual(self.send(f"phones/{one['uuid']}/look", jpeg(), **bearer)[0], 200)
 
     def test_refuse_wrong_fields(self) -> None:
-        """Each wrong field of a phone that joins is refused by name; so is the phone for which there is no room."""
+        """Each invalid field of a joining phone is rejected by name, and so is a phone beyond the limit."""
         wrong: list[tuple[str, Any]] = [
             ("secret", "xyz"),
             ("secret", "0f" * 31),
@@ -132,7 +132,7 @@ class PhoneRouteTests(SynchronousTestCase):
         self.assertEqual(self.join(secret="2d" * 32).status_code, 409)
 
     def test_refuse_wrong_looks(self) -> None:
-        """What is no picture, and values that are none, are refused in words; nothing of it reaches the team."""
+        """Invalid pictures and values are rejected, and nothing of them reaches the team."""
         phone = self.joined()
         for body in (b"", b"GIF89a", b"\xff\xd8\xff\xd9", jpeg(641, 10), jpeg()[:-1]):
             status, told = self.look(phone, body)
@@ -157,7 +157,7 @@ class PhoneRouteTests(SynchronousTestCase):
         self.assertEqual(self.look(phone, jpeg(), json.dumps(at_bounds))[0], 200)
 
     def test_answer_posts_alone(self) -> None:
-        """Any other method is 405 with what is allowed, and what lies below a look is not there."""
+        """Other methods are answered with 405 and ``Allow``, and paths below with 404."""
         self.board.sessions = OpenSessions()
         for method, path, status in (("GET", "look", 405), ("PUT", "leave", 405), ("POST", "look/more", 404)):
             asked = Connection(self.site).ask(f"/api/v1/phones/01/{path}", method, X_Swarm="1").taken()
@@ -166,7 +166,7 @@ class PhoneRouteTests(SynchronousTestCase):
             self.assertEqual(b"Allow: POST" in asked, status == 405)
 
     def test_share_with_the_team(self) -> None:
-        """A page that came from another web node goes on looking here; a foreign site cannot, whatever it knows."""
+        """A page of another web node of the team may send pictures here; a page of an unknown origin may not."""
         self.board.fallbacks = Fallbacks(Page("02", "http://other:8080"))
         phone = self.joined()
         path = f"phones/{phone['uuid']}/look?ticket={phone['ticket']}"
@@ -174,7 +174,7 @@ class PhoneRouteTests(SynchronousTestCase):
         self.assertEqual(self.send(path, jpeg(), Origin="http://evil:8080")[0], 403)
 
     def test_node_without_phones(self) -> None:
-        """A node that takes no phones says so."""
+        """A node without phone support rejects phones with 409."""
         phone = self.joined()
         self.board.phones = None
         self.assertEqual(self.join().status_code, 409)

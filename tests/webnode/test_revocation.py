@@ -1,4 +1,4 @@
-"""Tests of ``webnode.revocation``: who signs out at one web node is signed out at all."""
+"""Tests of ``webnode.revocation``: a sign-out at one web node is valid at all of them."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class TeamRevocationsTests(SynchronousTestCase):
         return TeamRevocations(self.team.services[name].assembly.node)
 
     def test_hold_at_every_web_node(self) -> None:
-        """A token that is revoked at one web node lets in nobody at another, nor at one that starts when both died."""
+        """A token that one web node revokes is invalid at the others, and at a node that starts after both died."""
 
         def at(revoked: TeamRevocations, key: TokenKey) -> SignedSessions:
             return SignedSessions(key, lambda _: True, "quiet-otter", "", random.Random(1), check, revoked)
@@ -55,7 +55,7 @@ class TeamRevocationsTests(SynchronousTestCase):
         self.assertEqual(late.visitor(given[uuids[2]].text, now), Visitor())
 
     def test_stay_small(self) -> None:
-        """However many sign out, the record fits a datagram and holds the newest, and old ones are forgotten."""
+        """The record always fits a datagram, holds the newest revocations, and drops expired ones."""
         now = self.team.clock.seconds()
         self.vaio.add("ee" * 8, now + 1.0)
         self.team.clock.advance(2.0)
@@ -69,7 +69,7 @@ class TeamRevocationsTests(SynchronousTestCase):
         self.assertFalse(self.vaio.has("ee" * 8))
 
     def test_believe_lawful_records_only(self) -> None:
-        """A record that is no list of sessions ends none, whatever stands in it."""
+        """A record with invalid content revokes no session."""
         good = Record(REVOKED, SLOT, bytes(32), 1, "team", 60.0, msgpack.packb({bytes(8): 5}))
         self.assertEqual(revoked_in(good), {"00" * 8: 5.0})
         bad: list[Any] = [[], {"ab": 5}, {bytes(7): 5}, {bytes(8): "x"}, {bytes(8): float("nan")}, {bytes(8): True}, 7]
@@ -79,7 +79,7 @@ class TeamRevocationsTests(SynchronousTestCase):
             self.assertEqual(revoked_in(record), {})
 
     def test_remember_so_many(self) -> None:
-        """The twin in memory forgets the oldest, too."""
+        """The revocations in memory drop the oldest as well."""
         twin = Revocations()
         for number in range(REMEMBERED + 1):
             twin.add(str(number), 1.0)

@@ -1,4 +1,4 @@
-"""What ``webnode.route`` and the table of routes promise."""
+"""Tests of ``webnode.route`` and the table of routes."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class CheckedTests(SynchronousTestCase):
         return found
 
     def test_take_each_kind(self) -> None:
-        """A lawful value of each kind arrives as what the answer uses, from path, query and body."""
+        """Valid values of each kind are converted from path, query and body."""
         fields = (
             Field("uuid", "text", "", "path"),
             Field("after", "whole", "", "query"),
@@ -48,7 +48,7 @@ class CheckedTests(SynchronousTestCase):
         self.assertIs(type(given["n"]), int)
 
     def test_refuse_each_kind(self) -> None:
-        """A wrong value is refused by field, problem and remedy, whatever kind it should be."""
+        """An invalid value of each kind is rejected with field, problem and remedy."""
         wrong: list[tuple[Field, list[Any]]] = [
             (Field("name", "text", "", most=5), [5, None, "", " \x00", "abcdef", ["a"], {}]),
             (Field("code", "text", "", least=3), ["ab"]),
@@ -69,13 +69,13 @@ class CheckedTests(SynchronousTestCase):
                 self.assertTrue(refusal.problem and refusal.remedy, refusal)
 
     def test_ask_for_what_is_missing(self) -> None:
-        """A field that is missing is asked for, or has its default where it is not required."""
+        """A missing field is rejected if it is required, otherwise it has its default."""
         name, seconds = Field("name", "text", ""), Field("s", "number", "", default=15.0)
         self.assertEqual(self.assertRaises(Refusal, checked, route(name), {}, {}, {}).field, "name")
         self.assertEqual(checked(route(seconds), {}, {}, {}), {"s": 15.0})
 
     def test_refuse_unknown_fields(self) -> None:
-        """A field that the route does not take is refused with the nearest that it does; a body is an object."""
+        """An unknown field is rejected with the nearest known name, and a body that is not an object is rejected."""
         refusal = self.assertRaises(Refusal, checked, route(Field("tolerates", "whole", "")), {}, {}, {"toleratse": 1})
         self.assertEqual(refusal.field, "toleratse")
         self.assertIn("tolerates", refusal.remedy)
@@ -87,7 +87,7 @@ class CheckedTests(SynchronousTestCase):
 
 class GuardedTests(SynchronousTestCase):
     def test_let_in_by_role(self) -> None:
-        """An operator may do all, a viewer look, a phone that and what phones do; who is nobody is told to sign in."""
+        """Each role may use the routes that ``ALLOWED`` lists; an unknown visitor gets 401, others 403."""
         for wanted, lawful in ALLOWED.items():
             for role in ALLOWED:
                 if role in lawful:
@@ -99,7 +99,7 @@ class GuardedTests(SynchronousTestCase):
 
 class DeviceTests(SynchronousTestCase):
     def test_find_the_device(self) -> None:
-        """A device that is here is found; one that left is told of with 409, an unknown one with 404."""
+        """A present device is found; a lost device is answered with 409, an unknown one with 404."""
         departed, dogs = Departed(), [{"uuid": f"0{n}", "name": f"dog{n}", "joined": n} for n in (1, 2)]
         departed.of(dogs, 1.0)
         state = state_of(dogs[:1], [], {}, departed=departed.of(dogs[:1], 2.0))
@@ -112,7 +112,7 @@ class DeviceTests(SynchronousTestCase):
 
 class TableTests(SynchronousTestCase):
     def test_each_route_is_whole(self) -> None:
-        """Every route says what it does, names every part of its path as a field, and stands once in the table."""
+        """Every route has a description, a field for each part of its path, and is unique."""
         for each in TABLE:
             named = {field.name for field in each.fields if field.where == "path"}
             self.assertEqual(named, set(re.findall(r"\{(\w+)\}", each.path)), each.name)
@@ -123,7 +123,7 @@ class TableTests(SynchronousTestCase):
         self.assertEqual(len(names), len(set(names)))
 
     def test_orders_are_for_operators(self) -> None:
-        """Whatever changes something wants an operator, but for signing in and what a phone does; looking a viewer."""
+        """Changes require an operator, except for signing in and phones; reads require a viewer."""
         for each in TABLE:
             if each.method != "GET" and each.role != "operator":
                 self.assertTrue(each.role == "phone" or each.path in FOR_ALL, each.name)

@@ -1,4 +1,4 @@
-"""What ``webnode.server`` promises."""
+"""Tests of ``webnode.server``."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ NATIVE: dict[str, Resource] = {"/stream": Stream()}
 
 class SentTests(SynchronousTestCase):
     def test_send_no_comments(self) -> None:
-        """Scripts are sent without their comments, each line at its number; what looks like one in a line stays."""
+        """Scripts are sent without full-line comments, with unchanged line numbers and strings."""
         script = Path(self.mktemp()).with_suffix(".js")
         script.write_text("// About it.\nconst a = 1; // one\n  // More.\nexport const URL = `http://a`;\n")
         self.assertEqual(sent(script), b"\nconst a = 1; // one\n\nexport const URL = `http://a`;\n")
@@ -61,20 +61,20 @@ class RootTests(SynchronousTestCase):
         return Connection(self.site).ask(path, method, **headers).taken()
 
     def test_divide(self) -> None:
-        """Streams and files are native; everything else, the root included, is Flask's with its whole path."""
+        """Streams and files are native routes; Flask serves all other paths."""
         self.assertIn(b"native", self.asked("/events"))
         self.assertIn(b"flask api/v1/state 0", self.asked("/api/v1/state"))
         self.assertIn(b"flask  0", self.asked("/"))
 
     def test_tell_all_files(self) -> None:
-        """A browser that keeps the page is told each of its files, and each is there."""
+        """A browser that stores the page gets the list of its files, and each file exists."""
         paths = json.loads(self.asked("/static/files.json").partition(b"\r\n\r\n")[2])
         self.assertLess({"/static/page.js", "/static/sw.js", "/static/base.css"}, set(paths))
         for path in paths:
             self.assertIn(b" 200 ", self.asked(path)[:15], path)
 
     def test_refuse_in_json(self) -> None:
-        """Whatever a native route refuses is JSON with the strict headers and no version of the server."""
+        """Errors of native routes are JSON with the strict headers and without the server's version."""
         self.site = site_of(Root(PathResource(), {**NATIVE, "/static": Files()}, self.board, lambda: 1e9), Clock())
         asked = [
             ("/static/nothing.js", "GET", 404),
@@ -101,7 +101,7 @@ class RootTests(SynchronousTestCase):
                 self.assertIn(b"Allow: GET", data)
 
     def test_ask_for_the_role(self) -> None:
-        """A native route is for its role: signed in by a header, or by the ticket in the query; no ticket is told."""
+        """A native route checks its role by header or ticket, and does not repeat an invalid ticket."""
         self.board.sessions = Guests()
         self.assertIn(b" 401 ", self.asked("/events"))
         self.assertIn(b" 401 ", self.asked("/events?ticket=nonsense"))
@@ -112,7 +112,7 @@ class RootTests(SynchronousTestCase):
         self.assertIn(b" 200 ", self.asked("/static/page.js"))
 
     def test_find_deep_routes(self) -> None:
-        """A native route may lie below the API; the whole path is matched, and one that no table names is guarded."""
+        """A native route can be below the API: its whole path must match, and its role is checked."""
         native: dict[str, Resource] = {"/api/v1/phones/{uuid}/look": Data(b"seen", "text/plain")}
         self.site = site_of(Root(PathResource(), native, self.board, lambda: 1e9), Clock())
         self.assertIn(b"seen", self.asked("/api/v1/phones/01/look"))
@@ -122,7 +122,7 @@ class RootTests(SynchronousTestCase):
         self.assertIn(b" 403 ", self.asked("/api/v1/phones/01/look?ticket=viewer"))
 
     def test_share_with_the_team(self) -> None:
-        """A page of another web node of the team may ask, also for what it needs a preflight; any other may not."""
+        """A page of another web node of the team may send requests, also with a preflight; other origins may not."""
         self.board.fallbacks = Fallbacks(Page("02", "http://other:8080"))
         for method in ("GET", "OPTIONS"):
             data = self.asked("/events", method, Origin="http://other:8080")
@@ -131,7 +131,7 @@ class RootTests(SynchronousTestCase):
         self.assertIn(b" 403 ", self.asked("/events", "OPTIONS", Origin="http://evil:8080"))
 
     def test_pack_files(self) -> None:
-        """A file goes out packed to whoever takes gzip, and plain to others, each under its own tag."""
+        """A file is compressed if the client accepts gzip, and each variant has its own ETag."""
         plain = self.asked("/static/page.js")
         packed = self.asked("/static/page.js", Accept_Encoding="br, gzip;q=0.8")
         self.assertIn(b"Content-Encoding: gzip", packed)
@@ -142,7 +142,7 @@ class RootTests(SynchronousTestCase):
             self.assertNotIn(b"Content-Encoding", self.asked("/static/page.js", Accept_Encoding=refused))
 
     def test_serve_files(self) -> None:
-        """A file is revalidated at each visit and not sent twice; what is not there is not found."""
+        """A file is revalidated by ETag at each visit; a missing file is not found."""
         data = self.asked("/static/page.js")
         self.assertIn(b"text/javascript", data)
         self.assertIn(b"Cache-Control: no-cache", data)
@@ -154,13 +154,13 @@ class RootTests(SynchronousTestCase):
             self.assertNotIn(b"create_app", self.asked(path))
 
     def test_take_small_bodies(self) -> None:
-        """A body of the largest lawful size comes through."""
+        """A body of exactly the maximum size is accepted."""
         body = bytes(MAX_BODY)
         head = f"POST /api/x HTTP/1.1\r\nHost: vaio\r\nContent-Length: {len(body)}\r\n\r\n".encode()
         self.assertIn(b"flask api/x %d" % MAX_BODY, Connection(self.site).send(head + body).taken())
 
     def test_cut_large_bodies(self) -> None:
-        """A body announced as too large is refused before it comes; one that only grows is cut at the limit."""
+        """A too large body is rejected by its announced length, or as soon as it exceeds the limit."""
         announced = Connection(self.site).send(b"POST /api/x HTTP/1.1\r\nHost: vaio\r\nContent-Length: 65537\r\n\r\n")
         growing = Connection(self.site).send(
             b"POST /api/x HTTP/1.1\r\nHost: vaio\r\nTransfer-Encoding: chunked\r\n\r\n"
@@ -182,7 +182,7 @@ class QuickReactor:
 
 class CallerTests(SynchronousTestCase):
     def test_bring_the_answer(self) -> None:
-        """What the desk returns comes back, also by a Deferred; what it refuses is raised."""
+        """The caller returns the desk's result, also from a Deferred, and raises its refusals."""
 
         def refuse() -> None:
             raise Refusal("name", "no", "ask another", 404)
@@ -193,7 +193,7 @@ class CallerTests(SynchronousTestCase):
         self.assertEqual(self.assertRaises(Refusal, on_reactor, refuse).status, 404)
 
     def test_wait_no_longer_than_the_limit(self) -> None:
-        """A desk that does not answer costs the worker only the limit, and the visitor is told to look."""
+        """A desk that does not answer is given up after the limit, with 503."""
         never: Deferred[None] = Deferred()
         for usual_s, given in ((0.0, {}), (1e6, {"limit_s": 0.0})):
             error = self.assertRaises(Refusal, caller(QuickReactor(), usual_s), lambda: never, **given)

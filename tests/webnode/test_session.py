@@ -1,4 +1,4 @@
-"""Tests of ``webnode.session``: signing in, by code, password and invitation."""
+"""Tests of ``webnode.session``: signing in by code, password and invitation."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ KEYS = {name: TokenKey(Identity(name.encode().ljust(32))) for name in ("vaio", "
 
 
 def uuid(name: str) -> str:
-    """The id of a node as the page has it."""
+    """Return the id of a node as the page shows it."""
     return KEYS[name].node_id.hex()
 
 
@@ -47,7 +47,7 @@ class SignedSessionsTests(SynchronousTestCase):
         return refusal
 
     def test_sign_in_by_the_code(self) -> None:
-        """The code makes an operator, however it is written, for twelve hours; its ticket a viewer for as long."""
+        """The code, in any notation, signs in an operator for twelve hours; its ticket a viewer for the same time."""
         for words in ("quiet-otter", " Quiet Otter ", "QUIETOTTER"):
             token = self.signed(words)
             self.assertEqual((token.role, token.until), ("operator", SIGNED_S))
@@ -59,7 +59,7 @@ class SignedSessionsTests(SynchronousTestCase):
             self.assertEqual(self.sessions.visitor(text, SIGNED_S), Visitor())
 
     def test_go_on_at_another_web_node(self) -> None:
-        """A pass is good for minutes at the web node that it names and at no other; renewed there it is the session."""
+        """A pass is valid for minutes at the web node that it names; a renewal there continues the session."""
         pi, nuc = self.node("pi"), self.node("nuc")
         token = self.signed()
         self.assertEqual(pi.visitor(token.text, 1.0), Visitor())
@@ -79,7 +79,7 @@ class SignedSessionsTests(SynchronousTestCase):
         self.assertEqual(refusal.status, 401)
 
     def test_believe_gateways_alone(self) -> None:
-        """A session ends while one that vouches for it is no gateway, and nobody signs in at a node that is none."""
+        """A session is invalid while one of its vouchers is no gateway, and only gateways allow signing in."""
         pi, token = self.node("pi"), self.signed()
         given = self.sessions.passes(self.sessions.visitor(token.text, 1.0), [uuid("pi")], 1.0)[uuid("pi")]
         renewed = pi.renewed(pi.visitor(given.text, 1.0), 1.0)
@@ -95,7 +95,7 @@ class SignedSessionsTests(SynchronousTestCase):
         self.assertEqual(self.sessions.visitor(token.text, 3.0).role, "operator")
 
     def test_end_what_was_made_of_it(self) -> None:
-        """With an invitation end the sessions that began by it, with a session the tickets that were derived of it."""
+        """Revoking an invitation ends its sessions, and revoking a session ends its derived tickets."""
         who = self.sessions.visitor(self.signed().text, 1.0)
         invitation = self.sessions.token(who, "guest", "phone", 1.0, 600.0)
         guest = self.sessions.visitor(self.signed(invitation.text, 2.0).text, 2.0)
@@ -106,7 +106,7 @@ class SignedSessionsTests(SynchronousTestCase):
         self.assertEqual(self.refused(invitation.text, 3.0).status, 401)
 
     def test_refuse_what_is_not_the_code(self) -> None:
-        """Anything else is refused with 401 and words that say where the code stands; no token is nobody."""
+        """A wrong code is rejected with 401 and a hint to ``swarm web``; a visitor without a token is anonymous."""
         for words in ("", "quiet", "quiet-otter1", "\N{DOG FACE}", "A" * 60):
             refusal = self.refused(words)
             self.assertEqual((refusal.status, refusal.field), (401, "code"))
@@ -114,7 +114,7 @@ class SignedSessionsTests(SynchronousTestCase):
         self.assertEqual(self.sessions.visitor("", 0.0), Visitor())
 
     def test_slow_guesses_down(self) -> None:
-        """Of a thousand guesses ten are looked at, then even the code waits; from elsewhere one signs in meanwhile."""
+        """After ten guesses a source must wait even with the correct code; other sources sign in at once."""
         told = [self.refused(f"guess {n}").status for n in range(1000)]
         self.assertEqual((told.count(401), told.count(429)), (10, 990))
         self.assertIn("wait 4 s", self.refused("quiet-otter").remedy)
@@ -123,14 +123,14 @@ class SignedSessionsTests(SynchronousTestCase):
         self.assertEqual(self.refused("wrong", 4.0).status, 401)
 
     def test_sign_in_by_the_password(self) -> None:
-        """Where there is a password it lets in as the code does, and a wrong one does not."""
+        """If a password is set, both password and code sign in, and a wrong password does not."""
         self.sessions = self.node(password=HASH)
         self.assertEqual(self.signed("correct horse").role, "operator")
         self.assertEqual(self.signed().role, "operator")
         self.assertEqual(self.refused("correct hors").status, 401)
 
     def test_check_two_passwords_at_once(self) -> None:
-        """Of a storm of passwords two are worked at, some wait, the others are told to come back; each is a guess."""
+        """Two passwords are checked at once, some wait, the others get 503; each counts as a guess."""
         asked: list[Deferred[bool]] = []
 
         def check(text: str, word: str) -> Deferred[bool]:
@@ -152,7 +152,7 @@ class SignedSessionsTests(SynchronousTestCase):
             each.addErrback(lambda _: None)
 
     def test_invite(self) -> None:
-        """An invitation signs in by itself, in its role and for no longer; its ticket and an old one do not."""
+        """An invitation signs in with its role and until its end; its ticket and an expired one do not."""
         invitation = self.sessions.token(OPERATOR, "guest", "viewer", 0.0, 100.0)
         token = self.signed(invitation.text, 10.0)
         self.assertEqual((token.role, token.until), ("viewer", 100.0))
@@ -164,7 +164,7 @@ class SignedSessionsTests(SynchronousTestCase):
         self.assertEqual(self.signed(long.text, 1.0).until, SIGNED_S + 1.0)
 
     def test_renew(self) -> None:
-        """A token can be had anew while it is good, up to thirty days after signing in, and is the same session."""
+        """A valid token can be renewed up to thirty days after signing in, within the same session."""
         token, now = self.signed(), 0.0
         while token.until < MAX_SIGNED_S:
             now = token.until - 1.0
@@ -177,7 +177,7 @@ class SignedSessionsTests(SynchronousTestCase):
         self.assertEqual(self.sessions.visitor(token.text, now), Visitor())
 
     def test_renew_no_further_than_invited(self) -> None:
-        """A guest stays until the invitation ends; a ticket, which is seen by more, and nobody renew nothing."""
+        """A guest cannot renew beyond the invitation; a ticket and an unknown visitor cannot renew."""
         invitation = self.sessions.token(OPERATOR, "guest", "viewer", 0.0, SIGNED_S + 10.0)
         token = self.signed(invitation.text, 1.0)
         self.assertEqual(token.until, SIGNED_S + 1.0)
@@ -193,20 +193,20 @@ OPERATOR = Visitor("operator", "operator")
 
 class FactoryTests(SynchronousTestCase):
     def made(self, **web: object) -> Any:
-        """The sessions of a web node that is a gateway, with these settings."""
+        """Return the sessions of a gateway with these settings."""
         settings = Settings.from_mapping({"node": {"name": "vaio", "team_key": "x" * 20}, "web": web}, "vaio.toml")
         entangled = SimpleNamespace(watch=lambda *what, **how: None, identity=Identity(bytes(32)))
         node, team = SimpleNamespace(entangled=entangled), SimpleNamespace(may_vouch=lambda public: True)
         return sessions(settings, cast(Any, node), None, random.Random(1), cast(Any, team))
 
     def test_have_the_code_of_the_settings(self) -> None:
-        """The code is that of the settings; where there is none, one is made that cannot be misread."""
+        """The code comes from the settings; otherwise a random code without ambiguous letters is used."""
         self.assertEqual(self.made(code="quiet-otter").code, "quiet-otter")
         self.assertRegex(self.made().code, r"^[a-hj-km-np-z]{4}-[a-hj-km-np-z]{4}$")
         self.assertNotEqual(draw_code(random.Random(1)), draw_code(random.Random(2)))
 
     def test_do_without_on_this_machine_alone(self) -> None:
-        """Without signing in a page is served to this machine alone; open to a network it is refused in one line."""
+        """A page without sign-in is allowed on the loopback address only; otherwise the setting is rejected."""
         self.assertIsInstance(self.made(sign_in=False), OpenSessions)
         self.assertIsInstance(self.made(sign_in=False, host="::1"), OpenSessions)
         for host in ("0.0.0.0", "192.168.0.2", "::"):
@@ -214,7 +214,7 @@ class FactoryTests(SynchronousTestCase):
             self.assertIn("vaio.toml: [web] sign_in", str(error))
 
     def test_refuse_a_password_that_is_no_hash(self) -> None:
-        """A password that stands there as it is typed is refused, and not shown."""
+        """A plain-text password in the settings is rejected without showing it."""
         error = self.assertRaises(BadSetting, self.made, password="correct horse")
         self.assertIn("swarm password", str(error))
         self.assertNotIn("horse", str(error))

@@ -23,19 +23,19 @@ class TunerTests(SynchronousTestCase):
         self.node = self.team.services["dog1"].assembly.node
 
     def told(self, name: str = "dog1") -> dict[str, Any]:
-        """The settings of a device, as it tells."""
+        """Return the settings that a device reports."""
         asked = read_settings(self.team.desk, self.team.services[name].assembly.node.uuid)
         self.team.clock.advance(0.1)
         return {str(row["key"]): row["value"] for row in self.successResultOf(asked)}
 
     def change(self, **changes: Any) -> dict[str, Any]:
-        """Change settings of dog1; what it tells then."""
+        """Change settings of dog1 and return the settings that it reports."""
         asked = change_settings(self.team.desk, self.node.uuid, changes)
         self.team.clock.advance(0.1)
         return {str(row["key"]): row["value"] for row in self.successResultOf(asked)}
 
     def refusal(self, **changes: Any) -> Refusal:
-        """Why dog1 does not change them."""
+        """Return the error with which dog1 rejects the changes."""
         asked = change_settings(self.team.desk, self.node.uuid, changes)
         self.team.clock.advance(0.1)
         refusal = self.failureResultOf(asked, Refusal).value
@@ -43,11 +43,11 @@ class TunerTests(SynchronousTestCase):
         return refusal
 
     def row(self) -> dict[str, Any]:
-        """dog1 as the page shows it."""
+        """Return dog1 as the page shows it."""
         return next(dict(row) for row in self.team.state()["devices"] if row["name"] == "dog1")
 
     def test_tell_what_can_be_changed(self) -> None:
-        """A robot with a camera has four settings, a laptop three; each with its bounds and its unit."""
+        """A robot with a camera has four settings, a laptop three, each with bounds and unit."""
         self.assertEqual(list(self.told()), KEYS)
         self.assertEqual(list(self.told("vaio")), KEYS[:3])
         asked = read_settings(self.team.desk, self.node.uuid)
@@ -56,7 +56,7 @@ class TunerTests(SynchronousTestCase):
         self.assertEqual([lease[key] for key in ("value", "unit", "least", "most")], [1.0, "s", 0.1, 60.0])
 
     def test_change_what_others_see(self) -> None:
-        """A description and a capability that are changed are what the whole team sees of the device."""
+        """The whole team sees a changed description and a changed capability."""
         told = self.change(description="lame", capabilities={"gripper": {"width": 0.1}})
         self.assertEqual((told["description"], told["capabilities"]), ("lame", {"gripper": {"width": 0.1}}))
         self.team.clock.advance(1.0)
@@ -68,7 +68,7 @@ class TunerTests(SynchronousTestCase):
         self.assertNotIn("gripper", self.row()["capabilities"])
 
     def test_lease_says_how_soon_a_loss_is_seen(self) -> None:
-        """With a lease of 4 s a dead device is believed in for 3 to 5 s; with a short one it is gone in one."""
+        """A lease of 4 s delays the loss of a dead device to 3 to 5 s; a short lease to less than one."""
         for lease, earliest, latest in ((4.0, 2.6, 5.0), (0.4, 0.2, 1.0)):
             self.change(presence_lease=lease)
             self.team.clock.advance(6.0)
@@ -84,7 +84,7 @@ class TunerTests(SynchronousTestCase):
             self.node = self.team.services["dog1"].assembly.node
 
     def test_camera_takes_as_many_pictures(self) -> None:
-        """A camera that is set to 2 a second takes so many, and none at 0; the robot goes on all the same."""
+        """The camera follows its frame rate, also 0, and the driver stays ready."""
         driver: Any = self.team.services["dog1"].assembly.driver
         for fps in (2.0, 0.0, 10.0):
             self.assertEqual(self.change(camera_fps=fps)["camera_fps"], fps)
@@ -95,7 +95,7 @@ class TunerTests(SynchronousTestCase):
             self.assertEqual(driver.state, "ready")
 
     def test_refuse_what_is_wrong(self) -> None:
-        """Each wrong value is refused by the device, with the key, the problem and the remedy; nothing is changed."""
+        """Each invalid value is rejected by the device with key, problem and remedy; nothing is changed."""
         before = self.told()
         wrong: list[tuple[str, Any]] = [
             ("presence_lease", 0.01),
@@ -115,14 +115,14 @@ class TunerTests(SynchronousTestCase):
         self.assertEqual(self.told(), before)
 
     def test_device_that_is_gone_is_told(self) -> None:
-        """The settings of a device that has just died are refused as those of one that left."""
+        """The settings of a device that has just died are answered with 409."""
         self.team.kill("dog1")
         asked = read_settings(self.team.desk, self.node.uuid)
         self.team.clock.advance(2.0)
         self.assertEqual(self.failureResultOf(asked, Refusal).value.status, 409)
 
     def test_kept_for_the_next_life(self) -> None:
-        """What was changed holds when the device comes back from its store, and a rotten note does no harm."""
+        """Changed settings survive a restart from the store, and an invalid stored value is ignored."""
         self.change(description="lame", presence_lease=2.5)
         service = self.team.services["dog1"]
         seams = replace(service._seams, rng=random.Random(1))

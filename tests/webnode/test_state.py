@@ -1,4 +1,4 @@
-"""What ``webnode.state`` promises."""
+"""Tests of ``webnode.state``."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def member(number: int, cost: float | None, assigned: int | None) -> dict[str, A
 
 class StateTests(SynchronousTestCase):
     def test_order_by_joining(self) -> None:
-        """Devices stand in the order of joining on every web node, whatever order the records came in."""
+        """Devices are listed in the order of joining, for any order of the records."""
         records = [device(1, joined=3), device(2, joined=1), device(3, joined=2), device(4, joined=2)]
         rng = random.Random(1)
         for _ in range(6):
@@ -34,13 +34,13 @@ class StateTests(SynchronousTestCase):
             self.assertEqual(names, ["dog2", "dog3", "dog4", "dog1"])
 
     def test_name_objective(self) -> None:
-        """A device's objective is the title of its task, or the task's id where the task is not known."""
+        """A device's objective is the title of its task, or the id of an unknown task."""
         tasks = [{"id": "t1", "title": "Find it", "created": 5}]
         views = state_of([device(1, task="t1"), device(2, task="t9"), device(3)], tasks, {})["devices"]
         self.assertEqual([view["objective"] for view in views], ["Find it", "t9", ""])
 
     def test_tell_where_devices_are(self) -> None:
-        """A position is metres in a yard or a place on the globe; what is neither is none."""
+        """A position is in metres on the map or in degrees on the globe; other values give no position."""
         for said, told in (
             ({"x": 1, "y": -2.5, "heading": 0.5}, {"x": 1.0, "y": -2.5, "heading": 0.5}),
             ({"x": 1, "y": 2}, {"x": 1.0, "y": 2.0, "heading": None}),
@@ -53,7 +53,7 @@ class StateTests(SynchronousTestCase):
             self.assertEqual(view["position"], told, said)
 
     def test_list_newest_task_first(self) -> None:
-        """Tasks stand newest first, and a result keeps who and how long."""
+        """Tasks are listed newest first, and a result keeps the finishing device and the duration."""
         result = {"by": "dog2", "took": 41.5}
         tasks = [{"id": "a", "created": 1, "result": result, "status": "COMPLETED"}, {"id": "b", "created": 2}]
         views = state_of([], tasks, {})["tasks"]
@@ -62,7 +62,7 @@ class StateTests(SynchronousTestCase):
         self.assertEqual([view["status"] for view in views], ["UNKNOWN", "COMPLETED"])
 
     def test_survive_unlawful_records(self) -> None:
-        """Records of the wrong shape neither break the view nor reach the page."""
+        """Invalid records do not break the view and do not reach the page."""
         bad: dict[str, Any] = {
             "uuid": "ab",
             "name": 7,
@@ -85,27 +85,27 @@ class StateTests(SynchronousTestCase):
 
 class GroupTests(SynchronousTestCase):
     def test_agree(self) -> None:
-        """Where all name the same agent, the consensus point is that agent and the costs share one scale."""
+        """If all members name the same agent, it is the assigned agent, and the costs share one scale."""
         view = group_view("t", "T", [member(3, 2.0, 2), member(1, 1.0, 2), member(2, 0.5, 2)])
         self.assertEqual((view["assigned"], view["agree"], view["of"]), ("dog2", 3, 3))
         self.assertEqual([each["share"] for each in view["members"]], [0.5, 0.25, 1.0])
         self.assertEqual((view["differ"], view["undecided"]), ([], []))
 
     def test_differ(self) -> None:
-        """Who names another, and who names nobody, is told by name; who bids nothing has no share."""
+        """Members with another choice and undecided members are listed by name; no cost means no share."""
         view = group_view("t", "T", [member(1, 1.0, 1), member(2, 0.5, 2), member(3, 0.7, 2), member(4, None, None)])
         self.assertEqual((view["assigned"], view["agree"], view["of"]), ("dog2", 2, 4))
         self.assertEqual((view["differ"], view["undecided"]), (["dog1"], ["dog4"]))
         self.assertIsNone(view["members"][3]["share"])
 
     def test_decide_even_votes(self) -> None:
-        """Even votes give the lowest uuid, in any order of the members."""
+        """Equal votes give the lowest uuid, in any order of the members."""
         members = [member(1, 1.0, 2), member(2, 1.0, 1)]
         self.assertEqual(group_view("t", "T", members)["assigned"], "dog1")
         self.assertEqual(group_view("t", "T", members[::-1])["assigned"], "dog1")
 
     def test_be_undecided(self) -> None:
-        """A group without any named winner has no consensus point, and zero costs divide nothing."""
+        """A group without a named winner has no assigned agent, and zero costs cause no division by zero."""
         view = group_view("t", "T", [member(1, 0.0, None)])
         self.assertEqual((view["assigned"], view["agree"]), ("", 0))
         self.assertEqual(view["members"][0]["share"], 0.0)
@@ -113,7 +113,7 @@ class GroupTests(SynchronousTestCase):
 
 class WhyTests(SynchronousTestCase):
     def test_rows_of_a_decision(self) -> None:
-        """A task's decision has a row for each who reported, stands silent, or differs, and says what each is."""
+        """A decision has a row for each reporting, silent or differing device, with a note."""
         reports = [Reported("02" * 20, "dog2", 0.5), Reported("01" * 20, "dog1", 1.5)]
         differ = (Difference("dog1", "names dog1"), Difference("dog4", "names dog1"))
         head = (2, "02" * 20, "dog2", ("dog2", "dog3"), 4, differ, "nearest", "1", "nobody acted before")
@@ -137,7 +137,7 @@ class WhyTests(SynchronousTestCase):
 
 class DepartedTests(SynchronousTestCase):
     def test_remember_for_a_minute(self) -> None:
-        """A device that left stands there as gone, in its place, for sixty seconds, and then no longer."""
+        """A device that left is listed as gone at its place for sixty seconds."""
         departed = Departed()
         both = [device(1), device(2, status="EXECUTING")]
         departed.of(both, 100.0)
@@ -147,7 +147,7 @@ class DepartedTests(SynchronousTestCase):
         self.assertEqual(departed.of(both[1:], 161.0), [])
 
     def test_forget_when_back(self) -> None:
-        """A device that comes back is alive at once, and leaves anew with a new moment."""
+        """A device that returns is present at once, and its next loss has a new time."""
         departed = Departed()
         departed.of([device(1)], 1.0)
         self.assertEqual(len(departed.of([], 2.0)), 1)

@@ -1,4 +1,4 @@
-"""What ``webnode.survey`` and ``middleware.diagnostics.survey`` promise, over nodes on one turned clock."""
+"""Tests of ``webnode.survey`` and ``middleware.diagnostics.survey`` with nodes in virtual time."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class SurveyTests(FleetCase):
         return self.done(self.team, self.survey.network(), PATIENCE_S + 1)
 
     def test_tell_who_knows_whom(self) -> None:
-        """Each of three, in the order of joining, names the two others with a round trip and when it heard them."""
+        """Each of three nodes, in the order of joining, lists the two others with round trip and last contact."""
         told = self.network()
         self.assertEqual((list(told["devices"]), told["silent"]), (self.dogs, []))
         for place, view in enumerate(told["devices"].values()):
@@ -47,7 +47,7 @@ class SurveyTests(FleetCase):
             self.assertTrue(all(contact["heard_s"] < 3 for contact in view["contacts"]), view)
 
     def test_ask_once_for_all_who_look(self) -> None:
-        """Many who look at once, and a moment later, cost one question to each device."""
+        """Concurrent and closely following reads cause one request to each device."""
         asked: list[str] = []
 
         def expose(node: SwarmNode) -> None:
@@ -69,7 +69,7 @@ class SurveyTests(FleetCase):
         self.assertEqual(len(asked), 4)
 
     def test_name_the_silent(self) -> None:
-        """A device that does not answer is named as silent; the others are shown, in time."""
+        """A device that does not answer is listed as silent, and the others are shown in time."""
         self.team.nodes[2].vanish()
         waiting = self.survey.network()
         self.team.run(PATIENCE_S + 0.3)
@@ -77,14 +77,14 @@ class SurveyTests(FleetCase):
         self.assertEqual((list(told["devices"]), told["silent"]), (self.dogs[:2], self.dogs[2:]))
 
     def test_go_on_beside_one_without_an_address(self) -> None:
-        """A device that says no address is named as silent, and the others are shown all the same."""
+        """A device without a valid address is listed as silent, and the others are shown."""
         self.team.nodes[2].presence.change(address="nowhere")
         self.team.run(1)
         told = self.network()
         self.assertEqual((list(told["devices"]), told["silent"]), (self.dogs[:2], self.dogs[2:]))
 
     def test_believe_nothing_unlawful(self) -> None:
-        """Answers of the wrong shape become empty ones."""
+        """Answers of the wrong shape are replaced by empty ones."""
         for told in ({"contacts": [3, {"uuid": 5}, {"uuid": "ab", "rtt_ms": "x"}], "lookups": 7, "sent": []}, "no", {}):
             self.team.nodes[1].entangled.endpoint.expose(NETWORK, lambda peer, told=told: told)
             self.team.run(2)
@@ -100,7 +100,7 @@ class SurveyTests(FleetCase):
         return self.done(self.team, self.survey.links(), PATIENCE_S + 1)
 
     def test_tell_how_each_is_reached(self) -> None:
-        """Each of three tells its ways to the two others; a moment later each way has its score, and why."""
+        """Each of three nodes lists its paths to the two others; a later read has their scores."""
         told = self.links()
         self.assertEqual((told["here"], list(told["devices"]), told["silent"]), (self.dogs[0], self.dogs, []))
         self.assertEqual({way["score"] for view in told["devices"].values() for way in view["links"]}, {None})
@@ -113,7 +113,7 @@ class SurveyTests(FleetCase):
                 self.assertTrue(5 < way["rtt_ms"] < 8 and way["jitter_ms"] < 1 and way["for_s"] > 1, way)
 
     def test_tell_what_got_worse(self) -> None:
-        """A way that loses much has fewer points than one that loses nothing, as the rule of the terminal has it."""
+        """A path with loss and delay has a lower score than a good one, by the same rule as ``swarm links``."""
         self.links()
         self.team.run(3)
         far = self.team.address(2)
@@ -130,7 +130,7 @@ class SurveyTests(FleetCase):
         self.assertEqual(way["score"], judged)
 
     def test_carrying_costs(self) -> None:
-        """Of two ways with the same figures that which others carry has fewer points, and says who carries."""
+        """Of two paths with equal measurements the relayed one has the lower score, and names its relay."""
         ways = [
             {"id": uuid, "way": way, "by": by, "loss": 0.0, "round_trip": 0.002, "jitter": 0.0}
             for uuid, way, by in ((self.dogs[0], "punched", ""), (self.dogs[2], "carried", self.dogs[0]))
@@ -142,7 +142,7 @@ class SurveyTests(FleetCase):
         self.assertLess(carried["score"], 100)
 
     def test_believe_no_unlawful_way(self) -> None:
-        """What a device says of its ways is made lawful: kinds, sides and numbers that there are, and no others."""
+        """Invalid kinds, sides and numbers of a device's paths are replaced by valid ones."""
         way = {"id": "ab", "way": "magic", "loss": 7, "round_trip": float("nan"), "for": -1, "by": 3, "address": ["x"]}
         refusal = {"who": "x\n" * 99, "side": 3, "code": None, "reason": "why; do; this", "ago": "y", "count": 1.5}
         answer = {"links": [way, {"id": 4}, 5], "refusals": [refusal, "x"]}
@@ -154,12 +154,12 @@ class SurveyTests(FleetCase):
         self.assertEqual((refused["ago_s"], refused["count"], len(refused["who"]) <= 64), (0.0, 1, True))
 
     def test_open_team(self) -> None:
-        """An open team says what it does not protect."""
+        """An open team lists the protections that it lacks."""
         told: Any = self.survey.team()
         self.assertEqual((told["kind"], told["unprotected"]), ("open", UNPROTECTED))
 
     def test_tell_what_is_stored(self) -> None:
-        """A device tells how much it holds of each kind, and its newest records; another one, or the node itself."""
+        """The inventory of another node and of the own node counts records by kind and lists the newest."""
         self.done(self.team, self.team.nodes[1].entangled.put(hashed_key("a"), "note", b"\xa1x", "team"), 1)
         for uuid in self.dogs[:2]:
             told: Any = self.done(self.team, self.survey.inventory(uuid), 1)
@@ -170,7 +170,7 @@ class SurveyTests(FleetCase):
             self.assertTrue(0 < size < told["bytes"] < told["most_bytes"])
 
     def test_say_who_did_not_answer(self) -> None:
-        """A device that is silent is 504, one that knows no such question 409, one that is not here 409 at once."""
+        """A silent device is answered with 504, a device without the method and a missing device with 409."""
         self.assertEqual(self.assertRaises(Refusal, self.survey.inventory, "ff").status, 409)
         self.team.nodes[1].entangled.endpoint.expose("device.inventory", _refuse)
         waiting = self.survey.inventory(self.dogs[1])
@@ -183,7 +183,7 @@ class SurveyTests(FleetCase):
         self.assertEqual((refusal.status, refusal.problem), (504, "dog2 did not answer"))
 
     def test_remember_lookups(self) -> None:
-        """A lookup is remembered with how many it asked, in how many hops, and how many it found."""
+        """A lookup is recorded with its requests, hops and results."""
         large = self.swarm(12, weather=Weather(delay_s=0.003))
         large.run(3)
         node: SwarmNode = large.nodes[11]
@@ -194,7 +194,7 @@ class SurveyTests(FleetCase):
             self.assertTrue(1 <= each["hops"] <= each["asked"] and each["found"] == 8 and each["ms"] > 0, each)
 
     def test_ask_by_http(self) -> None:
-        """Both are read by viewers; an unknown device is 404, a silent one 504, a node that cannot ask says so."""
+        """Viewers read the surveys; an unknown device gives 404, a silent one 504, a node without surveys 409."""
         state = state_of([{"uuid": "01", "name": "dog1"}, {"uuid": "02", "name": "dog2"}], [], {})
         others: Any = ({"here": "01", "devices": {}, "silent": []}, {"kind": "open", "unprotected": "much"})
         survey = MemorySurvey({"devices": {}, "silent": ["02"]}, {"01": {"records": 4}}, *others)
@@ -214,4 +214,4 @@ class SurveyTests(FleetCase):
 
 
 def _refuse(peer: object, too: int, many: int) -> None:
-    """Takes more than is asked with."""
+    """Take more arguments than the caller passes."""

@@ -1,4 +1,4 @@
-"""What ``webnode.team`` promises: what devices say to an order, in a small team in memory."""
+"""Tests of ``webnode.team``: the answers of devices to requests, in a small team in memory."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ class TeamDeskTests(SynchronousTestCase):
         self.desk = self.team.desk
 
     def uuid(self, name: str) -> str:
-        """The uuid of a device."""
+        """Return the uuid of a device."""
         return str(self.team.services[name].assembly.node.uuid)
 
     def refusal(self, asked: Deferred[Any], seconds: float = PATIENCE + 0.2) -> Refusal:
-        """Why an order was not carried out."""
+        """Return the error of a request."""
         self.team.clock.advance(seconds)
         refusal = self.failureResultOf(asked, Refusal).value
         assert isinstance(refusal, Refusal)
         return refusal
 
     def test_say_who_has_a_message(self) -> None:
-        """A message to all is answered with who has it, and by name with why another has not."""
+        """A message to all returns its recipients, and the reason for each device without it."""
         told = self.desk.message("", "sit")
         self.team.clock.advance(0.1)
         self.assertEqual(self.successResultOf(told), {"delivered": ["dog1", "dog2", "vaio"], "failed": {}})
@@ -47,7 +47,7 @@ class TeamDeskTests(SynchronousTestCase):
         self.assertEqual(list(answer["failed"]), ["dog2"])
 
     def test_device_that_vanishes_is_told(self) -> None:
-        """A device that dies while it is asked is reported so, before the visitor's own patience ends."""
+        """A device that dies during a request is reported within the patience of the page."""
         orders: list[tuple[Any, Any]] = [(self.desk.message, "sit"), (self.desk.disconnect, 5.0)]
         for order, what in orders:
             uuid = self.uuid("dog2")
@@ -59,21 +59,21 @@ class TeamDeskTests(SynchronousTestCase):
             self.team.clock.advance(3.0)
 
     def test_device_that_is_silent_is_told(self) -> None:
-        """A device that others still hear and that does not answer is reported with 504."""
+        """A device that is present but does not answer is reported with 504."""
         presence = self.team.services["dog2"].assembly.node
         presence.entangled.endpoint.expose("device.message", lambda peer, text: Deferred(), changes=True)
         refusal = self.refusal(self.desk.message(self.uuid("dog2"), "sit"))
         self.assertEqual((refusal.status, refusal.problem), (504, "dog2 did not answer"))
 
     def test_device_that_says_no_is_told(self) -> None:
-        """What a device refuses is passed on in its own words; who is unknown is no device."""
+        """A device's refusal is forwarded in its words, and an unknown uuid is reported as a lost device."""
         refusal = self.refusal(self.desk.message(self.uuid("dog2"), "x" * 300))
         self.assertEqual(refusal.status, 409)
         self.assertIn("dog2 refused: a message is a text of 1 to 200 characters", refusal.problem)
         self.assertIn("has left the network", self.refusal(self.desk.disconnect("ab" * 16, 5.0)).problem)
 
     def test_disconnect_is_answered_before_it_leaves(self) -> None:
-        """A device says that it leaves, and then does."""
+        """A device answers the request to disconnect before it leaves."""
         gone = self.desk.disconnect(self.uuid("dog2"), 5.0)
         self.team.clock.advance(0.03)
         self.assertEqual(self.successResultOf(gone), "leaving")
@@ -82,7 +82,7 @@ class TeamDeskTests(SynchronousTestCase):
         self.assertEqual([row["status"] for row in self.team.state()["devices"] if row["name"] == "dog2"], ["GONE"])
 
     def test_preview(self) -> None:
-        """Who can take a task and who not is told with why, and that nobody knows who would; nothing is assigned."""
+        """The preview lists able and refused devices with reasons, and assigns nothing."""
         preview = self.desk.preview("find-red-target")
         self.assertEqual([(row["name"], row["busy"]) for row in preview["able"]], [("dog1", ""), ("dog2", "")])
         self.assertIn("vaio", preview["refused"])
@@ -91,7 +91,7 @@ class TeamDeskTests(SynchronousTestCase):
         self.assertEqual(self.assertRaises(Refusal, self.desk.preview, "fly").status, 404)
 
     def test_preview_of_a_group(self) -> None:
-        """A task of a group would be divided with the open ones of it that want the same, and with no others."""
+        """A task of a group is previewed together with the open tasks of the group that need the same."""
         wishes = [("turn-around", "yard"), ("find-red-target", "yard"), ("turn-around", "attic"), ("turn-around", "")]
         ids = [self.desk.assign(name, group=group)["id"] for name, group in wishes]
         self.team.clock.advance(1.0)
@@ -105,7 +105,7 @@ class TeamDeskTests(SynchronousTestCase):
         self.assertEqual(self.desk.preview("turn-around", "yard")["together"], [])
 
     def test_preview_by_what_is_reported(self) -> None:
-        """While the same task is under way, its reports say who is busy with it and who is the nearest."""
+        """While an equal task runs, its reports show the busy devices and the nearest one."""
         self.team.run_demo()
         for _ in range(60):
             self.team.clock.advance(0.5)
@@ -120,7 +120,7 @@ class TeamDeskTests(SynchronousTestCase):
         self.assertIsNone(self.desk.preview("turn-around")["likely"])
 
     def test_target_comes_without_the_node_that_ordered_it(self) -> None:
-        """The web node that ran the demonstration dies before the target is placed: the yard places it all the same."""
+        """If the web node dies after it started the demonstration, the simulator still places the target."""
         self.team.run_demo()
         self.team.clock.advance(1.0)
         self.assertIsNone(self.team.truth()["target"])
@@ -129,7 +129,7 @@ class TeamDeskTests(SynchronousTestCase):
         self.assertIsNotNone(self.team.truth()["target"])
 
     def test_lift_a_robot(self) -> None:
-        """A robot is set down where it is wanted; a place that is taken is refused in the yard's words."""
+        """A robot is moved to the given place, and a taken place is rejected with the simulator's error."""
         moved = self.desk.move_robot("dog1", 1.0, 1.0, 0.5)
         self.team.clock.advance(0.1)
         self.assertIsNone(moved.addCallback(lambda _: None).result)
@@ -141,7 +141,7 @@ class TeamDeskTests(SynchronousTestCase):
 
 
 class RepeatedWishTests(SynchronousTestCase):
-    """One wish, asked of two web nodes."""
+    """One request, sent to two web nodes."""
 
     def setUp(self) -> None:
         self.team = VirtualTeam(3, dogs=("dog1", "dog2"), others=("pi",))
@@ -151,7 +151,7 @@ class RepeatedWishTests(SynchronousTestCase):
         self.team.clock.advance(1.0)
 
     def test_wish_that_is_repeated_elsewhere(self) -> None:
-        """What another web node made of the same wish while this one heard nothing is not made again by this one."""
+        """A request that another web node has carried out is not repeated, even if this node missed it."""
         wishes: list[Callable[[TeamDesk], Any]] = [
             lambda desk: desk.assign("find-red-target", 2, "yard", task_id="a1").addCallback(itemgetter("id")),
             lambda desk: desk.run_demo("b2"),
@@ -172,7 +172,7 @@ class RepeatedWishTests(SynchronousTestCase):
         self.assertEqual(statuses, ["ASSIGNED", "CANCELLED"])
 
     def test_wish_that_the_first_node_died_of(self) -> None:
-        """The node that was asked first is dead and had done nothing: the next one does it, soon enough to say so."""
+        """If the first node died without an effect, the next node carries out the request in time."""
         self.team.kill("vaio")
         wish = self.reserve.assign("turn-around", task_id="a1")
         self.team.clock.advance(LOOKUP_S + 0.1)

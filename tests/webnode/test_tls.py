@@ -1,4 +1,4 @@
-"""Tests of ``webnode.tls``: the page's second port, its certificate, and who dribbles a handshake."""
+"""Tests of ``webnode.tls``: the port for TLS, its certificate, and slow handshakes."""
 
 from __future__ import annotations
 
@@ -55,18 +55,18 @@ class CertifiedTests(SynchronousTestCase):
         self.now = NOW
 
     def certified(self, seed: int = 1) -> tuple[Certified, str]:
-        """What a node has after its start, and what it says."""
+        """Return the certificate of a node after its start, and its log lines."""
         with capturedLogs() as said:
             made = Certified(self.signer, "a", self.path, lambda: self.names, lambda: self.now, random.Random(seed))
         return made, "\n".join(formatEvent(each) for each in said)
 
     def served(self, certified: Certified) -> list[str]:
-        """The names for which it stands when the next visitor has connected."""
+        """Return the names in the certificate after the next connection."""
         certified.serverConnectionForTLS(None)
         return certified.names
 
     def test_make_it_once(self) -> None:
-        """The first start makes a certificate for the node's user alone; the next one uses it."""
+        """The first start creates a private certificate file, and the next start uses it."""
         _, said = self.certified()
         self.assertIn("there is none yet", said)
         pem = self.path.read_bytes()
@@ -76,7 +76,7 @@ class CertifiedTests(SynchronousTestCase):
         self.assertEqual(self.path.read_bytes(), pem)
 
     def test_make_it_anew(self) -> None:
-        """One that others may read, is cut, foreign, old or for another address is made anew, which is said."""
+        """A certificate that is exposed, truncated, old, incomplete or of another authority is replaced and logged."""
 
         def cut() -> None:
             self.path.write_bytes(self.path.read_bytes()[:300])
@@ -109,14 +109,14 @@ class CertifiedTests(SynchronousTestCase):
             self.assertEqual(stat.S_IMODE(self.path.stat().st_mode), 0o600)
 
     def test_go_on_without_a_place(self) -> None:
-        """Where it cannot be kept it serves all the same, and the log says why the next start makes another."""
+        """If the certificate cannot be stored, it is used nevertheless, and the log gives the reason."""
         self.path = self.path.parent / "nowhere" / "a.tls"
         certified, said = self.certified()
         self.assertIn("cannot store", said)
         self.assertIn("192.168.0.7", self.served(certified))
 
     def test_follow_the_machine(self) -> None:
-        """A node that runs renews it: for an address that came later, for one that was dialled, when it runs out."""
+        """A running node replaces its certificate for new local addresses and before its end."""
         certified, _ = self.certified()
         self.names = ["10.0.0.5"]
         self.assertNotIn("10.0.0.5", certified.names)
@@ -132,7 +132,7 @@ class CertifiedTests(SynchronousTestCase):
         self.assertNotEqual(self.path.read_bytes(), before)
 
     def test_look_once_a_minute(self) -> None:
-        """A hundred visitors of one minute do not make the node look for its addresses a hundred times."""
+        """The node checks its addresses at most once a minute, for any number of connections."""
         certified, _ = self.certified()
         looks: list[int] = []
         certified._names = lambda: looks.append(1) or self.names  # type: ignore[func-returns-value]
@@ -166,7 +166,7 @@ class DoorTests(SynchronousTestCase):
         )
 
     def test_have_an_authority_of_its_own(self) -> None:
-        """Each node has its own authority, also in one team, and the same one after each start."""
+        """Each node has its own authority, which stays the same after a restart."""
         kept = MemoryStore()
         first = self.door("a.sqlite", kept)
         self.assertEqual(self.door("a.sqlite", kept, 2).signer.pem, first.signer.pem)
@@ -174,7 +174,7 @@ class DoorTests(SynchronousTestCase):
         self.assertEqual(sorted(os.listdir(self.folder)), ["a.sqlite.tls", "b.sqlite.tls"])
 
     def test_migrate(self) -> None:
-        """A certificate that an authority of an earlier version signed, out of the team's secret, is made anew."""
+        """A certificate of an authority from an earlier version is replaced."""
         path = self.folder / "a.sqlite.tls"
         old = leaf(authority(b"7" * 32, "a"), "a", ["192.168.0.7"], NOW, random.Random(1))
         keep(path, old.pem_with_key)
@@ -182,12 +182,12 @@ class DoorTests(SynchronousTestCase):
         self.assertEqual(read(path.read_bytes()).flaw(made.signer, ["192.168.0.7"], NOW), "")
 
     def test_keep_nothing_in_memory(self) -> None:
-        """A node that stores nothing leaves no file behind."""
+        """A node with a store in memory leaves no file."""
         self.door(store=":memory:")
         self.assertEqual(os.listdir(self.folder), [])
 
     def test_tell_of_a_taken_port(self) -> None:
-        """A port that is held is told with the setting that names it."""
+        """A port in use is reported with the setting for it."""
 
         class Taken(MemoryReactorClock):
             def listenTCP(self, port: int, *others: Any, **more: Any) -> Any:  # noqa: N802
@@ -201,14 +201,14 @@ class DoorTests(SynchronousTestCase):
 
 
 class Line(StringTransport):
-    """A transport of TCP."""
+    """A TCP transport in memory."""
 
     def setTcpNoDelay(self, enabled: bool) -> None:  # noqa: N802
         """Do nothing."""
 
 
 class HandshakeTests(SynchronousTestCase):
-    """A real TLS client against the port, on a turned clock and without a socket."""
+    """A real TLS client connects to the port, in virtual time and without a socket."""
 
     if MISSING:
         skip = SKIP
@@ -225,7 +225,7 @@ class HandshakeTests(SynchronousTestCase):
         self.connections = self.reactor.tcpServers[0][1]
 
     def connected(self) -> Connection:
-        """A connection on which nothing was said."""
+        """Return a connection before the first byte."""
         connection = Connection.__new__(Connection)
         local = IPv4Address("TCP", "10.0.0.9", 8443)
         connection.transport = Line(hostAddress=local, peerAddress=IPv4Address("TCP", "10.0.0.1", 54321))
@@ -234,7 +234,7 @@ class HandshakeTests(SynchronousTestCase):
         return connection
 
     def client(self, **versions: ssl.TLSVersion) -> tuple[ssl.SSLObject, ssl.MemoryBIO, ssl.MemoryBIO]:
-        """A client that trusts the authority and checks the address."""
+        """Return a TLS client that trusts the authority and checks the address."""
         context = ssl.create_default_context(cadata=self.signer.pem.decode())
         context.maximum_version = versions.get("newest", ssl.TLSVersion.MAXIMUM_SUPPORTED)
         context.minimum_version = ssl.TLSVersion.MINIMUM_SUPPORTED
@@ -243,16 +243,16 @@ class HandshakeTests(SynchronousTestCase):
         return context.wrap_bio(incoming, outgoing, server_hostname="10.0.0.9"), incoming, outgoing
 
     def test_answer_over_tls(self) -> None:
-        """A client that trusts the authority gets the page, by HTTP/1.1, under TLS 1.2 and 1.3."""
+        """A client that trusts the authority gets the page over HTTP/1.1 with TLS 1.2 and 1.3."""
         for newest in (ssl.TLSVersion.TLSv1_2, ssl.TLSVersion.TLSv1_3):
             self.assertIn(b"hello", self.asked(newest))
 
     def test_refuse_old_tls(self) -> None:
-        """TLS 1.1 is not spoken."""
+        """TLS 1.1 is rejected."""
         self.assertRaises(ssl.SSLError, self.asked, ssl.TLSVersion.TLSv1_1)
 
     def asked(self, newest: ssl.TLSVersion) -> bytes:
-        """What is answered to one request."""
+        """Return the answer to one request."""
         connection = self.connected()
         client, incoming, outgoing = self.client(newest=newest)
         is_asked = False
@@ -273,19 +273,19 @@ class HandshakeTests(SynchronousTestCase):
         return b""
 
     def test_let_little_wait_for_a_slow_reader(self) -> None:
-        """A stream over TLS is as short in this machine as a plain one: its socket lies below the TLS."""
+        """Over TLS the send buffers are as small as without, because the option is set on the socket below TLS."""
         connection = self.connected()
         with socket.socket() as below:
             connection.transport.getHandle = lambda: below  # type: ignore[attr-defined]
             request: Any = SimpleNamespace(channel=SimpleNamespace(transport=connection.protocol))
             Viewer(request).narrow()
-            # Linux keeps twice what it is asked for.
+            # Linux reports twice the requested value.
             self.assertLessEqual(below.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF), 2 * SYSTEM_AHEAD)
         self.assertEqual(connection.transport.bufferSize, SENT_AHEAD)  # type: ignore[attr-defined]
         connection.leave()
 
     def test_let_go_who_dribbles_a_handshake(self) -> None:
-        """Whoever says nothing, or a handshake byte by byte, is closed in time, and nothing is left of it."""
+        """A silent or slow handshake is closed in time, and leaves no connection and no timer."""
         client, _, outgoing = self.client()
         self.assertRaises(ssl.SSLWantReadError, client.do_handshake)
         hello = outgoing.read()

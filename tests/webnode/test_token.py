@@ -1,4 +1,4 @@
-"""Tests of ``webnode.token``: tokens that one web node signs and the one that they are for reads."""
+"""Tests of ``webnode.token``: signed tokens, which only the addressed web node accepts."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CLAIM = Claim("ab" * 8, "operator", "operator", 2_000_000_000, limit=2_000_100_0
 
 class TokenTests(SynchronousTestCase):
     def test_read_what_was_signed(self) -> None:
-        """What a node signs for itself it reads again, with itself for a voucher; no other node does."""
+        """A node accepts its own token, with itself as voucher; another node does not."""
         for claim in (CLAIM, CLAIM.ticket, replace(CLAIM, role="phone", name="Z\N{SNOWMAN}", parents=("cd" * 8,))):
             text = VAIO.token(claim)
             self.assertRegex(text, r"^[\w.-]+$")
@@ -29,7 +29,7 @@ class TokenTests(SynchronousTestCase):
             self.assertIsNone(PI.claim(text))
 
     def test_read_what_is_for_it(self) -> None:
-        """What a node signs for another one that one reads alone; who vouched before still does."""
+        """Only the addressed node accepts a token, and earlier vouchers are kept."""
         claim = replace(CLAIM, vouchers=(EVE.public,))
         text = VAIO.token(claim, PI.node_id)
         self.assertEqual(PI.claim(text), replace(claim, vouchers=(EVE.public, VAIO.public)))
@@ -37,14 +37,14 @@ class TokenTests(SynchronousTestCase):
         self.assertEqual(VAIO.token(CLAIM, VAIO.node_id), VAIO.token(CLAIM))
 
     def test_a_ticket_lets_less(self) -> None:
-        """An operator's ticket is a viewer's, a phone's the phone's, and it says that it is one."""
+        """The ticket of an operator has the role viewer; the ticket of a phone stays a phone."""
         roles: dict[Any, str] = {"operator": "viewer", "viewer": "viewer", "phone": "phone"}
         for role, less in roles.items():
             ticket = replace(CLAIM, role=role).ticket
             self.assertEqual((ticket.role, ticket.is_ticket), (less, True))
 
     def test_fit_into_its_places(self) -> None:
-        """An invitation is short enough for a code that a camera reads; the longest is read, and a long name is cut."""
+        """An invitation fits a QR code, the longest token is accepted, and a long name is cut."""
         self.assertLess(len(VAIO.token(replace(CLAIM, name="guest"))), 140)
         others = tuple(bytes([n]) * 32 for n in range(MAX_VOUCHERS))
         longest = replace(CLAIM, name="\N{SNOWMAN}" * 99, parents=("cd" * 8,) * 3, vouchers=others)
@@ -55,17 +55,17 @@ class TokenTests(SynchronousTestCase):
         self.assertEqual((len(read.name), len(read.vouchers)), (MAX_NAME, MAX_VOUCHERS + 1))
 
     def test_refuse_each_change(self) -> None:
-        """A token that was changed anywhere, cut or grown is none."""
+        """A token that is changed, truncated or extended at any place is invalid."""
         for text in (VAIO.token(CLAIM), VAIO.token(CLAIM, PI.node_id)):
             reader = VAIO if VAIO.claim(text) else PI
-            for at in range(len(text) - 2):  # of the last letter not every bit counts
+            for at in range(len(text) - 2):  # not every bit of the last letter counts
                 changed = text[:at] + ("A" if text[at] != "A" else "B") + text[at + 1 :]
                 self.assertIsNone(reader.claim(changed), at)
             for other in (text[:-4], text + "AAAA", f"A.{text}", text.replace(".", ".."), text * 5):
                 self.assertIsNone(reader.claim(other))
 
     def test_refuse_what_is_signed_for_something_else(self) -> None:
-        """A signature of the same key over the same bytes, made for another purpose, is none here."""
+        """A signature of the same key for another purpose is invalid."""
         identity = Identity(bytes([1]) * 32)
         value = base64_encode(packed(CLAIM))
 
@@ -76,7 +76,7 @@ class TokenTests(SynchronousTestCase):
         self.assertEqual(found, [True, False, False, False])
 
     def test_refuse_unlawful_content(self) -> None:
-        """Whoever signs nonsense with a key of its own is refused without more ado."""
+        """Signed but invalid content is rejected."""
         identity = Identity(bytes([3]) * 32)
         lawful: list[Any] = msgpack.unpackb(packed(CLAIM, PI.node_id))
         contents: list[Any] = [7, [], {}, None, lawful[:-1], [*lawful, 1]]
@@ -94,12 +94,12 @@ class TokenTests(SynchronousTestCase):
 
     @given(st.text(max_size=700))
     def test_bear_any_text(self, text: str) -> None:
-        """Whatever is shown, nothing is raised."""
+        """Any text is rejected without an exception."""
         for each in (text, f"{text}.{text}", f"{base64_encode(EVE.public).decode()}.{text}.{text}"):
             self.assertIsNone(VAIO.claim(each))
 
     def test_bear_keys_of_any_length(self) -> None:
-        """A key that is none is no reason to fail."""
+        """Keys of a wrong length are rejected without an exception."""
         dice = random.Random(1)
         for length in (0, 1, 31, 33, 64, 200):
             key = base64_encode(dice.randbytes(length)).decode()

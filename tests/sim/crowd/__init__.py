@@ -1,1 +1,1 @@
-"""Tests of the yard for many."""
+"""Tests of the simulator for large numbers of robots."""

@@ -1,4 +1,4 @@
-"""Tests of ``sim.robots.crowd.command``, ``search`` and ``picture``, with a team whose agents are made up."""
+"""Tests of ``sim.robots.crowd.command``, ``search`` and ``picture``, with a stub team."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from sim.robots.crowd.yard import CrowdYard
 
 
 class PlayedTeam:
-    """Agents that know how far the target is, name the nearest, and let it reach the target, each a second later."""
+    """A stub team: agents know their distance to the target and name the nearest, which then reaches it."""
 
     def __init__(
         self,
@@ -46,11 +46,11 @@ class PlayedTeam:
         self._choose = choose
 
     def assign(self) -> None:
-        """Begin."""
+        """Count ten datagrams."""
         self.board.counters["sent"] += 10
 
     def words(self) -> Mapping[str, Word]:
-        """Nobody knows anything until the target is there; then all do."""
+        """Return no costs before the target is placed; afterwards the distances and the chosen agent."""
         crowd, target = self.yard.crowd, self.yard.crowd.target
         if target is None:
             return {name: Word(None, "") for name in self.yard.names}
@@ -60,24 +60,24 @@ class PlayedTeam:
         return {name: Word(cost, chosen) for name, cost in costs.items()}
 
     def done_by(self) -> str | None:
-        """Who stands there."""
+        """Return the agent at the target."""
         return next(iter(self.words().values())).assigned if self.clock.seconds() > 7.0 else None
 
     def stop(self) -> None:
-        """Nothing to end."""
+        """Do nothing: the stub has no nodes."""
 
 
 class ImpatientTeam(PlayedTeam):
-    """The same, and somebody presses Ctrl-C as soon as the task is assigned."""
+    """A stub team that receives Ctrl-C after the task is assigned."""
 
     def assign(self) -> None:
-        """Begin, and press."""
+        """Schedule SIGINT."""
         self.clock.callLater(0.02, signal.raise_signal, signal.SIGINT)
 
 
 class SearchTests(SynchronousTestCase):
     def test_moments_are_noted(self) -> None:
-        """Engaged at once, found when the target is there, agreed and reached when the team says so, by the nearest."""
+        """``search`` records the times of engagement, first sight, agreement and arrival, and checks the agent."""
         outcome = search(PlayedTeam(1, 4, roomy(9)), 1, 60.0, lambda: 0.0)
         self.assertEqual((outcome.engaged, outcome.first, outcome.found), (0.5, 5.0, 4))
         self.assertEqual((outcome.agree, outcome.reach, outcome.right), (6.5, 7.5, True))
@@ -87,7 +87,7 @@ class SearchTests(SynchronousTestCase):
         self.assertEqual((wrong.right, "NO" in table(wrong)), (False, True))
 
     def test_limit_and_end_leave_a_report(self) -> None:
-        """A run that is over before anything was found, or that is ended, says what it knows."""
+        """A search that ends early, by its limit or by ``is_over``, reports the results so far."""
         team = PlayedTeam(1, 4, roomy(9))
         short = search(team, 1, 2.0, lambda: 0.0)
         ended = search(team, 1, 60.0, lambda: 0.0, is_over=lambda: team.clock.seconds() > 3.22)
@@ -98,7 +98,7 @@ class SearchTests(SynchronousTestCase):
 
 class CommandTests(SynchronousTestCase):
     def run_with(self, *words: str, team: MakeTeam | None = None) -> tuple[int, str]:
-        """The exit code and what was printed."""
+        """Run the command and return its exit code and output."""
         told = StringIO()
         with redirect_stdout(told), redirect_stderr(told):
             try:
@@ -108,7 +108,7 @@ class CommandTests(SynchronousTestCase):
         return code, told.getvalue()
 
     def test_crowd_alone(self) -> None:
-        """A crowd without agents prints its figures, writes both files, and gives the same hash twice."""
+        """A crowd without agents prints its results, writes both files, and gives the same digest twice."""
         folder = Path(self.mktemp())
         folder.mkdir()
         picture, figures = folder / "a.svg", folder / "a.json"
@@ -123,7 +123,7 @@ class CommandTests(SynchronousTestCase):
         self.assertTrue(ET.fromstring(picture.read_text(encoding="utf-8")).tag.endswith("svg"))
 
     def test_search_with_agents(self) -> None:
-        """With agents the table of the search is printed, and 0 comes back where the target was reached, else 1."""
+        """With agents the table of the search is printed, and the exit code is 0 if an agent arrived, else 1."""
         code, told = self.run_with("--bodies", "9", "--agents", "4", team=PlayedTeam)
         self.assertEqual(code, 0, told)
         self.assertIn("4 agents joined", told)
@@ -132,7 +132,7 @@ class CommandTests(SynchronousTestCase):
         self.assertEqual(code, 1, told)
 
     def test_interrupt_leaves_the_table(self) -> None:
-        """Ctrl-C ends a search with its table and its file, and is afterwards what it was before."""
+        """Ctrl-C ends a search with its table and its file, and the previous signal handler is restored."""
         folder, usual = Path(self.mktemp()), signal.getsignal(signal.SIGINT)
         folder.mkdir()
         words = ("--bodies", "9", "--agents", "4", "--json", str(folder / "a.json"))
@@ -142,7 +142,7 @@ class CommandTests(SynchronousTestCase):
         self.assertEqual(signal.getsignal(signal.SIGINT), usual)
 
     def test_wrong_words_are_refused(self) -> None:
-        """What cannot be run is said in one line with the remedy, before anything is run."""
+        """Invalid arguments are rejected with a remedy in one line, before the simulation starts."""
         for words, problem in (
             (("--bodies", "0"), "bodies must be"),
             (("--room", "0.01"), "room must be"),
@@ -165,7 +165,7 @@ class CommandTests(SynchronousTestCase):
 
 class PictureTests(SynchronousTestCase):
     def test_draws_everybody(self) -> None:
-        """Each robot is drawn once, in the colour of what it is, with target, caption and a legend of what is there."""
+        """Each robot is drawn once, in the colour of its state, with target, caption and a legend of the states."""
         crowd = Crowd(1, roomy(30))
         crowd.place_target_at_random()
         going = "the one that goes"

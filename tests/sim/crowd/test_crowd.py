@@ -1,4 +1,4 @@
-"""Tests of ``sim.robots.crowd.crowd`` and ``ground``: bodies that push each other, the same for the same seed."""
+"""Tests of ``sim.robots.crowd.crowd`` and ``ground``: collisions, placement, controllers and reproducibility."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ print(crowd.digest())
 
 
 def press(crowd: Crowd, seconds: float) -> float:
-    """Let everybody walk to the middle of the yard; the largest overlap on the way, in metres."""
+    """Drive all robots to the middle of the map and return the largest overlap, in metres."""
     worst = 0.0
     for _ in range(round(seconds / TICK)):
         towards = np.arctan2(crowd.ground.height / 2 - crowd.y, crowd.ground.width / 2 - crowd.x)
@@ -42,7 +42,7 @@ def press(crowd: Crowd, seconds: float) -> float:
 
 class CrowdTests(SynchronousTestCase):
     def test_nobody_overlaps_or_leaves(self) -> None:
-        """Three hundred that press to the middle of a full yard overlap by 6 mm at most, and nobody is in a wall."""
+        """Three hundred robots that press to the middle overlap by at most 6 mm and stay inside the walls."""
         crowd = Crowd(1, roomy(300, 0.15))
         worst = press(crowd, 20.0)
         self.assertGreater(worst, 0.0)
@@ -52,7 +52,7 @@ class CrowdTests(SynchronousTestCase):
             self.assertLessEqual(float(row.max()), side - FOOTPRINT)
 
     def test_nobody_enters_the_target(self) -> None:
-        """The target stands where it stands, and who walks at it stops at its surface."""
+        """A robot that drives at the target stops at its surface, and the target does not move."""
         crowd = Crowd(2, Ground(1, 3.0, 3.0))
         crowd.move(0, 1.0, 1.5, 0.0)
         crowd.place_target(1.5, 1.5)
@@ -63,7 +63,7 @@ class CrowdTests(SynchronousTestCase):
         self.assertAlmostEqual(float(crowd.ranges[0, 0]), FOOTPRINT, 3)
 
     def test_walks_as_a_dog_of_the_yard(self) -> None:
-        """The same orders bring a robot of the crowd to where they bring a dog of the yard, within 2 cm in 6 s."""
+        """The same commands move a crowd robot and a robot of ``World`` to the same place, within 2 cm in 6 s."""
         scene = Scene("one", 6.0, 6.0, 0.4, 0.08, 0.22, (Kennel("dog", 3.0, 3.0, 0.3, 1),))
         world, crowd = World(Random(1), scene), Crowd(1, Ground(1, 6.0, 6.0))
         crowd.move(0, 3.0, 3.0, 0.3)
@@ -80,12 +80,12 @@ class CrowdTests(SynchronousTestCase):
         self.assertLess(float(np.hypot(crowd.vx, crowd.vy)[0]), 1e-9)
 
     def test_same_seed_gives_the_same_hash(self) -> None:
-        """A crowded run ends in the same bits in two processes with other hash seeds; another seed ends elsewhere."""
+        """A run with collisions gives the same digest in two processes; another seed gives another digest."""
         replayed(self, RUN)
         self.assertNotEqual(Crowd(7, roomy(50)).digest(), Crowd(8, roomy(50)).digest())
 
     def test_things_are_placed_where_there_is_room(self) -> None:
-        """Target and robots are refused in walls and on each other, with the place that was asked for."""
+        """Target and robots cannot be placed in walls or on each other, and a full map has no place for a target."""
         crowd = Crowd(1, Ground(2, 3.0, 3.0))
         crowd.move(0, 1.0, 1.0, 0.0)
         for place in ((0.0, 1.0), (1.1, 1.0), (math.nan, 1.0)):
@@ -98,14 +98,14 @@ class CrowdTests(SynchronousTestCase):
 
 class GroundTests(SynchronousTestCase):
     def test_too_small_is_refused_with_the_remedy(self) -> None:
-        """A yard too small says how many have room, and which size would do; that size does."""
+        """The error for a map that is too small names the number of robots that fit and a size that is large enough."""
         error = self.assertRaises(SceneError, Ground, 1000, 5.0, 5.0)
         self.assertIn("there is room for 361; use at most 361 robots, or 8.4 x 8.4 m", str(error))
         self.assertEqual(Ground(361, 5.0, 5.0).bodies, 361)
         self.assertEqual(Ground(1000, 8.4, 8.4).bodies, 1000)
 
     def test_wrong_numbers_are_refused(self) -> None:
-        """What is no count or no length is refused, with what it may be."""
+        """Invalid numbers of robots and invalid lengths are rejected with the valid range."""
         for bodies in (0, -1, 2.5, True, "10", MAX_BODIES + 1):
             self.assertIn("whole number", str(self.assertRaises(SceneError, Ground, bodies, 9.0, 9.0)))
             self.assertRaises(SceneError, roomy, bodies)
@@ -116,7 +116,7 @@ class GroundTests(SynchronousTestCase):
         self.assertIn("target_radius", str(self.assertRaises(SceneError, Ground, 1, 9.0, 9.0, target_radius=2.0)))
 
     def test_everybody_has_a_place(self) -> None:
-        """In yards from empty to full, square and long, all stand apart and inside."""
+        """On maps from empty to full, square or long, all robots start inside the walls and without overlap."""
         for seed, (bodies, width, height) in enumerate(
             ((1, 1.0, 1.0), (361, 5.0, 5.0), (90, 40.0, 1.0), (500, 30.0, 7.0))
         ):
@@ -128,7 +128,7 @@ class GroundTests(SynchronousTestCase):
 
 class ControllerTests(SynchronousTestCase):
     def run_with(self, name: str, crowd: Crowd, seconds: float) -> Senses:
-        """Let everybody do that."""
+        """Run a controller for some seconds and return its senses."""
         senses = Senses(crowd)
         for _ in range(round(seconds / TICK)):
             crowd.wish[:] = CONTROLLERS[name](senses)
@@ -136,7 +136,7 @@ class ControllerTests(SynchronousTestCase):
         return senses
 
     def test_disperse(self) -> None:
-        """Those who stand close to each other have more room afterwards."""
+        """``disperse`` increases the mean range between robots that start close together."""
         crowd = Crowd(1, Ground(60, 9.0, 9.0))
         number = np.arange(60)
         crowd.x[:], crowd.y[:], crowd.heading[:] = 2.5 + 0.3 * (number % 8), 2.5 + 0.3 * (number // 8), 0.4 * number
@@ -146,7 +146,7 @@ class ControllerTests(SynchronousTestCase):
         self.assertGreater(crowd.ranges.mean(), before + 0.4)
 
     def test_climb(self) -> None:
-        """Who follows the scent comes to the target from everywhere."""
+        """``climb`` leads the robots from all parts of the map to the target."""
         crowd = Crowd(1, roomy(30))
         crowd.place_target_at_random()
         target = crowd.target
@@ -156,7 +156,7 @@ class ControllerTests(SynchronousTestCase):
         self.assertLess(float(np.median(np.hypot(crowd.x - target.x, crowd.y - target.y))), 2.0)
 
     def test_search(self) -> None:
-        """Who sees the target walks up to it and stands there; who does not, wanders on."""
+        """``search`` leads robots that see the target to it, where they stop; the other robots continue to wander."""
         crowd = Crowd(1, roomy(40))
         crowd.place_target_at_random()
         senses = self.run_with("search", crowd, 180.0)
@@ -167,7 +167,7 @@ class ControllerTests(SynchronousTestCase):
         self.assertGreater(int((speed > 0.1).sum()), 10)
 
     def test_sight(self) -> None:
-        """The target is seen ahead and near; not behind, not far, and not by who stands behind another."""
+        """A robot sees the target ahead and near, but not behind it, far away or hidden by another robot."""
         crowd = Crowd(1, Ground(5, 12.0, 12.0))
         for body, (x, y, heading) in enumerate(
             (

@@ -1,4 +1,4 @@
-"""Tests of ``sim.robots.crowd.ray``: all rays at once say what the yard's own say one by one."""
+"""Tests of ``sim.robots.crowd.ray``: the vectorized rays measure the same distances as the rays of ``World``."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from sim.robots.world import World
 
 
 def twin(crowd: Crowd) -> World:
-    """The same robots in the same places as dogs of the yard, and the same target."""
+    """Build a ``World`` with the same robots and target at the same places."""
     ground = crowd.ground
     kennels = tuple(
         Kennel(f"dog{n}", float(crowd.x[n]), float(crowd.y[n]), float(crowd.heading[n]), 1) for n in range(len(crowd.x))
@@ -29,7 +29,7 @@ def twin(crowd: Crowd) -> World:
 
 
 def one_by_one(world: World, crowd: Crowd, body: int) -> list[float]:
-    """What ``segment_query_first`` says along each ray of ``body``, which is turned round for it."""
+    """Return the distances that ``segment_query_first`` measures from ``body``, turned to the direction of each ray."""
     x, y, heading = (float(row[body]) for row in (crowd.x, crowd.y, crowd.heading))
     dog, found = world.dogs[f"dog{body}"], []
     for ray in range(RAYS):
@@ -41,14 +41,14 @@ def one_by_one(world: World, crowd: Crowd, body: int) -> list[float]:
 
 class TwinTests(SynchronousTestCase):
     def check(self, crowd: Crowd) -> int:
-        """Compare every ray; returns how many of them met something."""
+        """Compare all rays and return the number of rays that hit something."""
         world = twin(crowd)
         rows = np.array([one_by_one(world, crowd, body) for body in range(len(crowd.x))])
         self.assertLess(float(np.abs(rows - crowd.ranges).max()), 0.001)
         return int((rows < REACH).sum())
 
     def test_random_scenes(self) -> None:
-        """In thin and dense yards, with the target in some, every ray is that of the yard to a millimetre."""
+        """On sparse and dense maps, with and without target, each ray matches ``World`` within a millimetre."""
         met = 0
         for seed, (bodies, side) in enumerate([(12, 3.0), (40, 4.0), (80, 4.0), (60, 9.0), (30, 12.0)] * 4):
             crowd = Crowd(seed, Ground(bodies, side, side + 0.7))
@@ -58,7 +58,7 @@ class TwinTests(SynchronousTestCase):
         self.assertGreater(met, 2000)
 
     def test_still_holds_after_they_have_moved(self) -> None:
-        """Neighbours that are remembered from earlier steps hide nobody who has come near since."""
+        """Rays still match after 120 steps: the neighbours cached in earlier steps hide no robot that came near."""
         crowd = Crowd(3, Ground(40, 5.0, 5.0))
         for turn in range(120):
             crowd.wish[:] = (0.16, 0.0, 0.4 * math.sin(turn / 20))
@@ -69,7 +69,7 @@ class TwinTests(SynchronousTestCase):
 
 class RaysTests(SynchronousTestCase):
     def test_grazing_rays(self) -> None:
-        """A ray that passes a disc by a tenth of a millimetre misses it; one as far within meets it."""
+        """A ray that passes 0.1 mm outside a disc misses it; a ray 0.1 mm inside hits it."""
         rays = Rays(6.0, 4.0, RAYS, REACH)
         for side, is_met in ((FOOTPRINT + 1e-4, False), (FOOTPRINT - 1e-4, True)):
             row = rays.cast(np.array([2.0, 3.0]), np.array([2.0, 2.0 + side]), np.zeros(2))[0]

@@ -1,4 +1,4 @@
-"""Tests of ``sim.robots.crowd.yard``, ``feeling`` and ``eye``: to a driver a robot of a crowd is as a dog."""
+"""Tests of ``sim.robots.crowd.yard``, ``feeling`` and ``eye``: drivers use a crowd robot like any simulated robot."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ from sim.robots.yard import Yard
 
 
 class DrivenTests(SynchronousTestCase):
-    """Five robots on 6 x 4 m, two of them to be driven."""
+    """Five robots on a map of 6 x 4 m; drivers control two of them."""
 
     def setUp(self) -> None:
-        """The first stands at the left and looks to the right, the others behind it."""
+        """Place the first robot at the left, facing right, and the others behind it."""
         self.clock = HeapClock()
         self.yard = CrowdYard(self.clock, Random(1), Ground(5, 6.0, 4.0), 2, stand)
         self.crowd = self.yard.crowd
@@ -39,27 +39,27 @@ class DrivenTests(SynchronousTestCase):
         self.yard.start()
 
     def driver(self, name: str = "robot1", fps: float = 0.0) -> SimDriver:
-        """A driver of that robot, connected and with its motors on as soon as can be."""
+        """Return a connected driver of the robot, enabled if possible."""
         driver = SimDriver({"robot": name, "camera_fps": fps}, self.yard.connector(), self.clock)
         driver.connect().addCallback(lambda _: driver.enable()).addErrback(lambda why: why.trap(DriverError))
         self.clock.advance(0.5)
         return driver
 
     def newest(self, driver: SimDriver) -> Observation:
-        """What the driver has heard last."""
+        """Return the driver's latest observation."""
         seen = driver.observe()
         assert seen is not None
         return seen
 
     def act(self, driver: SimDriver, seconds: float, ttl: float = 0.3, **motion: float) -> None:
-        """Drive for so long, an order each tenth of a second."""
+        """Drive for some seconds, with a command each 0.1 s."""
         for _ in range(round(seconds / 0.1)):
             permit = Permit(1, self.clock.seconds() + ttl)
             driver.act({f"base.{key}": value for key, value in motion.items()}, permit)
             self.clock.advance(0.1)
 
     def test_tells_what_a_dog_tells(self) -> None:
-        """Keys, kinds of values and names of samples are those of a dog of the yard, and frames come each 32 ms."""
+        """A crowd robot sends the same keys, value types and samples as a robot of ``Yard``, in a frame each 32 ms."""
         dogs = Yard(self.clock, Random(1), loaded("three-dogs"))
         dogs.start()
         dog = SimDriver({"robot": "dog1"}, dogs.connector(), self.clock)
@@ -76,7 +76,7 @@ class DrivenTests(SynchronousTestCase):
             yard.stop()
 
     def test_obeys_its_driver(self) -> None:
-        """It walks as it is told, its odometry with it; it stands when the time to live is over, and others stay."""
+        """The robot and its odometry follow the commands until their time to live ends; other robots stay."""
         driver = self.driver()
         others = self.crowd.x[1:].tolist()
         self.act(driver, 2.0, vx=0.5)
@@ -90,7 +90,7 @@ class DrivenTests(SynchronousTestCase):
         self.assertEqual(self.crowd.x[1:].tolist(), others)
 
     def test_stands_when_nothing_is_heard(self) -> None:
-        """A link that is silent, though nobody closed it, lets the robot stand at the end of the time to live."""
+        """A robot stops at the end of the time to live if its link falls silent without being closed."""
         connector = self.yard.connector()
         driver = SimDriver({"robot": "robot1", "camera_fps": 0.0}, connector, self.clock)
         driver.connect().addCallback(lambda _: driver.enable())
@@ -105,7 +105,7 @@ class DrivenTests(SynchronousTestCase):
         self.assertEqual(self.yard.holders, [])
 
     def test_ranges(self) -> None:
-        """Near and far measure from the nose to what is ahead, and say NaN beyond their reach, as a dog's do."""
+        """The near and far sensors measure from the nose to the obstacle, and return NaN beyond their range."""
         driver = self.driver()
         for gap, near in ((0.3, True), (1.0, False)):
             self.crowd.place_target(1.0 + NOSE + gap + 0.08, 2.0)
@@ -119,7 +119,7 @@ class DrivenTests(SynchronousTestCase):
             self.assertLess(abs(float(rows[-1].values["range.chest"]) - 0.204), 0.02)
 
     def test_feels_how_it_moves(self) -> None:
-        """Accelerometer, compass and battery: a start is felt ahead, a turn is seen, and power is used up."""
+        """The accelerometer measures the start, compass and odometry the turn, and the battery level falls."""
         driver = self.driver()
         felt: list[float] = []
         end = driver.subscribe(lambda seen: felt.append(float(seen.values["imu.ax"])))
@@ -135,7 +135,7 @@ class DrivenTests(SynchronousTestCase):
         self.assertTrue(0.999 < float(values["power.level"]) < 1.0)
 
     def test_pictures_show_the_target(self) -> None:
-        """The agents' own eyes find the target in its pictures, where it is, unless somebody stands before it."""
+        """The agents' vision locates the target in the camera pictures, unless other robots hide it."""
         driver = self.driver(fps=10.0)
         self.crowd.place_target(3.0, 2.3)
         self.clock.advance(0.5)
@@ -155,7 +155,7 @@ class DrivenTests(SynchronousTestCase):
         self.assertTrue(rest is None or not rest.is_whole)
 
     def test_pictures_without_a_target_have_no_red(self) -> None:
-        """Walls, floor and the others look like no target to anybody."""
+        """The agents' vision finds no target in pictures of walls, floor and other robots."""
         yard = CrowdYard(self.clock, Random(2), Ground(60, 5.0, 5.0), 60, stand)
         for name in yard.names:
             picture = yard.lend(name).picture()
@@ -163,7 +163,7 @@ class DrivenTests(SynchronousTestCase):
             self.assertIsNone(find_target(picture, Size(0.08, 0.22)))
 
     def test_body_for_an_emulator(self) -> None:
-        """A robot that is lent moves, halts and senses by its body, feels bumps, and no driver may have it."""
+        """A robot that is lent to an emulator moves, stops, senses and detects bumps, and rejects drivers."""
         body = self.yard.lend("robot2")
         body.drive(0.16, 0.0, 0.0)
         self.clock.advance(1.0)
@@ -185,12 +185,12 @@ class DrivenTests(SynchronousTestCase):
         self.assertRaises(UsageError, self.yard.lend, "robot3")
 
     def bumps(self, body: CrowdBody) -> tuple[Any, Any]:
-        """Whether its left and its right are touched."""
+        """Return the values of the left and right bump sensors."""
         values = body.sense()
         return values["bump.left"], values["bump.right"]
 
     def test_wrong_numbers_are_refused(self) -> None:
-        """What is no number of drivers, a robot of the controller, and one connection too many are refused."""
+        """Invalid numbers of drivers, a driver for an undriven robot, and one connection too many are rejected."""
         for driven in (-1, 6, 1.5, True):
             self.assertRaises(SceneError, CrowdYard, self.clock, Random(1), Ground(5, 6.0, 4.0), driven)
         self.assertEqual(self.driver("robot3").state, "closed")
@@ -202,7 +202,7 @@ class DrivenTests(SynchronousTestCase):
         self.assertEqual(callers[-1].diagnostics()["refused"], 1)
 
     def test_costs_are_counted_apart(self) -> None:
-        """The stopwatch's time goes to moving or to telling, each step to both."""
+        """The stopwatch counts the time for motion and the time for observations separately."""
         moments = iter(np.arange(0.0, 1000.0, 1.0).tolist())
         yard = CrowdYard(self.clock, Random(1), Ground(5, 6.0, 4.0), 1, stand, lambda: next(moments))
         yard.start()
@@ -210,7 +210,7 @@ class DrivenTests(SynchronousTestCase):
         self.assertEqual((yard.moving, yard.telling), (10.0, 10.0))
 
     def test_time_lost_is_not_made_up_for(self) -> None:
-        """After a machine stood still the crowd goes on from there, and obeys nothing ordered before."""
+        """After a pause of the machine the simulation does not catch up, and drops commands from before it."""
         clock = Clock()
         yard = CrowdYard(clock, Random(1), Ground(5, 6.0, 4.0), 1, stand)
         yard.start()

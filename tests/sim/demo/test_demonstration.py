@@ -1,4 +1,4 @@
-"""Tests of the demonstration: configurations, the story, the judgement of an experiment, and the event stream."""
+"""Tests of the demonstration: configurations, log lines, verdicts of experiments, and the event stream."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ TASK = "t1"
 
 
 def snapshot(*xs: float, moving: str = "", target: bool = True) -> dict[str, Any]:
-    """The yard with dog1, dog2, ... at ``(x, 0)`` and the target at the origin."""
+    """Return a snapshot of the simulator with dog1, dog2, ... at ``(x, 0)`` and the target at the origin."""
     dogs = [
         {"name": f"dog{number}", "x": x, "y": 0.0, "heading": 0.0, "moving": f"dog{number}" == moving}
         for number, x in enumerate(xs, 1)
@@ -36,7 +36,7 @@ def snapshot(*xs: float, moving: str = "", target: bool = True) -> dict[str, Any
 
 
 def state(task: str, by: str = "", gone: float | None = None, **statuses: str) -> dict[str, Any]:
-    """What the page says: the task's status, who finished, the status of each dog, and since when all are gone."""
+    """Return the page's state: task status, finishing agent, status of each dog, and the time of their loss."""
     return {
         "devices": [
             {"uuid": name, "name": name, "status": status, "task": TASK, "gone": gone}
@@ -51,10 +51,10 @@ RUNS = state("EXECUTING", dog1="EXECUTING", dog2="WAITING")
 
 
 class ExperimentTests(SynchronousTestCase):
-    """An experiment is judged by where the dogs are."""
+    """The verdict of an experiment depends on the positions of the dogs."""
 
     def test_verdicts(self) -> None:
-        """The nearest dog at the target passes; a mere claim, another dog, no loss, or the lost dog at the end fail."""
+        """The nearest dog at the target passes; a false claim, another dog, no loss, or the lost dog fails."""
         wrong = state("EXECUTING", dog2="EXECUTING")
         for kills, looks, held, words in (
             (False, [(RUNS, (1.0, 1.5)), (state("COMPLETED", "dog1"), (0.30, 1.5))], True, "(gap 0.10 m)"),
@@ -73,7 +73,7 @@ class ExperimentTests(SynchronousTestCase):
             self.assertEqual(list(row["checks"].values()), [check.held for check in run.checks()])
 
     def test_who_is_killed(self) -> None:
-        """The dog on its way is named once, 0.1 m nearer or half way; none in experiment 1, and none that is gone."""
+        """``look`` names the moving dog once, 0.1 m nearer or half way; never in experiment 1 or if it is gone."""
         gone = state("EXECUTING", gone=1.0, dog1="EXECUTING")
         for kills, seen, ways, named in (
             (True, RUNS, (1.05, 1.0, 0.94, 0.85), ["", "", "dog1", ""]),
@@ -85,7 +85,7 @@ class ExperimentTests(SynchronousTestCase):
             self.assertEqual([run.look(float(now), seen, snapshot(x, 1.5)) for now, x in enumerate(ways)], named)
 
     def test_takeover_is_timed_until_another_dog_moves(self) -> None:
-        """The takeover lasts from the kill until another dog executes and moves; the lost one no longer counts."""
+        """The takeover lasts from the kill until another dog executes and moves; the killed dog is ignored."""
         run = Experiment("two", TASK, True, 0.0)
         run.look(0.0, RUNS, snapshot(1.0, 1.5))
         self.assertEqual(run.look(1.0, RUNS, snapshot(0.8, 1.5)), "dog1")
@@ -99,7 +99,7 @@ class ExperimentTests(SynchronousTestCase):
         self.assertTrue(run.held, table([run]))
 
     def test_experiment_ends_when_time_is_up(self) -> None:
-        """A task that never ends is over after the limit, and fails with its status in words."""
+        """An experiment is over after the time limit, and its table shows the last status of the task."""
         run = Experiment("one", TASK, False, 0.0)
         run.look(LIMIT_S - 1, state("OPEN"), None)
         self.assertFalse(run.is_over)
@@ -115,10 +115,10 @@ class ExperimentTests(SynchronousTestCase):
 
 
 class StoryTests(SynchronousTestCase):
-    """What changed is told in words."""
+    """Log lines describe the changes between two states of the page."""
 
     def test_told(self) -> None:
-        """Devices that join, change, go and come back, a task's end, and an agreement with its bids are told once."""
+        """Each join, status change, loss, return, task result and agreement is described once."""
         idle, busy = state("OPEN", dog1="IDLE"), state("OPEN", dog1="SEARCHING")
         gone = state("OPEN", gone=3.0, dog1="GONE")
         agreed = state("OPEN")
@@ -141,7 +141,7 @@ class StoryTests(SynchronousTestCase):
 
 
 class ConfigurationTests(SynchronousTestCase):
-    """The configurations are TOML that says what was planned."""
+    """The configurations are valid TOML with the planned values."""
 
     def setUp(self) -> None:
         ports = {"vaio": 7000, "pi": 7004, "dog1": 7001, "dog2": 7002, "dog3": 7003}
@@ -151,11 +151,11 @@ class ConfigurationTests(SynchronousTestCase):
         self.tables = self.read(self.plan)
 
     def read(self, plan: Plan) -> dict[str, Any]:
-        """The configuration of each node."""
+        """Parse the configuration of each node."""
         return {name: tomllib.loads(text) for name, text in plan.texts().items()}
 
     def test_every_node_has_a_file_in_lawful_toml(self) -> None:
-        """Two web nodes and three dogs that know the first, each with a port, a store and a robot of its own name."""
+        """Two web nodes and three dogs have their own ports, stores and robots, and know the first node."""
         self.assertEqual(list(self.tables), ["vaio", "pi", *DOGS])
         nodes = [table["node"] for table in self.tables.values()]
         self.assertEqual([node["port"] for node in nodes], [7000, 7004, 7001, 7002, 7003])
@@ -169,14 +169,14 @@ class ConfigurationTests(SynchronousTestCase):
         self.assertEqual((dog["driver"]["kind"], dog["driver"]["options"]["robot"]), ("sim", "dog2"))
 
     def test_every_node_is_a_member(self) -> None:
-        """What the team is founded with names each node that has a file, and no key of an open team."""
+        """The founding arguments list each node that has a file, and no configuration contains a team key."""
         words = self.plan.founding()
         members = [word.partition("=")[0] for flag, word in zip(words, words[1:], strict=False) if flag == "--member"]
         self.assertEqual([words[words.index("--first") + 1], *members], list(self.tables))
         self.assertNotIn("team_key", str(self.tables))
 
     def test_every_cast_is_known_to_its_drivers(self) -> None:
-        """The yard plays what each driver is told, none of which share a port; one dog has the older Tekkotsu."""
+        """Emulators match the drivers of each cast, ports are unique, and one Aibo speaks the older dialect."""
         self.assertEqual(self.plan.played, "")
         for wish in CASTS:
             ports = iter(range(9000, 9000 + MOST_PORTS * len(DOGS)))
@@ -194,7 +194,7 @@ class ConfigurationTests(SynchronousTestCase):
             self.assertEqual(dialects, [None, None, "T2" if wish == "aibo" else None])
 
     def test_two_nodes_serve_the_page(self) -> None:
-        """The laptop and its reserve serve the page over the yard, each at its own ports, also over TLS if planned."""
+        """The laptop and its reserve serve the page and the map, each on its own ports, also over TLS if planned."""
         web = {"host": "127.0.0.1", "port": 8080, "yard": "127.0.0.1:7400", "code": "quiet-otter"}
         secure = self.read(replace(self.plan, tls_ports=(8443, 8444)))
         for name, wanted, tls_port in (("vaio", web, 8443), ("pi", {**web, "port": 8081}, 8444)):
@@ -205,12 +205,12 @@ class ConfigurationTests(SynchronousTestCase):
 
 
 class EventStreamTests(SynchronousTestCase):
-    """Server-sent events come out of bytes."""
+    """``EventStream`` parses server-sent events."""
 
     WIRE = b'event: state\r\ndata: {"a":\r\ndata: 1}\r\n\r\n: heartbeat\n\nevent: other\ndata:x\n\ndata: y\n\n'
 
     def test_events_survive_any_cut(self) -> None:
-        """The same events come out whole and byte by byte; comments are none."""
+        """The parser finds the same events in the whole input and byte by byte, and ignores comments."""
         wanted = [("state", b'{"a":\n1}'), ("other", b"x"), ("message", b"y")]
         self.assertEqual(EventStream().feed(self.WIRE), wanted)
         stream = EventStream()
@@ -218,20 +218,20 @@ class EventStreamTests(SynchronousTestCase):
         self.assertEqual(pieces, wanted)
 
     def test_endless_line_is_dropped(self) -> None:
-        """A line without end does not fill the memory; the stream is understood again after it."""
+        """The parser drops a line without end and parses the events after it."""
         stream = EventStream()
         stream.feed(b"data: " + b"x" * (MAX_EVENT + 1))
         self.assertEqual(stream.feed(b"\n\ndata: y\n\n"), [("message", b"y")])
 
 
 class StageTests(SynchronousTestCase):
-    """Ports are free, and the run folder is emptied only where it is ours."""
+    """Ports are free, and only run folders of the demonstration are emptied."""
 
     def setUp(self) -> None:
         self.folder = Path(self.mktemp())
 
     def test_ports_of_one_plan_differ(self) -> None:
-        """A port of the page that was asked for is not given to the page over TLS as well."""
+        """A requested port for the page is not used for the page over TLS as well."""
         (wanted,) = port.free("tcp", "127.0.0.1", 1)
         self.patch(stage, "TLS_PORT", wanted)
         plan = arranged(self.folder, "127.0.0.1", wanted, True, lambda line: None, True)
@@ -239,7 +239,7 @@ class StageTests(SynchronousTestCase):
         self.assertEqual((plan.web_port, len(set(ports))), (wanted, 5))
 
     def test_free_ports_stay_free(self) -> None:
-        """No free port is one that systems give to outgoing connections, so none is taken before its process starts."""
+        """Free ports lie below the range for outgoing connections, so no other process takes them at random."""
         lowest_given = 32_768
         for kind in ("tcp", "udp", port.BOTH):
             ports = port.free(kind, "127.0.0.1", 20)
@@ -247,7 +247,7 @@ class StageTests(SynchronousTestCase):
             self.assertLess(max(ports), lowest_given)
 
     def test_ports_are_free_for_both_kinds(self) -> None:
-        """Where a port shall do for both kinds, one that is held for one of them alone is not given."""
+        """A port for both TCP and UDP is skipped if one of them is in use."""
         first, last = port.free(port.BOTH, "127.0.0.1", 2)
         self.patch(port, "QUIET", [first, last])
         for kind in (socket.SOCK_STREAM, socket.SOCK_DGRAM):
@@ -259,7 +259,7 @@ class StageTests(SynchronousTestCase):
                 self.assertRaises(OSError, port.free, port.BOTH, "127.0.0.1", 2)
 
     def test_only_a_free_folder_of_ours_is_emptied(self) -> None:
-        """What an earlier demonstration left is gone; a folder with another file, or in use, stays as it is."""
+        """The folder of an earlier demonstration is emptied; a folder with other files, or in use, stays unchanged."""
         fresh(self.folder).close()
         (self.folder / "dog1.sqlite").write_text("old")
         (self.folder / "inner").mkdir()
@@ -271,7 +271,7 @@ class StageTests(SynchronousTestCase):
         self.assertTrue((self.folder / "thesis.txt").exists())
 
     def test_what_is_no_folder_is_refused(self) -> None:
-        """A file in the place of the folder, or of the folder above it, is refused with what to do."""
+        """A file at the path of the folder or of its parent is rejected with a remedy."""
         self.folder.write_text("mine")
         for folder in (self.folder, self.folder / "inner"):
             said = str(self.assertRaises(Trouble, fresh, folder))
@@ -279,7 +279,7 @@ class StageTests(SynchronousTestCase):
             self.assertIn("choose another --run-dir", said)
 
     def test_foreign_address_is_refused(self) -> None:
-        """An address that is none of this machine is refused as such, and its port is not called busy."""
+        """An address of another machine is rejected with a hint to ``--web-host``, not as a busy port."""
         for wanted in (None, 8080):
             error = self.assertRaises(Trouble, arranged, self.folder, "192.0.2.1", wanted, True, lambda line: None)
             self.assertRegex(str(error), r"cannot serve the page on 192\.0\.2\.1 \(.*\); set --web-host")
@@ -287,7 +287,7 @@ class StageTests(SynchronousTestCase):
 
 class CommandLineTests(SynchronousTestCase):
     def test_wrong_words_are_refused(self) -> None:
-        """An unknown option, a port that is none, and a report in no folder are refused before anything starts."""
+        """An unknown option, an invalid port, and a report path in a missing folder are rejected at the start."""
         for words, said in (
             (["--nonsense"], "unrecognized arguments: --nonsense"),
             (["--web-port", "99999"], "--web-port: must be 0 to 65535, is '99999'"),

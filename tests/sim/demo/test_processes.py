@@ -1,4 +1,4 @@
-"""Tests of the team of processes, on a reactor in memory."""
+"""Tests of the processes of the demonstration, with a reactor in memory."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from sim.demo.processes import RESTART_S, Team, on_leash
 
 
 class MemoryProcess:
-    """A process that ends when it is told to, or, with ``stubborn``, only when it is killed."""
+    """A process that ends on any signal, or, if ``stubborn``, only on KILL."""
 
     def __init__(self, clock: Clock, pid: int, arguments: list[str], protocol: ProcessProtocol, stubborn: bool) -> None:
         self._clock = clock
@@ -43,7 +43,7 @@ class MemoryProcess:
 
 @implementer(IReactorProcess)
 class MemoryProcesses(Clock):
-    """A reactor whose processes are objects."""
+    """A reactor that starts ``MemoryProcess`` objects instead of processes."""
 
     def __init__(self, stubborn: bool = False) -> None:
         super().__init__()
@@ -60,7 +60,7 @@ class MemoryProcesses(Clock):
 
 
 class TeamTests(SynchronousTestCase):
-    """Processes are started, heard, killed, started again and ended."""
+    """``Team`` starts, logs, kills, restarts and ends processes."""
 
     def setUp(self) -> None:
         self.folder = Path(self.mktemp())
@@ -78,7 +78,7 @@ class TeamTests(SynchronousTestCase):
         return team, reactor
 
     def test_processes_start_on_a_leash_and_are_heard(self) -> None:
-        """Each process runs on a leash and has its id; its lines arrive at the listener, in its log and in its tail."""
+        """Each process starts on a leash; its lines reach the listener, its log file and its tail."""
         team, reactor = self.team()
         self.assertEqual(reactor.started[0].arguments, on_leash(["-m", "x"]))
         self.assertEqual((team.pid("dog1"), team.pid("dog2"), team.missing()), (100, 101, []))
@@ -89,7 +89,7 @@ class TeamTests(SynchronousTestCase):
         self.assertEqual(team.tail("dog1"), ["one", "two"])
 
     def test_killed_process_stays_away_for_the_delay(self) -> None:
-        """A process killed after a long life comes back after ``RESTART_S`` and not before; the others go on."""
+        """A killed process restarts after ``RESTART_S`` and not before; the other process keeps running."""
         team, reactor = self.team()
         reactor.advance(100.0)
         team.kill("dog1")
@@ -103,7 +103,7 @@ class TeamTests(SynchronousTestCase):
         self.assertEqual((team.pid("dog1"), team.pid("dog2")), (102, 101))
 
     def test_stop_ends_all_and_starts_none(self) -> None:
-        """After ``stop`` no process runs, none comes back, and no timer is left; a second call is answered too."""
+        """After ``stop`` no process runs or restarts, and no timer is left; later calls complete as well."""
         team, reactor = self.team()
         team.kill("dog2")
         reactor.advance(0.0)
@@ -115,7 +115,7 @@ class TeamTests(SynchronousTestCase):
         self.assertEqual((team.missing(), reactor.getDelayedCalls()), (["dog1", "dog2"], []))
 
     def test_stop_waits_for_the_stubborn_and_kills_them(self) -> None:
-        """A process that ignores the request to end is killed after four seconds, and ``stop`` waits for that."""
+        """``stop`` kills a process that ignores TERM for four seconds, and waits for its end."""
         team, reactor = self.team(stubborn=True)
         done = team.stop()
         reactor.pump([0.1] * 30)

@@ -1,4 +1,4 @@
-"""Tests of ``sim.demo.trials``: the table, and the command line with a team that is played."""
+"""Tests of ``sim.demo.trials``: the table, and the command line with a stub team."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sim.demo.trials import Outcome, main, percentile, table, trial
 
 
 class PlayedTeam:
-    """Two dogs that do what the seed says: an even seed completes, an odd one never does."""
+    """A stub team of two dogs: with an even seed the task completes, with an odd seed it never does."""
 
     def __init__(self, seed: int) -> None:
         self.clock = HeapClock()
@@ -26,23 +26,23 @@ class PlayedTeam:
         self._began: float | None = None
 
     def digest(self) -> str:
-        """As the board's."""
+        """Return a digest, in the role of the board."""
         return f"digest {self._seed}"
 
     def run_demo(self) -> str:
-        """Begin."""
+        """Start the task."""
         self._began = self.clock.seconds()
         return "t1"
 
     def scatter(self, seed: int) -> None:
-        """Nothing moves by itself."""
+        """Leave all dogs at their places."""
 
     def kill(self, name: str) -> None:
-        """Lose a dog."""
+        """Kill a dog."""
         self.lost.add(name)
 
     def stop(self) -> None:
-        """Nothing to end."""
+        """Do nothing: the stub has no processes."""
 
     def _age(self) -> float:
         return 0.0 if self._began is None else self.clock.seconds() - self._began
@@ -51,14 +51,14 @@ class PlayedTeam:
         return "dog2" if "dog1" in self.lost else "dog1"
 
     def truth(self) -> dict[str, Any]:
-        """The dogs walk to the target, the nearer one first."""
+        """Return a snapshot in which the acting dog walks to the target."""
         near = max(0.22, 1.0 - 0.1 * self._age())
         at = {"dog1": 0.9 if "dog1" in self.lost else near, "dog2": near if "dog1" in self.lost else 2.0}
         dogs = [{"name": n, "x": x, "y": 0.0, "heading": 0.0, "moving": True, "stripes": 1} for n, x in at.items()]
         return {"t": self._age(), "walls": [3.0, 2.4], "dogs": dogs, "target": {"x": 0.0, "y": 0.0, "radius": 0.08}}
 
     def state(self) -> dict[str, Any]:
-        """What the page would show."""
+        """Return the state of the page."""
         is_done = self._age() > 9.0 and self._seed % 2 == 0
         by = self._by()
         names = [name for name in ("dog1", "dog2") if name not in self.lost]
@@ -74,14 +74,14 @@ class PlayedTeam:
 
 class TrialTests(SynchronousTestCase):
     def test_trial_notes_what_came_of_it(self) -> None:
-        """A trial says who reached it, whether all found and agreed, and keeps the trace's hash."""
+        """A trial records the finishing dog, the checks of finding and agreement, and the digest of the trace."""
         outcome = trial(PlayedTeam, 1, 2)
         self.assertEqual(outcome.broken, [])
         self.assertTrue(outcome.held and outcome.found and outcome.agreed and outcome.right)
         self.assertEqual((outcome.by, outcome.killed, outcome.digest), ("dog1", "", "digest 2"))
 
     def test_second_experiment_loses_the_dog_on_its_way(self) -> None:
-        """In experiment 2 the dog on its way is killed once, the takeover is timed, and each phase drawn as a PNG."""
+        """In experiment 2 the acting dog is killed once, the takeover is timed, and each phase is drawn as a PNG."""
         folder = Path(self.mktemp())
         folder.mkdir()
         outcome = trial(PlayedTeam, 2, 2, folder)
@@ -94,12 +94,12 @@ class TrialTests(SynchronousTestCase):
         self.assertTrue(all(path.read_bytes()[:4] == b"\x89PNG" for path in folder.iterdir()))
 
     def test_percentile_is_a_value_that_was(self) -> None:
-        """The percentile is the smallest value that the share does not exceed; it invents none."""
+        """The percentile is the smallest measured value that covers the share; it is never interpolated."""
         values = [5.0, 1.0, 4.0, 2.0, 3.0]
         self.assertEqual([percentile(values, share) for share in (0.0, 0.2, 0.21, 0.5, 0.95, 1.0)], [1, 1, 2, 3, 5, 5])
 
     def test_table_counts_and_measures(self) -> None:
-        """One line for each experiment, with counts, medians and 95th percentiles; a dash for nothing measured."""
+        """Each experiment has one line with counts, medians and 95th percentiles, and a dash for no value."""
         good: dict[str, Any] = {"held": True, "found": True, "agreed": True, "right": True}
         outcomes = [Outcome(n, 1, **good, find=1.0 + n, agree=2.0, reach=10.0) for n in range(3)]
         outcomes.append(Outcome(1, 2, takeover=1.25))
@@ -109,7 +109,7 @@ class TrialTests(SynchronousTestCase):
         self.assertEqual(lines[2], ["experiment", "2", "1", "0", "0", "0", "0", "-", "-", "-", "1.25", "(1.25)"])
 
     def run_main(self, *words: str) -> tuple[int, str, Path]:
-        """The command with a folder of its own; code, output and folder."""
+        """Run the command with a new output folder and return exit code, output and folder."""
         folder = Path(self.mktemp())
         output = io.StringIO()
         with contextlib.redirect_stdout(output):
@@ -117,7 +117,7 @@ class TrialTests(SynchronousTestCase):
         return code, output.getvalue(), folder
 
     def test_exit_code(self) -> None:
-        """Where every trial held the code is 0 and the report has each; else it is 1 and the line says what failed."""
+        """The exit code is 0 if every trial passes; otherwise it is 1, and the trial's line names the failed check."""
         code, output, folder = self.run_main("--count", "1", "--seed", "2")
         self.assertEqual(code, 0, output)
         self.assertIn("   1/2 ok   experiment 1 seed 2: dog1 reached it", output)
@@ -130,7 +130,7 @@ class TrialTests(SynchronousTestCase):
         self.assertIn("1/2 FAIL experiment 1 seed 1: nobody reached it  (task completed (", output)
 
     def test_wrong_arguments_are_refused(self) -> None:
-        """A negative number, a word for a number and a folder that cannot be made are one line and code 2."""
+        """A negative or non-numeric count and a folder that cannot be created are rejected in one line with code 2."""
         blocked = Path(self.mktemp())
         blocked.write_text("a file", encoding="utf-8")
         for words in (["--count", "-1"], ["--count", "many"], ["--out", str(blocked / "below")]):

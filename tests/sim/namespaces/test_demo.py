@@ -1,4 +1,4 @@
-"""The plan of the demonstration across namespaces, as text; no namespace is made."""
+"""Tests of the configurations of the demonstration across namespaces; no namespace is created."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sim.namespaces.kind import Kind
 
 
 def places() -> dict[str, Place]:
-    """Each process at an address of its own."""
+    """Return a place with a distinct address for each process."""
     return {
         name: Place(f"198.19.1.{number}", "198.18.1.1", f"198.19.255.{number}", ("nsenter",))
         for number, name in enumerate(HOSTS, start=2)
@@ -24,7 +24,7 @@ def places() -> dict[str, Place]:
 
 class NatDemoTests(SynchronousTestCase):
     def test_nobody_is_told_of_this_machine(self) -> None:
-        """With every cast, no configuration and no robot names the loopback, and each is one that a node takes."""
+        """With each cast all configurations are valid, and neither they nor the emulators use the loopback address."""
         for cast in CASTS:
             plan = planned(Path("/nowhere"), cast, places(), "over-there")
             for name, text in plan.texts().items():
@@ -34,14 +34,14 @@ class NatDemoTests(SynchronousTestCase):
             self.assertNotIn(LOOPBACK, plan.played)
 
     def test_everybody_enters_by_the_router(self) -> None:
-        """The dogs name the address at which their own side finds the bootstrap; the judge's is one as well."""
+        """The dogs and the judge use the address of the bootstrap node that is valid in their own network."""
         plan = planned(Path("/nowhere"), "sim", places(), "over-there")
         for name in DOGS:
             self.assertIn(f'known_nodes = ["198.18.1.1:{NODE_PORT}"]', plan.texts()[name])
         self.assertEqual(plan.place(JUDGE).entry, "198.18.1.1")
 
     def test_two_dogs_are_behind_different_routers(self) -> None:
-        """dog1 and dog2 are alone behind routers of different kinds, dog3 is where the bootstrap is."""
+        """dog1 and dog2 are behind NATs of different kinds, and dog3 is at the site of the bootstrap node."""
         kinds = {f"{site.name}{number}": site.kind for site in SITES for number in range(1, site.hosts + 1)}
         self.assertEqual([kinds[HOSTS[name]] for name in DOGS[:2]], [Kind.PORT, Kind.SYM])
         self.assertEqual(HOSTS[DOGS[2]][:-1], HOSTS["vaio"][:-1])

@@ -1,4 +1,4 @@
-"""The rules of routers, as text."""
+"""Tests of the firewall rules for each kind of NAT."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from sim.namespaces.kind import Kind
 
 class KindTests(SynchronousTestCase):
     def test_what_makes_a_kind(self) -> None:
-        """Only the symmetric one has random ports, only the leaky one takes strangers in, only one blocks UDP."""
+        """Only SYM has random ports, only LEAKY accepts any packet, only NOUDP drops UDP; FULL and ADDR use DNAT."""
         self.assertEqual([kind for kind in Kind if "fully-random" in kind.rules()], [Kind.SYM])
         self.assertEqual([kind for kind in Kind if "ct state new drop" not in kind.rules()], [Kind.LEAKY])
         self.assertEqual([kind for kind in Kind if "udp drop" in kind.rules()], [Kind.NOUDP])

@@ -1,4 +1,4 @@
-"""What one line of the internet of namespaces does to frames; dice and moments are handed in."""
+"""Tests of the link emulation between namespaces, with a given random generator and given times."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ MANY = 20_000
 
 
 def line(**figures: float) -> Line:
-    """A line with that weather."""
+    """Return a line with these impairments."""
     made = Line(Random(7))
     made.weather = Weather(**figures)
     return made
@@ -21,7 +21,7 @@ def line(**figures: float) -> Line:
 
 class LineTests(SynchronousTestCase):
     def test_losses_are_as_many_as_said(self) -> None:
-        """A tenth, a third and all are lost where that is said; each of them counts."""
+        """The measured loss matches a configured loss of 10, 33 and 100 percent, and the counters match the frames."""
         for percent in (10.0, 33.0, 100.0):
             lossy = line(loss=percent)
             lost = sum(not lossy.fates(100, 0.0) for _ in range(MANY))
@@ -29,7 +29,7 @@ class LineTests(SynchronousTestCase):
             self.assertEqual((lossy.lost, lossy.passed), (lost, MANY - lost))
 
     def test_losses_come_in_bursts(self) -> None:
-        """With bursts of five as many are lost as without, but about five in a row."""
+        """A burst length of five keeps the loss rate and loses about five frames in a row."""
         bursty = line(loss=20.0, burst=5.0)
         fates = [not bursty.fates(100, 0.0) for _ in range(MANY)]
         self.assertApproximates(sum(fates) / MANY, 0.2, 0.03)
@@ -37,7 +37,7 @@ class LineTests(SynchronousTestCase):
         self.assertApproximates(sum(fates) / begun, 5.0, 0.6)
 
     def test_delay_and_jitter(self) -> None:
-        """Frames are late by the delay on the average, spread as far as the jitter says, and never early."""
+        """The mean and the standard deviation of the delay match the settings, and no frame arrives early."""
         slow = line(delay=50.0, jitter=10.0)
         late = [1000 * (slow.fates(100, 2.0)[0] - 2.0) for _ in range(MANY)]
         self.assertApproximates(statistics.mean(late), 50.0, 0.5)
@@ -45,14 +45,14 @@ class LineTests(SynchronousTestCase):
         self.assertGreaterEqual(min(late), 0.0)
 
     def test_a_narrow_line_queues_and_overflows(self) -> None:
-        """At 80 kbit/s frames of 1000 bytes come out a tenth of a second apart; what waits too long is lost."""
+        """At 80 kbit/s frames of 1000 bytes leave 0.1 s apart, and frames beyond the queue limit are dropped."""
         narrow = line(rate=80.0, queue=250.0)
         fates = [narrow.fates(1000, 0.0) for _ in range(5)]
         self.assertEqual([round(fate[0], 3) for fate in fates if fate], [0.1, 0.2, 0.3])
         self.assertEqual(narrow.lost, 2)
 
     def test_doubles_reordered_and_corrupt_frames(self) -> None:
-        """Frames double, overtake, or have one bit turned behind the header, where that is said; others are whole."""
+        """Frames are duplicated, reordered, or corrupted by one bit after the header only if configured."""
         fair = line()
         self.assertEqual((fair.fates(100, 3.0), fair.spoiled(b"frame", 0)), ([3.0], b"frame"))
         self.assertEqual(fair.counts, {"passed": 1, "lost": 0, "bytes": 100})
@@ -63,6 +63,6 @@ class LineTests(SynchronousTestCase):
         self.assertEqual(sum(byte.bit_count() for byte in spoiled), 1)
 
     def test_senseless_weather_is_refused(self) -> None:
-        """Percentages above 100, negative times and bursts of less than one frame are refused."""
+        """Percentages above 100, negative delays, bursts shorter than one frame and NaN are rejected."""
         for figures in ({"loss": 101.0}, {"delay": -1.0}, {"burst": 0.5}, {"rate": float("nan")}):
             self.assertRaises(ValueError, Weather, **figures)

@@ -1,1 +1,1 @@
-"""Tests of whole teams in one process."""
+"""Tests of the team simulator."""

@@ -1,4 +1,4 @@
-"""The checker over histories made by hand: each invariant has one that breaks it, and one like it that does not."""
+"""Tests of the invariant checker with handmade histories: violations of each invariant, and similar valid ones."""
 
 from __future__ import annotations
 
@@ -57,31 +57,31 @@ SURVEY = Asked(5.0, 9, 2, "survey", "job")
 
 
 def command(at: float, token: int, is_accepted: bool = True, place: int = 1) -> Commanded:
-    """A command for t0 that is in force for a second."""
+    """Return a command for t0 that is in force for one second."""
     return Commanded(at, "t0", place, token, is_accepted, at + 1.0, at + 1.0)
 
 
 def write(at: float, number: int, is_known: bool = True, what: str = "write") -> list[Event]:
-    """A write of the slot, and its acknowledgement."""
+    """Return a write of the slot, and its acknowledgement."""
     asked = Asked(at, number, 1, what, SLOT, number)
     return [asked, Answered(at + 0.1, number)] if is_known else [asked, Unanswered(at + 0.1, number, "silence")]
 
 
 def read(at: float, shown: dict[Slot, int], concern: str = "majority") -> list[Event]:
-    """A read of the slot's key."""
+    """Return a read of the slot's key, and its answer."""
     number = int(at * 1000)
     return [Asked(at, number, (2, 1), "read", b"key", concern), Answered(at + 0.1, number, shown)]
 
 
 def decided(place: int, assigned: str, cost: float = 1.0, serial: int = 5, holder: str | None = None) -> Decided:
-    """A decision between a and b, of which b bids 2."""
+    """Return a decision between the agents a and b, in which b bids 2."""
     me = Report(str(place), f"dog{place}", 1, 1, None)
     reports = (me, Report("a", "dog-a", 1, serial, cost), Report("b", "dog-b", 1, 5, 2.0))
     return Decided(1.0 + place / 10, place, "t0", reports, ("basis", cost, serial), assigned, holder, 0.1)
 
 
 def shot(after: str = "same", raised: str = "", logged: str = "", answers: tuple[tuple[bool, int], ...] = ()) -> Shot:
-    """A forged datagram of ten bytes."""
+    """Return the delivery of a forged datagram of ten bytes."""
     return Shot(1.0, 1, "forged", bytes(10), "same", after, raised, logged, answers)
 
 
@@ -260,28 +260,28 @@ LAWFUL: dict[str, list[Event]] = {
 
 class CheckerTests(SynchronousTestCase):
     def test_each_is_broken_alone(self) -> None:
-        """Every invariant is broken by histories made for it, and those break no other one."""
+        """Each history in ``BROKEN`` violates its invariant and no other."""
         for name, histories in BROKEN.items():
             for history in histories:
                 found = {line.partition(":")[0] for line in check(history)}
                 self.assertEqual(found, {name}, history)
 
     def test_none_is_forgotten(self) -> None:
-        """Every invariant of the checker has a history here that breaks it."""
+        """``BROKEN`` has a history for every invariant of the checker."""
         self.assertEqual({name for _, invariants in PARTS for name, _ in invariants}, set(BROKEN))
 
     def test_lawful(self) -> None:
-        """What looks like a violation and is none passes."""
+        """Valid histories that resemble violations pass."""
         self.assertEqual({why: found for why, history in LAWFUL.items() if (found := check(history))}, {})
 
     def test_no_line_twice(self) -> None:
-        """What is broken many times in the same way is told once."""
+        """A violation that repeats in the same way is reported once."""
         self.assertEqual(len(check([TERMS, *[Held(1.0, "t0", 1, (2,))] * 3])), 1)
 
 
 class HistoryTests(SynchronousTestCase):
     def made(self, result: object) -> History:
-        """A history with an operation in it."""
+        """Return a history with one operation."""
         moments = iter([1.0, 2.0, 2.5])
         history = History(lambda: next(moments))
         number = history.asked("client", "put", ("job", 1))
@@ -290,11 +290,11 @@ class HistoryTests(SynchronousTestCase):
         return history
 
     def test_order(self) -> None:
-        """Events stand in the order in which they happened, each with its moment."""
+        """A history lists the events in the order in which they happened, each with its time."""
         wanted = [Asked(1.0, 1, "client", "put", ("job", 1)), Died(2.0, 3), Answered(2.5, 1, "done")]
         self.assertEqual(list(self.made("done")), wanted)
 
     def test_digest(self) -> None:
-        """Equal histories have equal digests, and a single other fact makes another one."""
+        """Equal histories have equal digests; a different result changes the digest."""
         self.assertEqual(self.made("done").digest(), self.made("done").digest())
         self.assertNotEqual(self.made("done").digest(), self.made("not done").digest())

@@ -1,4 +1,4 @@
-"""Tests of what clients write down."""
+"""Tests of the history that simulated clients record."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ KEY = b"k" * 32
 
 
 class Peer:
-    """A node that answers at once with what it is given: success, or an error."""
+    """A stub node that answers at once with a given result or error."""
 
     def __init__(self) -> None:
         self.identity = Identity(b"i" * 32)
@@ -28,24 +28,24 @@ class Peer:
         self.answer: Exception | list[Record] = []
 
     def put(self, key: bytes, name: str, value: bytes, lifetime: str, concern: str) -> Deferred[Any]:
-        """A write."""
+        """Answer a write."""
         self.puts.append(value)
         return self.remove(key, name, concern)
 
     def remove(self, key: bytes, name: str, concern: str) -> Deferred[Any]:
-        """A removal."""
+        """Answer a removal."""
         return fail(self.answer) if isinstance(self.answer, Exception) else succeed(None)
 
     def get(self, key: bytes, concern: str) -> Deferred[Any]:
-        """A read."""
+        """Answer a read."""
         return fail(self.answer) if isinstance(self.answer, Exception) else succeed(self.answer)
 
 
 class ClientTests(SynchronousTestCase):
-    """Behaviour of ``Clients``."""
+    """Tests of ``Clients``."""
 
     def setUp(self) -> None:
-        """Clients of one node."""
+        """Create clients of one stub node."""
         self.peer = Peer()
         self.node = cast(EntangledNode, self.peer)
         self.slot = Slot(KEY, self.peer.identity.public, "a")
@@ -53,7 +53,7 @@ class ClientTests(SynchronousTestCase):
         self.clients = Clients(self.history)
 
     def test_changes_of_a_slot_are_numbered(self) -> None:
-        """Writes and removals of one slot count on, those of another from 1, and the history has what came of each."""
+        """Writes and removals are numbered per slot, and the history contains the outcome of each."""
         for name, act in (("a", WRITE), ("a", REMOVE), ("b", WRITE), ("a", WRITE)):
             self.clients.write(2, self.node, KEY, name, act=act)
         self.assertEqual(self.peer.puts, [b"1", b"1", b"3"])
@@ -62,7 +62,7 @@ class ClientTests(SynchronousTestCase):
         self.assertEqual(self.clients.slots(b"somebody else"), [])
 
     def test_reads(self) -> None:
-        """A read fires with what was found, and the history has the number in each slot, 0 where it is empty."""
+        """A read returns the records, and the history contains the number in each slot, 0 for an empty slot."""
         owner = self.peer.identity.public
         self.peer.answer = [
             Record(KEY, name, owner, 1, "team", 60.0, value, b"") for name, value in (("a", b"3"), ("b", None))
@@ -73,7 +73,7 @@ class ClientTests(SynchronousTestCase):
         self.assertEqual(self.history.events, [Asked(1.0, 1, (2, 4), READ, KEY, "majority"), Answered(1.0, 1, shown)])
 
     def test_what_fails_may_have_been_done(self) -> None:
-        """What fails is noted as open, a read of too few as unavailable, and is not counted as answered."""
+        """A failed operation stays open, a read without a majority is unavailable, and neither counts as answered."""
         self.peer.answer = NotAcknowledged(1, 3)
         self.clients.write(2, self.node, KEY, "a")
         self.peer.answer = Unavailable(1, 3)

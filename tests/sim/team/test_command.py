@@ -1,4 +1,4 @@
-"""Tests of ``sim run``: what people and programs are told."""
+"""Tests of the command ``sim run``: its report, progress and errors."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ lasts = 1.0
 
 
 class CommandTests(SynchronousTestCase):
-    """Behaviour of ``run``."""
+    """Tests of ``run``."""
 
     def setUp(self) -> None:
-        """Have a folder, a scenario in it, and a world whose clock goes on by itself."""
+        """Create a folder for the scenario, and a clock that advances at each call."""
         self.folder = Path(self.mktemp())
         self.folder.mkdir()
         self.path = self.folder / "small.toml"
@@ -42,12 +42,12 @@ class CommandTests(SynchronousTestCase):
         self.asked = 0
 
     def seconds(self) -> float:
-        """A clock that goes on at each look."""
+        """Advance the clock and return its time."""
         self.now += 0.15
         return self.now
 
     def run_it(self, *words: str, text: str = SCENARIO, stop_after: int = 10**9, columns: int = 0) -> int:
-        """Run the scenario; what the command returns."""
+        """Run the scenario and return the exit code."""
         self.path.write_text(text)
 
         def is_stopped() -> bool:
@@ -63,7 +63,7 @@ class CommandTests(SynchronousTestCase):
         return run(["--scenario", str(self.path), *words], world, KINDS)
 
     def test_report_is_for_people_and_programs(self) -> None:
-        """Table, hash and repeating line are printed; JSON has the same, and series; trace and picture the fault."""
+        """Table, hash and command are printed; the JSON file adds time series; trace and picture show the fault."""
         files = [str(self.folder / name) for name in ("r.json", "t.jsonl", "p.svg")]
         self.assertEqual(self.run_it("--seed", "3", "--json", files[0], "--trace", files[1], "--picture", files[2]), 0)
         report = json.loads(Path(files[0]).read_text())
@@ -82,13 +82,13 @@ class CommandTests(SynchronousTestCase):
         self.assertIn("crash", "".join(picture.itertext()))
 
     def test_missed_target_fails(self) -> None:
-        """A target that is missed is said, and the exit code tells."""
+        """A missed target is reported and sets the exit code."""
         text = SCENARIO + '[targets]\n"nodes" = ">= 5"\n'
         self.assertEqual(self.run_it(text=text), MISSED)
         self.assertIn("MISSED    nodes: >= 5", self.out.getvalue())
 
     def test_target_without_figure_is_refused(self) -> None:
-        """A target that no workload of the scenario measures is refused by its line, before the first step."""
+        """A target that no workload of the scenario measures is rejected with its line, before the first step."""
         text = SCENARIO + "[load.lookups]\n[load.traffic]\n[targets]\n"
         kept = self.folder / "kept.json"
         kept.write_text("{}")
@@ -99,7 +99,7 @@ class CommandTests(SynchronousTestCase):
         self.assertEqual(kept.read_text(), "{}")
 
     def test_ending_leaves_a_valid_partial_report(self) -> None:
-        """Who ends a run gets a report, as text, JSON, trace and picture, that says that it is partial."""
+        """An interrupted run leaves a report as text, JSON, trace and picture, each marked as partial."""
         files = [str(self.folder / name) for name in ("r.json", "t.jsonl", "p.svg")]
         code = self.run_it("--json", files[0], "--trace", files[1], "--picture", files[2], stop_after=3)
         self.assertEqual(code, ENDED)
@@ -110,7 +110,7 @@ class CommandTests(SynchronousTestCase):
         self.assertIn("partial", ElementTree.fromstring(Path(files[2]).read_text())[0].text or "")
 
     def test_progress_is_a_bar_or_lines(self) -> None:
-        """On a terminal a bar is drawn over itself and taken away at the end; elsewhere lines come now and then."""
+        """On a terminal progress is a bar that is erased at the end; elsewhere it is an occasional line."""
         self.run_it(columns=120)
         drawn = self.err.getvalue()
         self.assertRegex(drawn, r"\r\[#+\.+\]  ?\d+% running, \d+\.\d of 17 s, [34] alive, [\d,]+ datagrams, ")
@@ -126,16 +126,16 @@ class CommandTests(SynchronousTestCase):
         self.assertTrue(lines[-1].endswith(", nodes inside 4 (!)"), lines[-1])
 
     def test_file_that_cannot_be_written_is_said_first(self) -> None:
-        """A folder that is not there is refused before anything runs."""
+        """A report path in a missing folder is rejected before the run starts."""
         error = self.assertRaises(BadSetting, self.run_it, "--json", str(self.folder / "no" / "r.json"))
         self.assertEqual((error.key, self.err.getvalue()), ("--json", ""))
 
 
 class TraceTests(SynchronousTestCase):
-    """Behaviour of ``Trace``."""
+    """Tests of ``Trace``."""
 
     def test_each_event_is_a_line_up_to_a_bound(self) -> None:
-        """Head, events and end are one JSON object a line; beyond the bound they are only counted."""
+        """The trace has one JSON object per line; events beyond the limit are only counted."""
         out = io.StringIO()
         trace = Trace(out, 2)
         trace.begin(seed=3)

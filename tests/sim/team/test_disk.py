@@ -1,4 +1,4 @@
-"""Tests of the twin of a store in a file."""
+"""Tests of the simulated disk."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ def _record(name: str, sequence: int = 1, lifetime: Lifetime = "team") -> Record
 
 
 class DiskTests(SynchronousTestCase):
-    """Behaviour of ``Disk``."""
+    """Tests of ``Disk``."""
 
     def setUp(self) -> None:
-        """Have a disk that is empty."""
+        """Create an empty disk."""
         self.clock = HeapClock()
         self.disk = Disk(self.clock, random.Random(1))
 
@@ -34,7 +34,7 @@ class DiskTests(SynchronousTestCase):
         return next_life(self.disk, Disk(self.clock, random.Random(2)), self.clock.seconds())
 
     def test_last_moment_goes_with_the_power(self) -> None:
-        """What ``written`` confirmed is in the next life, what it did not is not, and a lease never is."""
+        """Records that ``written`` confirmed survive a power loss; unconfirmed records and leases do not."""
         self.disk.put(_record("safe"), 60.0)
         self.disk.put(_record("lease", lifetime="leased"), 60.0)
         self.disk.note("fact", b"1")
@@ -52,20 +52,20 @@ class DiskTests(SynchronousTestCase):
         self.assertEqual(reborn.expiry(_record("safe").slot), self.clock.seconds() + 60.0)
 
     def test_third_life_has_what_the_first_wrote(self) -> None:
-        """What a disk held when its node began is still on it when the next one ends."""
+        """A record survives two restarts in a row."""
         self.disk.put(_record("old"), 60.0)
         self.clock.advance(1.0)
         second = self._reborn()
         self.assertEqual(self._names(next_life(second, Memory(), 1.0)), ["old"])
 
     def test_goodbye_writes_all(self) -> None:
-        """A store that is closed has written what it could."""
+        """``close`` writes all pending records."""
         self.disk.put(_record("last"), 60.0)
         self.disk.close()
         self.assertEqual(self._names(self._reborn()), ["last"])
 
     def test_full_disk_refuses_by_name_and_recovers(self) -> None:
-        """While the disk is full, waiters are told, new records refused and old ones read; then all goes on."""
+        """A full disk fails pending and new writes but serves reads; after that it writes pending records."""
         self.disk.put(_record("before"), 60.0)
         self.clock.advance(0.1)
         self.disk.is_full = True
@@ -84,7 +84,7 @@ class DiskTests(SynchronousTestCase):
         self.assertEqual(sorted(self._names(self._reborn())), ["before", "owed"])
 
     def test_memory_outlives_the_power_but_for_leases(self) -> None:
-        """Where a scenario has no disks, all but the leases is there in the next life."""
+        """In a scenario without disks everything but the leases survives a restart."""
         memory = Memory()
         memory.put(_record("team"), 60.0)
         memory.put(_record("lease", lifetime="leased"), 60.0)

@@ -1,4 +1,4 @@
-"""The logbook of long runs: what it keeps, and what is left to be run."""
+"""Tests of the logbook of long runs: its entries, and the seeds that are left to run."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ ENTRY = Entry("2026-11-22T10:00:00Z", "abc", "", 1, 3, (2,), 1.5)
 
 class LogbookTests(SynchronousTestCase):
     def book(self) -> Path:
-        """Where a logbook may stand."""
+        """Return the path of a new logbook."""
         return Path(self.mktemp())
 
     def test_what_is_added_is_read(self) -> None:
-        """Entries are read as they were added, in their order."""
+        """Entries are read in the order in which they were appended."""
         book, second = self.book(), replace(ENTRY, first=4, failures=())
         for entry in (ENTRY, second):
             append(str(book), entry)
         self.assertEqual(entries(book.read_text(), "book"), [ENTRY, second])
 
     def test_half_a_line(self) -> None:
-        """Half a line at the end is left out when the book is read, and gone when it is added to."""
+        """An incomplete last line is ignored when the logbook is read, and removed when an entry is appended."""
         book = self.book()
         append(str(book), ENTRY)
         with book.open("a") as torn:
@@ -36,17 +36,17 @@ class LogbookTests(SynchronousTestCase):
         self.assertEqual(entries(book.read_text(), "book"), [ENTRY, ENTRY])
 
     def test_no_logbook(self) -> None:
-        """A whole line that is no entry is refused with its number."""
+        """A complete line that is no entry is rejected with its line number."""
         told = ENTRY.line() + "\nhello\n" + ENTRY.line() + "\n"
         error = self.assertRaises(BadSetting, entries, told, "book")
         self.assertIn("line 2", str(error))
 
     def test_missing(self) -> None:
-        """What a book has of the same workloads is not run again; what it has of others is."""
+        """Seeds in the logbook are not run again, except for seeds that ran with other workloads."""
         logged = [ENTRY, replace(ENTRY, first=6), replace(ENTRY, first=4, what="wire")]
         self.assertEqual(missing(range(1, 11), logged, ""), [4, 5, 9, 10])
 
     def test_stretches(self) -> None:
-        """Seeds are told of in stretches without gaps, none longer than is allowed."""
+        """Seeds are grouped into ranges without gaps, up to a maximum length."""
         self.assertEqual(stretches([1, 2, 3, 7, 8, 10], 2), [[1, 2], [3], [7, 8], [10]])
         self.assertEqual(stretches([], 2), [])

@@ -1,4 +1,4 @@
-"""Tests of a place's computer."""
+"""Tests of a node's simulated computer."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from sim.team.machine import MOST_WAITING, Machine, MachineNetwork
 
 
 class MachineTests(SynchronousTestCase):
-    """Behaviour of ``Machine`` and its network."""
+    """Tests of ``Machine`` and ``MachineNetwork``."""
 
     def setUp(self) -> None:
-        """Have a world, and a place to write down what happens."""
+        """Create a clock, and a list of results."""
         self.world = HeapClock()
         self.seen: list[object] = []
 
     def test_clock_runs_at_its_own_rate(self) -> None:
-        """A fast clock shows more, its timers are due sooner, and a new rate moves no moment that has passed."""
+        """A fast clock runs ahead, its timers are due earlier, and a new rate does not change past times."""
         machine = Machine(self.world, 2.0, 100.0)
         verifyObject(IReactorTime, machine)
         machine.callLater(4.0, lambda: self.seen.append(self.world.seconds()))
@@ -34,10 +34,10 @@ class MachineTests(SynchronousTestCase):
         self.assertEqual(machine.seconds(), 107.0)
 
     def test_waiting_for_what_is_left_ends(self) -> None:
-        """Who sets a timer for the rest of a wait again and again gets there, however the clocks round."""
+        """A timer that is set again for the remaining time reaches its deadline in spite of rounding."""
         dice = random.Random(1)
         for _ in range(300):
-            self.world = HeapClock(1e6 + dice.random())  # its digits are coarser than those of a clock that begins now
+            self.world = HeapClock(1e6 + dice.random())  # coarser resolution than a clock that starts at 0
             rate = dice.uniform(0.99, 1.01)
             machine = Machine(self.world, rate, -rate * self.world.seconds())
             turns: list[int] = []
@@ -53,7 +53,7 @@ class MachineTests(SynchronousTestCase):
             self.assertLess(len(turns), 5, f"rate {rate}")
 
     def test_what_was_due_waits_for_the_thaw(self) -> None:
-        """Nothing of a still machine runs; then come the timers in their order, and after them what came in."""
+        """A frozen machine runs nothing; after the thaw overdue timers run in order, then datagrams arrive."""
         board = Switchboard(self.world, random.Random(1))
         machine = Machine(self.world)
         network = MachineNetwork(machine, board.network("10.0.0.1", 7000))
@@ -71,7 +71,7 @@ class MachineTests(SynchronousTestCase):
         self.assertEqual(self.seen, ["first", "second", b"hello"])
 
     def test_overdue_timer_can_be_cancelled(self) -> None:
-        """A timer that is overdue counts as waiting: the one that runs before it may cancel it."""
+        """An overdue timer is still active, and an overdue timer that runs before it can cancel it."""
         machine = Machine(self.world)
         first = machine.callLater(1.0, lambda: second.cancel())
         second = machine.callLater(1.0, self.seen.append, "second")
@@ -84,7 +84,7 @@ class MachineTests(SynchronousTestCase):
         self.assertRaises(AlreadyCalled, first.cancel)
 
     def test_clock_that_stops_while_suspended(self) -> None:
-        """A clock counts a suspension, unless it is made not to; then it is late by as much from then on."""
+        """A clock counts a suspension, unless ``COUNTS_SUSPENSION`` is false; then it stays late by that time."""
         for counts, shown in ((True, 8.0), (False, 2.0)):
             self.world = HeapClock()
             machine = Machine(self.world, 2.0)
@@ -98,7 +98,7 @@ class MachineTests(SynchronousTestCase):
             self.assertEqual(machine.unstopped_at(shown), shown / 2.0)
 
     def test_buffer_holds_so_many_datagrams(self) -> None:
-        """A machine that stands still for long keeps the first datagrams and drops the rest."""
+        """A frozen machine buffers the first ``MOST_WAITING`` datagrams and drops the rest."""
         machine = Machine(self.world)
         machine.freeze()
         for number in range(MOST_WAITING + 50):
@@ -107,7 +107,7 @@ class MachineTests(SynchronousTestCase):
         self.assertEqual((len(self.seen), self.seen[0]), (MOST_WAITING, b"0"))
 
     def test_dead_machine_does_nothing(self) -> None:
-        """Timers of a dead machine are never made, be it still or not."""
+        """Timers of a dead machine never run, even if the machine was frozen."""
         machine = Machine(self.world)
         machine.callLater(1.0, self.seen.append, "late")
         machine.freeze()
@@ -119,7 +119,7 @@ class MachineTests(SynchronousTestCase):
         self.assertEqual(self.seen, [])
 
     def test_calls_can_be_moved_and_taken_back_once(self) -> None:
-        """A call is moved in the machine's own seconds; what was called or cancelled cannot be moved."""
+        """A call is rescheduled in the machine's own seconds; a finished or cancelled call cannot be changed."""
         machine = Machine(self.world, 2.0)
         call = machine.callLater(2.0, self.seen.append, "moved")
         call.reset(6.0)

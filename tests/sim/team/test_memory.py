@@ -1,4 +1,4 @@
-"""Tests of what a team needs and what there is."""
+"""Tests of the memory estimate of a simulated team."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ def _machine(files: dict[str, str]) -> Callable[[str], str]:
 
 
 class MemoryTests(SynchronousTestCase):
-    """What is foreseen before a run begins."""
+    """The memory limit and the estimate are checked before a run."""
 
     def test_machine_and_groups_set_the_limit(self) -> None:
-        """The least of what the machine has and what each group leaves counts, of either sort; "max" is none."""
+        """The limit is the minimum of the free memory and of each cgroup, v1 or v2; ``max`` is no limit."""
         files = {"/proc/meminfo": MEMINFO}
         self.assertEqual(free(_machine(files)), 4_000_000 * 1024)
         files |= {
@@ -45,7 +45,7 @@ class MemoryTests(SynchronousTestCase):
         self.assertEqual(free(_machine({})), NO_LIMIT)
 
     def test_team_that_does_not_fit_is_refused(self) -> None:
-        """The refusal has what is needed, what there is, and how many nodes would fit; newcomers count, too."""
+        """The error names a number of nodes that fits; nodes that join during the run count as well."""
         files = {"/proc/meminfo": MEMINFO}
         check(Scenario(nodes=10_000), _machine(files))
         error = self.assertRaises(BadSetting, check, Scenario(nodes=20_000), _machine(files))
@@ -57,6 +57,6 @@ class MemoryTests(SynchronousTestCase):
         self.assertEqual(foreseen(crowd), BASE + 100 * KIB["entangled"] * 1024)
 
     def test_own_size_is_read(self) -> None:
-        """What the process has is told in bytes, or as 0 where the system does not tell."""
+        """The memory of the process is reported in bytes, or as 0 if the system does not report it."""
         self.assertEqual(resident(_machine({"/proc/self/status": "Name: x\nVmRSS:\t  100 kB\n"})), 102_400)
         self.assertEqual(resident(_machine({})), 0)

@@ -1,4 +1,4 @@
-"""Tests of runs: faults, sessions, and what comes of them."""
+"""Tests of simulated runs: faults, sessions and outcomes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class _Nothing:
 
 
 class _Steps(Workload):
-    """A workload that counts what is asked of it, and finds what it is told to find."""
+    """A workload that counts its steps and reports given violations."""
 
     found: tuple[str, ...] = ()
 
@@ -56,10 +56,10 @@ BASE = Scenario(nodes=6, seconds=10.0, join=JOIN, loads=(("steps", _Nothing()),)
 
 
 class RunTests(SynchronousTestCase):
-    """Behaviour of ``Run``, its faults and its sessions."""
+    """Tests of ``Run``, its faults and its sessions."""
 
     def told(self, scenario: Scenario, seed: int = 1) -> tuple[Run, list[tuple[float, str, int]]]:
-        """A run that was played to its end, and what was told from the moment when the team stood."""
+        """Run a scenario to its end; return the run and the events since the team was complete."""
         run = Run(scenario, seed, KINDS)
         told: list[tuple[float, str, int]] = []
         run.team.told.append(lambda now, event, place, more: told.append((now, event, place)))
@@ -68,7 +68,7 @@ class RunTests(SynchronousTestCase):
         return run, [(round(now - began, 6), event, place) for now, event, place in told if now >= began]
 
     def test_workloads_act_while_it_lasts(self) -> None:
-        """They step at the scenario's pace, are told when the repair is over, and their figures meet the targets."""
+        """Workloads step at the scenario's pace, learn the end of the repair, and are compared to the targets."""
         run = Run(replace(BASE, repair=5.0, targets=(("steps", Bound(19)),)), 1, KINDS)
         outcome = run.go()
         workload = run.workloads[0][1]
@@ -80,7 +80,7 @@ class RunTests(SynchronousTestCase):
         self.assertAlmostEqual(outcome.seconds, run.expected_end)
 
     def test_workloads_wait_for_their_lead(self) -> None:
-        """With a lead the workloads begin to act only then."""
+        """With a lead the workloads start after it."""
         run = Run(replace(BASE, lead=7.5), 1, KINDS)
         run.go()
         workload = run.workloads[0][1]
@@ -89,13 +89,13 @@ class RunTests(SynchronousTestCase):
         self.assertEqual(len(workload.steps), 5)
 
     def test_violations_and_unknown_targets_are_told(self) -> None:
-        """What a workload finds is in the outcome, and a target for which nothing was measured is a violation."""
+        """The outcome lists the violations of workloads; a target without a measurement is a violation as well."""
         scenario = replace(BASE, loads=(("finds", _Nothing()),), targets=(("stops", Bound(1)),))
         found = Run(scenario, 1, KINDS).go().violations
         self.assertEqual(found, ["targets: nothing measured 'stops'; there are steps", "E1: something is wrong"])
 
     def test_it_can_be_ended_at_any_moment(self) -> None:
-        """Ended while the team comes, or while it lasts, there is an outcome that says so."""
+        """A run that ends early, while nodes join or while it runs, has a partial outcome."""
         for end, phase in ((0.5, JOINING), (6.0, RUNNING)):
             run = Run(BASE, 1, KINDS, lambda run, end=end: run.team.clock.seconds() >= end)  # type: ignore[misc]
             outcome = run.go()
@@ -104,7 +104,7 @@ class RunTests(SynchronousTestCase):
             self.assertEqual(len(outcome.digest), 32)
 
     def test_slow_machine_is_watched_as_often(self) -> None:
-        """Where the machine is slow the grains get finer, so that a person is heard; what happens is the same."""
+        """On a slow machine steps get shorter, so ``watched`` stays responsive; the digest does not change."""
         watched: dict[bool, list[float]] = {False: [], True: []}
         digests = []
         for is_slow, seen in watched.items():
@@ -126,13 +126,13 @@ class RunTests(SynchronousTestCase):
         self.assertTrue(end.is_partial)
 
     def test_who_is_not_in_is_a_violation(self) -> None:
-        """A node that does not get in within the time for it is said to be outside."""
+        """A node that does not join within the time limit is a violation."""
         link = LinkSettings("none", loss=0.9)
         scenario = replace(BASE, link=link, join=replace(JOIN, within=1.0), seconds=0.0)
         self.assertIn("nodes have not joined", Run(scenario, 1, KINDS).go().violations[0])
 
     def test_exception_is_a_violation(self) -> None:
-        """A call that raises, or a failure that a node only logs, ends nothing; the verdict has it."""
+        """An exception in a call and a logged failure are violations, and do not end the run."""
         run = Run(BASE, 1, KINDS)
         run.team.at(3.0, lambda: 1 // 0)
         run.team.at(4.0, lambda: Logger().failure("a node's own", Failure(KeyError("x"))))
@@ -145,7 +145,7 @@ class RunTests(SynchronousTestCase):
         self.assertEqual(len(self.flushLoggedErrors(ZeroDivisionError, KeyError)), 2)
 
     def test_power_fails_and_comes_back(self) -> None:
-        """Half of them die at their time, one after the other, and start again as long after."""
+        """Half of the nodes crash one after another at the planned times, and each restarts after the outage."""
         crash = Fault("crash", 2.0, lasts=3.0, share=0.5, over=1.5)
         _, told = self.told(replace(BASE, faults=(crash,)))
         killed = [(at, place) for at, event, place in told if event == "killed"]
@@ -154,7 +154,7 @@ class RunTests(SynchronousTestCase):
         self.assertEqual(born, [(at + 3.0, place) for at, place in killed])
 
     def test_healing_brings_all_back(self) -> None:
-        """With time for repair every fault is taken back at the end: nobody is cut, still, full or away."""
+        """Before the repair every fault ends: no node is cut off, frozen or gone, and no disk is full."""
         faults = tuple(
             Fault(kind, 1.0, lasts=99.0, count=2, amount=1.1 if kind == "rate" else 0.0)
             for kind in ("crash", "leave", "freeze", "cut", "deaf", "mute", "clog", "rate", "full")
@@ -178,7 +178,7 @@ class RunTests(SynchronousTestCase):
         self.assertEqual(known, [9] * 10)
 
     def test_what_lasts_ends_at_its_time(self) -> None:
-        """A cut, bad weather, a fast clock, a full disk and a frozen node are there for their time, and no longer."""
+        """A cut, more loss, a fast clock, a full disk and a frozen node last for the time of the fault."""
         faults = tuple(
             Fault(kind, 2.0, lasts=3.0, places=(1,), amount=1.5 if kind == "rate" else -60.0 if kind == "step" else 0.0)
             for kind in ("cut", "freeze", "rate", "full", "step")
@@ -198,14 +198,14 @@ class RunTests(SynchronousTestCase):
         self.assertEqual({seen[at] for at in seen if 2.1 < at < 4.9}, {bad})
 
     def test_crowd_comes_and_goes(self) -> None:
-        """Newcomers come over the time that the fault says, at places of their own, and leave after theirs."""
+        """New nodes join over the time that the fault gives, at new places, and leave after their time."""
         run, told = self.told(replace(BASE, faults=(Fault("crowd", 1.0, lasts=4.0, count=4, over=2.0),)))
         self.assertEqual([(at, p) for at, event, p in told if event == "born"], [(1 + n / 2, 6 + n) for n in range(4)])
         self.assertEqual([(at, p) for at, event, p in told if event == "left"], [(5 + n / 2, 6 + n) for n in range(4)])
         self.assertEqual(run.team.alive(), list(range(6)))
 
     def test_sessions_end_and_others_begin(self) -> None:
-        """Nodes leave at the rate that follows from the mean, and come back after their breaks; some stay always."""
+        """Nodes leave at the rate that follows from the mean, and return after their breaks; two always stay."""
         sessions = Sessions("exponential", 10.0, 2.0)
         run, told = self.told(replace(BASE, nodes=12, seconds=60.0, sessions=sessions))
         ended = [event for _, event, _ in told if event == "killed"]
@@ -217,14 +217,14 @@ class RunTests(SynchronousTestCase):
         self.assertGreater(len([1 for _, event, _ in told if event == "born"]), 0.7 * len(ended))
 
     def test_sessions_may_bring_others(self) -> None:
-        """With ``same`` false a newcomer takes the place; some of those who go say goodbye."""
+        """With ``same`` false another node takes the place of a node that left."""
         run = Run(replace(BASE, seconds=40.0, sessions=Sessions("fixed", 15.0, 2.0, 0.5, same=False)), 1, KINDS)
         before = [run.team.identity(place) for place in range(6)]
         run.go()
         self.assertTrue(all(run.team.identity(place) != before[place] for place in range(6)))
 
     def test_same_seed_gives_the_same_hash(self) -> None:
-        """Two runs of one seed with faults and sessions are the same to the last datagram; another seed is not."""
+        """Two runs of a seed with faults and sessions have equal digests; another seed has another one."""
         scenario = replace(
             BASE,
             link=LinkSettings("wifi", loss=0.05, burst=0.05, duplicate=0.05, reorder=0.05),

@@ -111,10 +111,10 @@ def _read(text: str, **changes: object) -> Scenario:
 
 
 class ScenarioTests(SynchronousTestCase):
-    """What is in a file is what is played, and whatever is wrong is said before the first step."""
+    """A scenario file is read completely or rejected before the first step."""
 
     def test_file_means_what_it_says(self) -> None:
-        """Tables, faults in their order, workloads and targets are all there; what is left out has its default."""
+        """Tables, faults in order, workloads and targets are read; missing values have defaults."""
         scenario = _read(WHOLE)
         self.assertEqual((scenario.nodes, scenario.kind, scenario.join.size), (50, "swarm", 10))
         self.assertEqual([fault.kind for fault in scenario.faults], ["crash", "cut"])
@@ -124,14 +124,14 @@ class ScenarioTests(SynchronousTestCase):
         self.assertEqual(scenario.sessions.stays, None)
 
     def test_wrong_values_are_named_with_their_line(self) -> None:
-        """Each wrong or impossible value is refused with file, line, key and a remedy."""
+        """Each invalid value is rejected with file, line, key and a remedy."""
         for text, (line, key) in WRONG.items():
             error = self.assertRaises(BadSetting, _read, text)
             self.assertEqual((error.file, error.key), (f"bad.toml:{line}", key), text)
             self.assertTrue(error.problem and error.remedy, text)
 
     def test_any_file_is_a_scenario_or_is_refused(self) -> None:
-        """However a file is damaged, it is refused with a remedy or means something; nothing else is raised."""
+        """A damaged file is either valid or rejected with a remedy; no other exception is raised."""
         dice, refused = random.Random(1), 0
         values = ("-1", "nan", "inf", "true", "'x'", "[]", "{}", "[1, 'a']", "9" * 30, "[[1]]", "1979-05-27")
         for _ in range(600):
@@ -154,24 +154,24 @@ class ScenarioTests(SynchronousTestCase):
         self.assertGreater(refused, 300)
 
     def test_what_is_no_toml_says_where(self) -> None:
-        """A file that cannot be parsed is refused with the line that the parser names."""
+        """A file that is not TOML is rejected with the line that the parser names."""
         error = self.assertRaises(BadSetting, _read, "nodes = 5\nseconds = = 3")
         self.assertIn("line 2", str(error))
 
     def test_command_line_comes_before_the_file(self) -> None:
-        """``--nodes`` takes the place of what the file says, and is checked as that is."""
+        """``--nodes`` overrides the value of the file and is checked in the same way."""
         self.assertEqual(_read(WHOLE, nodes=70).nodes, 70)
         error = self.assertRaises(BadSetting, _read, WHOLE, nodes=0)
         self.assertEqual((error.file, error.key), ("command line", "--nodes"))
 
     def test_scenarios_that_ship_are_lawful(self) -> None:
-        """Each scenario of the folder can be played, and says what it is about."""
+        """Each scenario in the package is valid and has a description."""
         self.assertIn("steady", names())
         for name in names():
             self.assertTrue(loaded(name, {name: kind.settings for name, kind in KINDS.items()}).about, name)
 
     def test_example_of_the_document_is_lawful(self) -> None:
-        """The scenario that docs/how-to/simulate-teams.md shows can be played."""
+        """The scenario in docs/how-to/simulate-teams.md is valid."""
         document = (FOLDER.parent.parent / "docs" / "how-to" / "simulate-teams.md").read_text(encoding="utf-8")
         found = re.findall(r"```toml\n(.*?)```", document, re.DOTALL)
         self.assertEqual(len(found), 1)
@@ -179,16 +179,16 @@ class ScenarioTests(SynchronousTestCase):
         self.assertEqual(len(scenario_of(found[0], "docs/how-to/simulate-teams.md", "example", sorts).faults), 1)
 
     def test_unknown_names_are_refused_with_the_nearest(self) -> None:
-        """A scenario that is not there is refused, and so is a file that cannot be read."""
+        """An unknown name is rejected with the nearest name, and an unreadable file is rejected."""
         self.assertIn("steady", self.assertRaises(BadSetting, loaded, "stedy", {}).remedy)
         self.assertIn("cannot be read", self.assertRaises(BadSetting, loaded, "/nowhere/x.toml", {}).problem)
 
 
 class SessionTests(SynchronousTestCase):
-    """Behaviour of ``Session``."""
+    """Tests of ``Session``."""
 
     def test_half_of_them_are_shorter_than_the_median(self) -> None:
-        """Drawn durations have the median and the mean that they should have."""
+        """Random durations have the expected median and mean."""
         for kind in session.KINDS:
             stays, rng = session.Session(kind, 60.0), random.Random(1)
             drawn = [stays.drawn(rng) for _ in range(40_000)]
@@ -196,7 +196,7 @@ class SessionTests(SynchronousTestCase):
             self.assertApproximates(fmean(drawn) / stays.mean, 1.0, 0.06, kind)
 
     def test_rate_of_leaving_is_the_same_from_the_start(self) -> None:
-        """Of many sessions met under way, as many end in the first seconds as in any others: n / mean a second."""
+        """Sessions that are already under way end at a constant rate from the start: n / mean per second."""
         for kind in session.KINDS:
             stays, rng = session.Session(kind, 60.0), random.Random(2)
             ends = []

@@ -1,4 +1,4 @@
-"""Shrinking, over runs that are nothing but rules of what fails."""
+"""Tests of shrinking, with rules instead of runs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from sim.team.shrink import WHOLE, Trim, fewest, shrunk
 
 class FewestTests(SynchronousTestCase):
     def test_those_that_are_needed(self) -> None:
-        """Of many faults exactly those are left which it takes, wherever they stand, in few tries."""
+        """``fewest`` finds exactly the faults that the failure needs, in fewer than 60 tries."""
         rng = random.Random(1)
         for _ in range(50):
             needed = set(rng.sample(range(16), rng.randrange(4)))
@@ -27,7 +27,7 @@ class FewestTests(SynchronousTestCase):
             self.assertLess(next(tries), 60)
 
     def test_none_can_be_dropped(self) -> None:
-        """Where several sets fail, what is left fails, and does not without any one of its faults."""
+        """If several sets of faults fail, the result fails, and no fault of it can be removed."""
 
         def fails(kept: tuple[int, ...]) -> bool:
             return {1, 2} <= set(kept) or {5, 6, 7} <= set(kept)
@@ -39,7 +39,7 @@ class FewestTests(SynchronousTestCase):
 
 class ShrunkTests(SynchronousTestCase):
     def test_all_that_can_go_goes(self) -> None:
-        """Faults, weather, workloads and seconds that a failure does not need are taken away."""
+        """Faults, link impairments, workloads and seconds that the failure does not need are removed."""
 
         def fails(trim: Trim) -> bool:
             is_long = trim.within(20.0) >= 5.0
@@ -49,13 +49,13 @@ class ShrunkTests(SynchronousTestCase):
         self.assertEqual(found, Trim((3,), True, ("records",), 5.0))
 
     def test_what_is_needed_stays(self) -> None:
-        """A failure that needs all of it is left as it is."""
+        """A failure that needs everything is not shrunk."""
         whole = Trim((0, 1), False, ("records", "wire"))
         self.assertEqual(shrunk(WHOLE, 2, ["records", "wire"], 20.0, lambda trim: trim == WHOLE).keep, (0, 1))
         self.assertEqual(shrunk(whole, 2, ["records", "wire"], 20.0, lambda trim: trim == whole), whole)
 
     def test_no_more_time(self) -> None:
-        """When there is no more time to try, what failed last is what is left."""
+        """When the time for tries is over, the last failing trim is the result."""
         tries = iter([False, True])
         found = shrunk(WHOLE, 4, ["records"], 20.0, lambda trim: next(tries, False))
         self.assertEqual(found, Trim((2, 3)))

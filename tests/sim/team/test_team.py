@@ -1,4 +1,4 @@
-"""Tests of teams: places, lives, and what is told of them."""
+"""Tests of simulated teams: places, restarts and events."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ QUICK = Join(pause=0.2, settle=2.0)
 
 
 class TeamTests(SynchronousTestCase):
-    """Behaviour of ``Team``."""
+    """Tests of ``Team``."""
 
     def setUp(self) -> None:
-        """No team yet."""
+        """Create an empty list of teams."""
         self.teams: list[Team] = []
 
     def tearDown(self) -> None:
-        """End them."""
+        """Stop all teams."""
         for team in self.teams:
             team.stop()
 
     def team(self, scenario: Scenario, seed: int = 1) -> Team:
-        """A team that stands, and ends with the test."""
+        """Start a team that stops with the test."""
         team = Team(scenario, seed)
         self.teams.append(team)
         team.stand()
         return team
 
     def test_all_come_in_whatever_the_way(self) -> None:
-        """One by one, in batches and all at once: everybody is in, and knows everybody in a small team."""
+        """Nodes join one by one, in batches and all at once; in a small team each then knows all others."""
         for join in (QUICK, Join("batches", 0.5, 3, settle=3.0), Join("at once", 0.5, settle=5.0)):
             team = self.team(Scenario(nodes=8, join=join))
             self.assertEqual((team.alive(), sorted(team.inside())), (list(range(8)),) * 2, join.how)
@@ -42,7 +42,7 @@ class TeamTests(SynchronousTestCase):
             self.assertEqual(known, [7] * 8, join.how)
 
     def test_batches_come_in_their_size(self) -> None:
-        """The first node comes alone, then so many at a time, ``pause`` apart."""
+        """The first node starts alone, then one batch after each ``pause``."""
         team = Team(Scenario(nodes=6, join=Join("batches", 1.0, 2)), 1)
         self.teams.append(team)
         born: list[tuple[float, int]] = []
@@ -52,7 +52,7 @@ class TeamTests(SynchronousTestCase):
         self.assertEqual(born, [(0.0, 0), (1.0, 1), (1.0, 2), (2.0, 3), (2.0, 4), (3.0, 5)])
 
     def test_next_life_is_the_same_node_on_its_disk(self) -> None:
-        """Who restarts keeps identity and store, rolls other dice, and is told to those who attend."""
+        """A restarted node keeps its identity and its store, and listeners learn of its end and its start."""
         team = self.team(Scenario(nodes=4, join=QUICK))
         lives: list[tuple[str, int]] = []
         team.attend(
@@ -78,7 +78,7 @@ class TeamTests(SynchronousTestCase):
         self.assertEqual(team.entangled(2).identity, former.identity)
 
     def test_another_node_may_take_the_place(self) -> None:
-        """Who is replaced has another identity and nothing in its store."""
+        """A replaced node has another identity and an empty store."""
         team = self.team(Scenario(nodes=4, join=QUICK))
         former = team.identity(3)
         team.leave(3)
@@ -94,7 +94,7 @@ class TeamTests(SynchronousTestCase):
         self.assertRaises(ValueError, team.replace, 3)
 
     def test_who_ends_before_it_is_in_says_so(self) -> None:
-        """``entered`` gives False for a node that dies first, or that is not there."""
+        """``entered`` gives False for a node that ends before it has joined, and for a node that is not running."""
         team = self.team(Scenario(nodes=3, join=QUICK))
         place = team.add()
         waiting = team.entered(place)
@@ -105,7 +105,7 @@ class TeamTests(SynchronousTestCase):
         self.assertEqual(list(team.places), [0, 1, 2, 3])
 
     def test_still_node_is_lost_and_comes_back(self) -> None:
-        """The others lose a node that stands still, and have it back after the thaw, in the same life."""
+        """A frozen node leaves the routing tables, and returns after the thaw without a restart."""
         team = self.team(Scenario(nodes=4, join=QUICK, clocks=Clocks(drift=0.001)))
         node = team.node(1)
         key = team.identity(1).node_id
@@ -118,12 +118,12 @@ class TeamTests(SynchronousTestCase):
         self.assertIs(team.node(1), node)
 
     def test_freezing_needs_machines(self) -> None:
-        """Where the scenario gives nodes no machines, a freeze is refused with what to write."""
+        """In a scenario without simulated machines a freeze is rejected with the missing setting."""
         team = self.team(Scenario(nodes=3, join=QUICK))
         self.assertIn("drift", str(self.assertRaises(ValueError, team.freeze, 1)))
 
     def test_traffic_is_counted_by_place_over_all_lives(self) -> None:
-        """What places send adds up to what the board carried, former lives included."""
+        """The traffic of all places, earlier runs of a node included, adds up to the traffic of the switchboard."""
         team = self.team(Scenario(nodes=5, join=QUICK, link=LinkSettings("none")))
         team.kill(4)
         team.start(4)
@@ -134,7 +134,7 @@ class TeamTests(SynchronousTestCase):
         self.assertGreater(team.traffic(4).received_bytes, 0)
 
     def test_swarm_nodes_are_there_as_devices(self) -> None:
-        """A team of whole nodes sees each other as devices, by name."""
+        """The nodes of a team of swarm nodes see each other as devices."""
         team = self.team(Scenario(nodes=3, kind="swarm", join=QUICK))
         node = team.node(1)
         assert isinstance(node, SwarmNode)
@@ -144,14 +144,14 @@ class TeamTests(SynchronousTestCase):
         self.assertEqual(seen[-1], 3)
 
     def test_nodes_behind_routers_come_in(self) -> None:
-        """Some sit behind routers, never the first ones, and are in the network all the same."""
+        """Some nodes, never the first two, are behind a NAT, and join the network nevertheless."""
         team = self.team(Scenario(nodes=6, join=QUICK, nat=Nats(0.5, ("port",))))
         behind = [place for place in team.places if team.place(place).home is not None]
         self.assertTrue(behind and not {0, 1} & set(behind))
         self.assertEqual(sorted(team.inside()), list(range(6)))
 
     def test_everything_follows_from_the_seed(self) -> None:
-        """The same scenario and seed give the same digest, another seed another one."""
+        """The same scenario and seed give the same digest; another seed gives another one."""
         scenario = Scenario(nodes=6, join=Join("at once", 0.1, settle=3.0), link=LinkSettings("wifi", loss=0.1))
         first, second, other = (self.team(scenario, seed).digest() for seed in (7, 7, 8))
         self.assertEqual(first, second)

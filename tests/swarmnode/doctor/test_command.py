@@ -1,4 +1,4 @@
-"""Tests of ``swarm doctor``: what it asks, prints and returns."""
+"""Tests of ``swarm doctor``: its requests, output and exit codes."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ LINKS = [
 
 
 class CommandTests(SynchronousTestCase):
-    """Behaviour of the command."""
+    """Tests of the command."""
 
     def setUp(self) -> None:
         self.folder = Path(self.mktemp()).absolute()
@@ -50,27 +50,27 @@ class CommandTests(SynchronousTestCase):
         self.measured: list[tuple[str, bool, Health | None]] = []
 
     def runs(self, name: str) -> None:
-        """Have a node of that name run here."""
+        """Create the control socket's file for a running node of that name."""
         (self.folder / FOLDER / f"{name}{ENDING}").touch()
 
     def ask(self, path: Path, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
-        """What the node answers."""
+        """Answer in place of the node."""
         yield {"answer": self.health if request["verb"] == "health" else LINKS}
 
     def measure(self, settings: Settings, is_running: bool, health: Health | None) -> Facts:
-        """The facts."""
+        """Return the prepared facts."""
         self.measured.append((settings.node.name, is_running, health))
         return replace(self.facts, health=health, is_running=is_running)
 
     def run_it(self, *words: str) -> tuple[int, str, str]:
-        """The exit code, what was printed, and the complaint."""
+        """Run the command; return exit code, standard output and standard error."""
         out, errors = io.StringIO(), io.StringIO()
         with contextlib.redirect_stderr(errors):
             code = main(words, out, self.ask, self.measure)
         return code, out.getvalue(), errors.getvalue()
 
     def test_exit_code(self) -> None:
-        """Where nothing is wrong it says so, with code 0; a finding has its reason and remedy, with code 1."""
+        """Without findings the exit code is 0; with a finding the reason and the remedy are printed and it is 1."""
         code, printed, _ = self.run_it(str(self.settings))
         self.assertEqual((code, printed), (0, "no problem found; run it again while the node runs\n"))
         self.assertEqual(self.measured, [("dog1", False, None)])
@@ -81,7 +81,7 @@ class CommandTests(SynchronousTestCase):
             self.assertIn(part, printed)
 
     def test_running_node_is_asked(self) -> None:
-        """The node of the settings is asked where it runs, and each of its links is scored."""
+        """A running node of the settings is queried over its control socket, and each of its links gets a score."""
         self.runs("dog1")
         code, printed, _ = self.run_it(str(self.settings))
         self.assertEqual((code, self.measured[0][1]), (0, True))
@@ -89,7 +89,7 @@ class CommandTests(SynchronousTestCase):
         self.assertIn("~ef:1    0/100  does not reply\n", printed)
 
     def test_running_node_without_settings(self) -> None:
-        """Without settings the only running node is asked; what it met is named."""
+        """Without settings the only running node is queried, and its recorded refusals are findings."""
         self.runs("dog1")
         self.health = {**HEALTH, "address": "127.0.0.1:8484", "refusals": [["revoked", "192.168.1.9:8484"]]}
         code, printed, _ = self.run_it()
@@ -97,7 +97,7 @@ class CommandTests(SynchronousTestCase):
         self.assertIn("certificate-revoked", printed)
 
     def test_json(self) -> None:
-        """With --json it is one line that a program reads, findings and links alike."""
+        """With --json findings and links are printed as one line of JSON."""
         self.runs("dog1")
         self.facts = replace(WELL, open_files=(("dog1.toml", 0o644),))
         code, printed, _ = self.run_it("--json", str(self.settings))
@@ -107,7 +107,7 @@ class CommandTests(SynchronousTestCase):
         self.assertEqual([each["score"] for each in read["links"]], [100, 0])
 
     def test_refusals(self) -> None:
-        """Neither settings nor a running node, and settings that a node would refuse, are one line and code 2."""
+        """Missing settings without a running node, and invalid settings, are rejected in one line with code 2."""
         code, _, complaint = self.run_it()
         self.assertEqual(code, 2)
         self.assertIn("swarm doctor SETTINGS", complaint)

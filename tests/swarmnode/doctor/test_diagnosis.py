@@ -1,4 +1,4 @@
-"""Tests of what the doctor makes of the facts."""
+"""Tests of the diagnosis that follows from measured facts."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ Case = tuple[dict[str, Any], str, str]
 
 
 def seen_at(*ports: int) -> dict[str, Any]:
-    """Known nodes that see this machine at these ports of a router."""
+    """Return the facts of known nodes that see this machine at these ports of a router."""
     probes = [
         Probe(at, Answer(at, seen=Address("198.51.100.1", port)), is_member=True)
         for at, port in zip((FAR, Address("203.0.113.6", 8484)), ports, strict=False)
@@ -54,10 +54,10 @@ def seen_at(*ports: int) -> dict[str, Any]:
 
 
 class DiagnosisTests(SynchronousTestCase):
-    """Each cause is named, with its reason and remedy, and a healthy node has none."""
+    """Each cause is found with reason and remedy, and a healthy node has no finding."""
 
     def check(self, *cases: Case) -> None:
-        """Each case has one finding."""
+        """Check that each case has exactly one finding."""
         for changes, cause, words in cases:
             found = diagnosed(replace(WELL, **changes))
             self.assertEqual([f"{finding.weight} {finding.cause}" for finding in found], [cause], changes)
@@ -65,12 +65,12 @@ class DiagnosisTests(SynchronousTestCase):
             self.assertIn(words, f"{found[0].what} {found[0].why} {found[0].remedy}")
 
     def check_well(self, *cases: dict[str, Any]) -> None:
-        """No case has a finding."""
+        """Check that no case has a finding."""
         for changes in cases:
             self.assertEqual(diagnosed(replace(WELL, **changes)), [], changes)
 
     def test_way(self) -> None:
-        """What lies between a node and those that it knows is named: firewall, isolation, a wrong address."""
+        """Problems on the path to known nodes are found: firewalls, client isolation, wrong addresses."""
         blocked = {"known": (replace(SILENT, is_tcp=True),), "lan": None}
         guarded = replace(SILENT_NEAR, is_resolved=True)
         unplugged = (LO, WLAN, replace(CABLE, is_running=False))
@@ -99,12 +99,12 @@ class DiagnosisTests(SynchronousTestCase):
             (alone, "error no-bootstrap", "203.0.113.5:8484"),
             ({"known": (), "lan": CALLED}, "warning no-bootstrap", "known_nodes is empty"),
         )
-        # One that answers over UDP clears the network, and a node that runs and has contacts is not alone.
+        # A reply over UDP shows that UDP is not blocked, and a running node with contacts is not alone.
         other = Probe(Address("203.0.113.6", 1), is_tcp=True)
         self.check_well({}, {"known": (OUTSIDE, other)}, {**alone, "health": Health(2), "is_running": True})
 
     def test_multicast(self) -> None:
-        """What keeps calls from the LAN is told apart: the network, or this machine; its own answer proves nothing."""
+        """Multicast blocked by the network differs from multicast blocked by this machine; own replies do not count."""
         own = Lan((Answer(Address("192.168.1.7", 8485), offset=0.0),), True, True)
         self.check(
             ({"lan": CALLED}, "warning multicast-blocked", "This network does not forward multicast"),
@@ -114,7 +114,7 @@ class DiagnosisTests(SynchronousTestCase):
         )
 
     def test_kind_of_router(self) -> None:
-        """One port seen by all is a friendly router, another port for each a symmetric one, one witness too few."""
+        """Equal external ports for all peers mean a cone NAT, different ones a symmetric NAT; one peer is too few."""
         self.check(
             (seen_at(5000, 5000), "note nat-cone", ""),
             (seen_at(5000, 6000), "warning nat-symmetric", "198.51.100.1:6000"),
@@ -122,7 +122,7 @@ class DiagnosisTests(SynchronousTestCase):
         )
 
     def test_team(self) -> None:
-        """Another team, another version, and a certificate that does not hold are named, each by its own cause."""
+        """Another team, another version and an invalid certificate each have their own cause."""
         newer = Probe(FAR, Answer(FAR, version=VERSION + 1, offset=0.0))
         self.check(
             ({"known": (STRANGER,), "fingerprint": b"a" * 8, "lan": None}, "error wrong-team", "swarm join"),
@@ -133,13 +133,13 @@ class DiagnosisTests(SynchronousTestCase):
             ({"certificate": Certificate(WALL + DAY, WALL + 9 * DAY)}, "error certificate-early", ""),
             ({"certificate": Certificate(0.0, WALL + DAY)}, "warning certificate-ends", ""),
             ({"certificate": UNREADABLE}, "error certificate-unreadable", ""),
-            # Where the membership cannot be read nobody could be greeted, so nobody is a stranger for that.
+            # If the membership cannot be read, no node can be verified, so unknown fingerprints are not a finding.
             ({"known": (STRANGER,), "lan": None, "certificate": UNREADABLE}, "error certificate-unreadable", ""),
         )
         self.check_well({"certificate": Certificate(WALL - DAY, WALL + 30 * DAY)})
 
     def test_refusals_that_the_running_node_met(self) -> None:
-        """What peers said when they did not let the node in is told with the remedy of each."""
+        """Each reason for which peers refused the node has a finding with a remedy."""
         causes = {
             "revoked": "certificate-revoked",
             "expired": "certificate-expired",
@@ -152,9 +152,9 @@ class DiagnosisTests(SynchronousTestCase):
             self.check(({"health": health}, f"error {cause}", "203.0.113.5:8484"))
 
     def test_clock(self) -> None:
-        """A clock that differs from the others' median is named; this machine's own nodes and one liar do not count.
+        """A clock that differs from the peers' median is found; own nodes and one wrong peer do not count.
 
-        A certificate that holds by the others' clocks is not called expired: the clock is what is wrong.
+        A certificate that is valid by the peers' clocks is not reported as expired, because the local clock is wrong.
         """
 
         def offset(*seconds: float) -> dict[str, Any]:
@@ -172,7 +172,7 @@ class DiagnosisTests(SynchronousTestCase):
         self.check_well(offset(0.0, 1e9, 1.0))
 
     def test_machine(self) -> None:
-        """A port that another program holds, a store without room, and secrets that others can read are named."""
+        """A port in use, a store without space, and secrets that other users can read are found."""
         taken = {"port_problem": "Another program listens at 192.168.1.7:8484."}
         self.check(
             (taken, "error port-in-use", "8484"),
@@ -186,7 +186,7 @@ class DiagnosisTests(SynchronousTestCase):
         self.check_well({**taken, "is_running": True})
 
     def test_the_gravest_comes_first(self) -> None:
-        """Errors come before warnings, and those before notes."""
+        """Errors come before warnings, and warnings before notes."""
         changes = {**seen_at(5), "lan": Lan((), True, False), "open_files": (("a", 0o644),)}
         found = diagnosed(replace(WELL, **changes))
         self.assertEqual([finding.weight for finding in found], ["error", "warning", "note"])

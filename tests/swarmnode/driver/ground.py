@@ -1,4 +1,4 @@
-"""A ground in memory: a turned clock, an emulated robot, a terminal whose keys a test writes down in advance."""
+"""An environment for ``swarm driver`` in memory: virtual time, an emulated robot and scripted keys."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PATIENCE_S = 60.0
 
 
 class ScriptedTerminal:
-    """Presses ``keys``, each at its second after the start; keeps what it was told."""
+    """A terminal that presses ``keys``, each at its time after the start, and records the output."""
 
     def __init__(self, clock: Clock, keys: Sequence[tuple[float, str]]) -> None:
         self.lines: list[tuple[float, str]] = []
@@ -42,7 +42,7 @@ class ScriptedTerminal:
 
 
 class MemoryGround:
-    """``pass_time`` is called at each step, for a body that moves."""
+    """An environment in memory; ``pass_time`` is called at each step, for a robot that moves."""
 
     def __init__(self, clock: Clock, connector: Any, pass_time: Callable[[float], None] = lambda _: None) -> None:
         self.clock = clock
@@ -61,7 +61,7 @@ class MemoryGround:
         return self.terminals[-1]
 
     def run(self, work: Callable[[], Deferred[Any]], end: Callable[[], Any]) -> Any:
-        """Turn the clock until ``work`` has fired."""
+        """Advance the clock until ``work`` has fired."""
         told: list[Any] = []
         work().addBoth(told.append)
         for _ in range(round(PATIENCE_S / STEP_S)):
@@ -79,7 +79,7 @@ class MemoryGround:
         return told[0]
 
     def swarm_driver(self, line: str) -> tuple[int, str, str]:
-        """What ``swarm driver LINE`` returns, prints, and complains of."""
+        """Run ``swarm driver LINE``; return exit code, standard output and standard error."""
         output, complaint = io.StringIO(), io.StringIO()
         with contextlib.redirect_stderr(complaint):
             code = main(line.split(), output, self)

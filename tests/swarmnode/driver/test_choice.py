@@ -1,4 +1,4 @@
-"""Tests of what ``swarm driver`` is told and finds: options, candidates, units, the catalogue, problems of links."""
+"""Tests of the inputs of ``swarm driver``: options, serial devices, units, the catalogue and link problems."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from swarmnode.driver.sheet import shown
 
 class OptionTests(SynchronousTestCase):
     def test_words_become_options(self) -> None:
-        """A value is TOML where it can be read so, else the text as it stands; dots make tables."""
+        """A value is parsed as TOML if possible, otherwise it is text; dots create tables."""
         words = ["host=192.168.0.51", "port=7400", "camera=false", "speed=[0.1, 0.2]", "ports.walk=1", "ports.head=2"]
         self.assertEqual(
             options_of([*words, "name=a=b", "when=2020-01-01", "empty="]),
@@ -34,14 +34,14 @@ class OptionTests(SynchronousTestCase):
         )
 
     def test_other_words_are_refused(self) -> None:
-        """What is no KEY=VALUE, and a key that is both a value and a table, is named."""
+        """A word that is not KEY=VALUE, and a key that is both a value and a table, are rejected."""
         for words in (["host"], ["=1"], ["a..b=1"], ["ports=1", "ports.walk=2"]):
             self.assertIn("--option", str(self.assertRaises(UsageError, options_of, words)))
 
 
 class CandidateTests(SynchronousTestCase):
     def test_serial_devices_are_shown(self) -> None:
-        """Each device comes with what its plug says, the next command, and the remedy where it is not allowed."""
+        """Each serial device is listed with its description, the next command, and the remedy if access is denied."""
         found = candidates(lambda: [("/dev/ttyUSB1", "FTDI"), ("/dev/ttyUSB0", "")], lambda device: "1" in device)
         self.assertEqual(found, [Candidate("/dev/ttyUSB0", "", False), Candidate("/dev/ttyUSB1", "FTDI", True)])
         told = "\n".join(candidate_lines(found))
@@ -49,13 +49,13 @@ class CandidateTests(SynchronousTestCase):
         self.assertEqual(told.count("no permission"), 1)
 
     def test_nothing_is_said_as_well(self) -> None:
-        """Where there is no device the network is not searched, and how to name a robot in it is said."""
+        """Without serial devices the output says that a robot in the network must be named."""
         self.assertIn("has to be named", "\n".join(candidate_lines([])))
 
 
 class UnitTests(SynchronousTestCase):
     def test_readings_have_their_units(self) -> None:
-        """SI units by the key; angles in degrees as well; nothing in range is said in words."""
+        """Values have SI units by their key, angles also degrees, and NaN is described in words."""
         for key, value, told in (
             ("base.vx", 0.1, "0.100 m/s"),
             ("base.wz", -0.5, "-0.500 rad/s"),
@@ -76,14 +76,14 @@ class UnitTests(SynchronousTestCase):
 
 class CatalogueTests(SynchronousTestCase):
     def test_says_what_is_missing(self) -> None:
-        """A kind whose library is not there tells what installs it; the others tell nothing of the kind."""
+        """A kind with a missing library names the package to install; other kinds are ready."""
         bare = {entry.kind: entry for entry in catalogue(lambda library: False)}
         self.assertIn("pip install 'swarm-node[serial]'", bare["create2"].needs)
         self.assertEqual((bare["create2"].is_ready, bare["aibo"].is_ready), (False, True))
         self.assertTrue(all(entry.is_ready for entry in catalogue(lambda library: True)))
 
     def test_names_the_broken_kinds_of_others(self) -> None:
-        """A driver of another distribution is listed by its docstring; one that cannot be imported as broken."""
+        """A driver of another distribution is listed with its docstring; one that cannot be imported is broken."""
         folder = Path(self.mktemp()).resolve()
         (folder / "odd-1.dist-info").mkdir(parents=True)
         (folder / "odd-1.dist-info" / "METADATA").write_text("Name: odd\nVersion: 1\n")
@@ -102,7 +102,7 @@ class CatalogueTests(SynchronousTestCase):
 
 class WitnessTests(SynchronousTestCase):
     def test_remembers_what_is_wrong_with_each_line(self) -> None:
-        """Serial devices and addresses go to their connectors; a line's problem is told while it lasts."""
+        """Serial devices and addresses use different connectors, and a link's problem is reported while it lasts."""
         line = SimpleNamespace(problem="it is off")
         tcp = SimpleNamespace(call=lambda host, port, caller: line)
         cable = SimpleNamespace()
@@ -115,7 +115,7 @@ class WitnessTests(SynchronousTestCase):
         self.assertEqual(connector.problems(), [])
 
     def test_knows_a_serial_device_by_its_name(self) -> None:
-        """Any path is a serial device, as the yard's or a link of one's own, and a host that begins like one is not."""
+        """Every path is a serial device, links included; a host name that begins like one is not."""
         tcp = SimpleNamespace(call=lambda host, port, caller: "tcp")
         serial = SimpleNamespace(call=lambda host, port, caller: "serial")
         connector = WitnessedConnector(tcp, serial)
@@ -125,7 +125,7 @@ class WitnessTests(SynchronousTestCase):
             self.assertEqual(connector.call(name, 10020, None), "tcp", name)
 
     def test_keeps_one_line_to_each_place(self) -> None:
-        """A robot that is asked by a connection for each request does not fill the memory with them."""
+        """A robot that is queried with one connection per request does not fill the memory."""
         tcp = SimpleNamespace(call=lambda host, port, caller: SimpleNamespace(problem=caller))
         connector = WitnessedConnector(tcp, None)
         for number in range(1000):
@@ -134,7 +134,7 @@ class WitnessTests(SynchronousTestCase):
         self.assertEqual(connector.problems(), ["dog1:80: problem 999"])
 
     def test_hears_the_warnings_of_drivers(self) -> None:
-        """What drivers warn of is heard once; what others say, and what is no warning, is not."""
+        """Each warning of a driver is recorded once; messages of other modules and of lower levels are not."""
         ear = Ear()
         for namespace in ("drivers.aibo.driver", "drivers.aibo.driver", "middleware.node"):
             Logger(namespace).warn("{robot}: it\nis off", robot=namespace[:7])
@@ -144,7 +144,7 @@ class WitnessTests(SynchronousTestCase):
         self.assertEqual(ear.heard, ["drivers: it is off"])
 
     def test_tcp_line_says_why_there_is_no_link(self) -> None:
-        """A refused call, a time-out and the like are told with their remedy, until there is a link."""
+        """A refused connection, a timeout and similar errors are reported with a remedy until the link is up."""
         connected: list[object] = []
 
         class Reactor(Clock):

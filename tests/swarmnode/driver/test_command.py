@@ -1,4 +1,4 @@
-"""Tests of ``swarm driver`` on an emulated AIBO in memory: list, info, probe, drive, monitor."""
+"""Tests of ``swarm driver`` with an emulated Aibo in memory: list, info, probe, drive, monitor."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ BLIND = f"{ROBOT} --option camera=false"
 
 class DriverCommandTests(SynchronousTestCase):
     def setUp(self) -> None:
-        """A dog on a clock that is turned by hand."""
+        """Start an emulated Aibo in virtual time."""
         self.clock = Clock()
         self.body = MemoryBody(jpeg=JPEG, values={"power.level": 0.8, "range.near": 0.25})
         self.dog = AiboEmulator(self.clock, self.body, random.Random(1))
@@ -38,7 +38,7 @@ class DriverCommandTests(SynchronousTestCase):
         self.ground = MemoryGround(self.clock, self.connector, self.pass_time)
 
     def tearDown(self) -> None:
-        """Whatever the command did, the robot stands, has its motors off, and nothing is left on the clock."""
+        """After each command the robot stands with disabled motors, and no timer is left."""
         for _ in range(100):
             self.clock.advance(0.01)
         self.assertEqual((self.body.motion, self.dog.is_engaged), ((0.0, 0.0, 0.0), True))
@@ -51,11 +51,11 @@ class DriverCommandTests(SynchronousTestCase):
         self.speeds.append((round(self.clock.seconds(), 3), *self.body.motion[::2]))
 
     def moving(self, began: float, ended: float) -> list[float]:
-        """How fast it went forward between two moments."""
+        """Return the forward speeds between two times."""
         return [vx for at, vx, _ in self.speeds if began <= at <= ended]
 
     def test_list_names_every_kind(self) -> None:
-        """Every kind is listed in a line, and in JSON; nothing is imported of what is not there."""
+        """Every kind is listed, in text and in JSON."""
         code, output, _ = self.ground.swarm_driver("list")
         self.assertEqual(code, 0)
         told = {line.split()[0] for line in output.splitlines() if not line.startswith(" ")}
@@ -64,7 +64,7 @@ class DriverCommandTests(SynchronousTestCase):
         self.assertEqual([entry["kind"] for entry in entries], kinds())
 
     def test_info_describes_before_connecting(self) -> None:
-        """Limits with their units, skills and rates are told without a robot, by kind or by a node's settings."""
+        """Limits with units, skills and rates are printed without a robot, by kind or from a node's settings."""
         code, output, _ = self.ground.swarm_driver("info aibo")
         self.assertEqual(code, 0)
         self.assertRegex(output, r"base\.vx +-0\.156 to \+0\.16 m/s")
@@ -81,7 +81,7 @@ class DriverCommandTests(SynchronousTestCase):
         self.assertIn("compass", told["capabilities"])
 
     def test_probe_says_what_came(self) -> None:
-        """After some seconds: when the first observation came, the rate, the dialect, the battery, no bad frames."""
+        """A probe reports the time to the first observation, rate, dialect, battery and bad frames."""
         code, output, complaint = self.ground.swarm_driver(f"probe {ROBOT}")
         self.assertEqual((code, complaint), (0, ""))
         self.assertRegex(output, r"first observation after 0\.\d\d s")
@@ -94,7 +94,7 @@ class DriverCommandTests(SynchronousTestCase):
         self.assertEqual((finding["is_there"], finding["readings"]["mode"]), (True, "T4"))
 
     def test_probe_names_what_is_wrong(self) -> None:
-        """A robot that is off is given up with what its link says, or what its driver does, and exit code 1."""
+        """A probe of a robot that is off ends with exit code 1 and the problem of the link or the driver."""
         self.connector.is_open = False
         self.ground.problems = ["dog1:10020: it does not answer; is it switched on?"]
         code, output, _ = self.ground.swarm_driver(f"probe {BLIND}")
@@ -106,20 +106,20 @@ class DriverCommandTests(SynchronousTestCase):
         self.assertIn("its main server at dog1:10020 does not answer; is it on, and does no other client", output)
 
     def test_probe_sees_a_slow_and_spoilt_robot(self) -> None:
-        """Lost world states and a camera without pictures are said."""
+        """A probe reports that world states are lost."""
         self.dog.faults.drop = 0.5
         _, output, _ = self.ground.swarm_driver(f"probe {BLIND}")
         self.assertIn("! it is slow", output)
 
     def test_probe_is_interrupted_in_order(self) -> None:
-        """Ctrl-C ends a probe with what came so far."""
+        """Ctrl-C ends a probe with the results so far."""
         self.ground.interrupted_at = 1.0
         code, output, _ = self.ground.swarm_driver(f"probe {BLIND} --seconds 30")
         self.assertEqual((code, self.clock.seconds() < 1.5), (0, True))
         self.assertIn("first observation", output)
 
     def test_drive_by_keys(self) -> None:
-        """A held key moves the robot at 30 % of its speed; let go, it stands 0.4 s later; x ends with motors off."""
+        """A held key moves the robot at 30 % speed; after its release the robot stops within 0.4 s; x ends."""
         held = [(1.0 + 0.1 * n, "w") for n in range(10)]
         self.ground.keys = [*held, (3.0, "a"), (3.1, "w"), (4.0, "+"), (4.1, "s"), (4.2, " "), (5.0, "x")]
         code, _, complaint = self.ground.swarm_driver(f"drive {BLIND}")
@@ -139,7 +139,7 @@ class DriverCommandTests(SynchronousTestCase):
         self.assertTrue(any("near 0.25 m" in line for line in lines))
 
     def test_drive_ends_at_rest_however_it_ends(self) -> None:
-        """Keys that run out and Ctrl-C end the drive as x does: the robot stands, its motors are off."""
+        """The end of input and Ctrl-C end the drive like x does: the robot stands with disabled motors."""
         for ending in ([(1.2, "")], [(1.2, "\x04")], []):
             began = self.clock.seconds()
             self.ground.keys = [(1.0, "w"), *ending]
@@ -149,7 +149,7 @@ class DriverCommandTests(SynchronousTestCase):
             self.assertEqual((self.body.motion, self.dog.is_engaged), ((0.0, 0.0, 0.0), True))
 
     def test_drive_says_why_it_does_not_move(self) -> None:
-        """Motors that somebody switched off, an axis that is not there, and a lost link are on the line."""
+        """The status line shows that the motors were switched off at the robot, and m enables them again."""
         self.ground.keys = [(1.5, "w"), (2.0, "m"), (3.0, "w"), (4.0, "x")]
         self.clock.callLater(1.0, self.dog.press)
         self.ground.swarm_driver(f"drive {BLIND}")
@@ -159,7 +159,7 @@ class DriverCommandTests(SynchronousTestCase):
         self.assertTrue(any(self.moving(3.05, 3.3)))
 
     def test_drive_is_refused_by_name(self) -> None:
-        """No terminal, a robot that does not move, no robot, two robots: each is one line, with exit code 2."""
+        """A missing terminal, an immobile robot, no robot and two robots are rejected in one line with code 2."""
         for words, told in (
             (["drive", *BLIND.split()], "is not a terminal"),
             (["drive", "--kind", "camera"], "a robot of kind camera does not move"),
@@ -178,14 +178,14 @@ class DriverCommandTests(SynchronousTestCase):
                 self.assertEqual(complaint.count("\n"), 1)
 
     def complaint(self, words: list[str]) -> str:
-        """What a command that is wrong says."""
+        """Run an invalid command and return its error message."""
         said = io.StringIO()
         with contextlib.redirect_stderr(said):
             self.assertEqual(main(words, io.StringIO()), 2)
         return said.getvalue()
 
     def test_monitor_shows_and_saves(self) -> None:
-        """Readings with their units each second; the newest picture is whole in its file."""
+        """Readings with units are printed each second, and the newest picture is saved completely."""
         picture = Path(self.mktemp())
         code, output, _ = self.ground.swarm_driver(f"monitor {ROBOT} --seconds 2 --picture {picture}")
         self.assertEqual((code, picture.read_bytes()), (0, JPEG))
@@ -197,7 +197,7 @@ class DriverCommandTests(SynchronousTestCase):
         self.assertIsNone(json.loads(lines[0])["values"]["range.far"])
 
     def test_monitor_says_what_it_lacks(self) -> None:
-        """No picture, a file that cannot be written, and a robot that is not there are said, with exit code 1."""
+        """A missing picture, an unwritable file and an unreachable robot are reported with exit code 1."""
         code, output, _ = self.ground.swarm_driver(f"monitor {BLIND} --seconds 1 --picture {self.mktemp()}")
         self.assertEqual((code, "! no picture received" in output), (1, True))
         code, output, _ = self.ground.swarm_driver(f"monitor {ROBOT} --seconds 5 --picture /no/such/folder/x.jpg")
@@ -207,7 +207,7 @@ class DriverCommandTests(SynchronousTestCase):
         self.assertEqual((code, "! no data within 8 s" in output), (1, True))
 
     def test_pilot_speaks_with_the_robots_own_token(self) -> None:
-        """A robot that has obeyed token 7 is driven under token 7: no higher one, which would lock a team out."""
+        """A robot that has obeyed token 7 is driven with token 7, because a higher one would lock out the team."""
         driver = driver_for("aibo", {"host": "dog1", "camera": False}, "dog1", self.clock, self.connector)
         driver.connect()
         self.turn(1.0)

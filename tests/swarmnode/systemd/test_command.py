@@ -1,4 +1,4 @@
-"""Tests of ``swarm service``: the unit, and what installing writes and tells systemd."""
+"""Tests of ``swarm service``: the unit, its installation and the calls of systemctl."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ PROGRAM = "/opt/swarm-node/bin/twistd"
 
 
 def unit(node: dict[str, object] | None = None, **tables: dict[str, object]) -> Unit:
-    """The unit of a node of the system."""
+    """Return the unit of a system service."""
     mapping = {"node": {"name": "dog1", **(node or {})}, **tables}
     return unit_for(Settings.from_mapping(mapping, "/etc/team/dog1.toml"), PROGRAM, is_user=False)
 
@@ -31,7 +31,7 @@ class UnitTests(SynchronousTestCase):
     """The text of a unit."""
 
     def test_a_node_may_little(self) -> None:
-        """A unit of the system has no user, no capability, no device and no file but its own folders."""
+        """A system unit has no fixed user, no capability and no device, and writes only its own folders."""
         lines = unit().text.splitlines()
         for line in (
             "DynamicUser=yes",
@@ -49,7 +49,7 @@ class UnitTests(SynchronousTestCase):
             self.assertIn(line, lines)
 
     def test_what_the_settings_need_is_let_through(self) -> None:
-        """The device of a driver, the right to a low port, and a Python in a home may be used, and nothing else."""
+        """The unit allows exactly the device, the low port and the home that the settings need."""
         robot = unit(driver={"kind": "create2", "options": {"port": "/dev/ttyUSB0"}})
         low = unit({"roles": ["web"]}, web={"tls": "auto", "tls_port": 443})
         homes = [
@@ -66,12 +66,12 @@ class UnitTests(SynchronousTestCase):
             self.assertEqual((line in lines, other in lines), (True, False), line)
 
     def test_names_cannot_add_lines(self) -> None:
-        """Spaces, quotes and percent signs of a path stay in their place."""
+        """Spaces, quotes and percent signs of a path are escaped."""
         made = unit_for(Settings.from_mapping({"node": {"name": "a"}}, '/a b/50%"/a.toml'), PROGRAM, is_user=True)
         self.assertIn('--config "/a b/50%%\\"/a.toml"\n', made.text)
 
     def test_systemd_takes_it(self) -> None:
-        """Where systemd is, it finds nothing wrong with the unit and calls its exposure low (below 2 of 10)."""
+        """The unit passes the checks of systemd, which rates its exposure below 2 of 10."""
         if shutil.which("systemd-analyze") is None:
             raise SkipTest("there is no systemd-analyze here")
         folder = Path(self.mktemp())
@@ -87,7 +87,7 @@ class UnitTests(SynchronousTestCase):
 
 
 class CommandTests(SynchronousTestCase):
-    """What the verbs do, below a root of the test's own."""
+    """Tests of the verbs below a temporary root."""
 
     def setUp(self) -> None:
         self.root = Path(self.mktemp()).absolute()
@@ -104,11 +104,11 @@ class CommandTests(SynchronousTestCase):
         self.closed = Path("/nowhere")
 
     def can_enter(self, folder: Path) -> bool:
-        """Whether the service's user could."""
+        """Return whether the service's user can enter the folder."""
         return folder != self.closed
 
     def run_it(self, *words: str, uid: int = 0) -> tuple[int, str, str]:
-        """The exit code, what was printed, and the complaint."""
+        """Run the command; return exit code, standard output and standard error."""
 
         def systemctl(words: Sequence[str]) -> int:
             self.told.append(" ".join(words))
@@ -124,7 +124,7 @@ class CommandTests(SynchronousTestCase):
         return self.run_it("install", str(self.settings))
 
     def test_install(self) -> None:
-        """Installing writes the unit, copies settings and store for the service alone, and has systemd start it."""
+        """``install`` writes the unit, copies settings and store with private modes, and starts the service."""
         (self.settings.parent / "dog1.sqlite").write_bytes(b"kept")
         code, printed, _ = self.install()
         self.assertEqual((code, printed), (0, f"{self.unit}\n"))
@@ -139,7 +139,7 @@ class CommandTests(SynchronousTestCase):
         )
 
     def test_install_again_keeps_the_store(self) -> None:
-        """New settings take the place of the old; what the service stored since stays."""
+        """A second installation replaces the settings and keeps the store of the service."""
         self.install()
         (self.state / "dog1.sqlite").write_bytes(b"newer")
         (self.settings.parent / "dog1.sqlite").write_bytes(b"older")
@@ -149,7 +149,7 @@ class CommandTests(SynchronousTestCase):
         self.assertIn("kind", (self.state / "node.toml").read_text(encoding="utf-8"))
 
     def test_refused_settings(self) -> None:
-        """A store outside of the settings' folder, and settings that a node would refuse, are refused by name."""
+        """A store outside the settings' folder and invalid settings are rejected by name."""
         for text, words in (
             ('[node]\nname = "dog1"\nstore = "/srv/dog1.sqlite"\n', "/srv/dog1.sqlite is outside"),
             ("[node]\n", "[node] name: is missing"),
@@ -161,7 +161,7 @@ class CommandTests(SynchronousTestCase):
             self.assertFalse(self.unit.exists())
 
     def test_a_program_that_the_service_could_not_run_is_refused(self) -> None:
-        """A program in somebody's closed home is refused with the folder and the remedy."""
+        """A program in a folder that other users cannot enter is rejected with a remedy."""
         self.closed = self.root
         code, _, complaint = self.install()
         self.assertEqual(code, 2)
@@ -170,14 +170,14 @@ class CommandTests(SynchronousTestCase):
         self.assertEqual(self.run_it("show", str(self.settings), "--user")[0], 0)
 
     def test_the_python_behind_the_environment_counts(self) -> None:
-        """An environment outside of all homes whose Python is a link into one is let read it."""
+        """If the environment's Python is a link into a home, the unit may read homes."""
         Path(self.program).symlink_to("/home/ann/.pyenv/bin/python3")
         code, printed, _ = self.run_it("show", str(self.settings))
         self.assertEqual(code, 0)
         self.assertIn("ProtectHome=read-only\n", printed)
 
     def test_remove(self) -> None:
-        """Removing stops it, takes the unit away and leaves what was stored."""
+        """``remove`` stops the service, deletes the unit and keeps the data."""
         self.install()
         self.told.clear()
         self.assertEqual(self.run_it("remove", "dog1")[0], 0)
@@ -186,7 +186,7 @@ class CommandTests(SynchronousTestCase):
         self.assertTrue((self.state / "node.toml").exists())
 
     def test_refusals_of_restart_and_systemd(self) -> None:
-        """A name of no service is refused, systemd told nothing; what systemd refuses is code 1 and where to read."""
+        """An unknown service is rejected without systemctl; if systemctl fails, the exit code is 1 with a hint."""
         for verb in ("restart", "remove"):
             code, _, complaint = self.run_it(verb, "cat")
             self.assertEqual((code, self.told), (2, []))
@@ -197,7 +197,7 @@ class CommandTests(SynchronousTestCase):
         self.assertIn("journalctl -u swarm-node-dog1", complaint)
 
     def test_without_root_it_is_the_users_own(self) -> None:
-        """Who is not root gets a unit of the user's manager, with the settings where they are."""
+        """Without root the unit belongs to the user's manager, and uses the settings in place."""
         self.patch(os, "environ", {**os.environ, "XDG_CONFIG_HOME": "/home/ann/.config"})
         code, printed, _ = self.run_it("install", str(self.settings), uid=1000)
         self.assertEqual(code, 0)
